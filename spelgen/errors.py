@@ -34,14 +34,14 @@ class SpelgenError(Exception):
         self.file = None if self.file is None else str(self.file)
 
     def __str__(self) -> str:
-        statement = _in_short(self.got)
+        statement = _truncated(self.got)
         if self.expected is not None:
-            statement = f"got {statement}, expected {_in_short(self.expected)}"
+            statement = f"got {statement}, expected {_truncated(self.expected)}"
         # Compilers print FILE:LINE in this form, and editors open the file at that line.
         location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
-        message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
+        message = ": ".join(x for x in (_truncated(location), _truncated(self.element or ""), statement) if x)
         if self.do is not None:
-            message += f"; {_in_short(self.do)}"
+            message += f"; {_truncated(self.do)}"
         return message
 
 
@@ -91,20 +91,20 @@ class SpelgenErrors(SpelgenError):
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
             groups.setdefault(key, []).append(error)
-        lines = [_once(group) for group in list(groups.values())[:MAX_ERRORS]]
+        lines = [_joined(group) for group in list(groups.values())[:MAX_ERRORS]]
         if len(groups) > MAX_ERRORS:
             lines.append(f"and {len(groups) - MAX_ERRORS} more like these")
         return "\n".join(lines)
 
 
-def _once(errors: Sequence[SpelgenError]) -> str:
+def _joined(errors: Sequence[SpelgenError]) -> str:
     """Return one text for equal errors in several files: the first error, followed by the names of the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     return f"{first}\n  the same: {shortened(list(map(str, files)), 5)}" if files else str(first)
 
 
-def _in_short(text: str) -> str:
+def _truncated(text: str) -> str:
     """Return a text, shortened to its start and end if it is long: a name in a file may have a million characters."""
     if len(text) <= MAX_TEXT:
         return text

@@ -131,7 +131,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager for writing `path`: an OSError without a file name (full disk), or of a hidden file, names it."""
+    """Context manager in which an OSError gets the file name `path`, unless it names another file.
+
+    An error on a full disk names no file; an error in `replacing` names the hidden file.
+    """
     try:
         yield
     except OSError as error:

@@ -147,10 +147,10 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of a predictor with an observer, which adds the disturbance torque of a momentum observer."""
+    """Return the name of a predictor whose predictions include the disturbance that a momentum observer estimates."""
     return f"{predictor} + observer"
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor. A predictor with an observer is shown only if it is the trained model."""
+    """Return True if charts show a predictor: of the predictors with a disturbance observer, only the trained model."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

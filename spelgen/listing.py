@@ -99,7 +99,7 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
 def _width(texts: Iterable[str]) -> int:
     """Return the width of the widest line in characters of a terminal."""
-    from rich.cells import cell_len  # rich is slow to import
+    from rich.cells import cell_len  # rich is imported here: its import is slow
 
     return max((cell_len(line) for text in texts for line in text.split("\n")), default=0)
 

@@ -219,7 +219,7 @@ class ModelSpec:
 
 def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
     """Return the ModelSpec in a JSON text (see `ModelSpec.to_json`). Raises ModuleError, which names ``file``."""
-    from pydantic import TypeAdapter, ValidationError  # pydantic is slow to import
+    from pydantic import TypeAdapter, ValidationError  # pydantic is imported here: its import is slow
 
     try:
         content = json.loads(text, parse_constant=_no_number)

@@ -126,7 +126,7 @@ class MovingJoint(NamedTuple):
 class LumpedLinks(NamedTuple):
     """Result of `lump_links`: moving joints with their bodies, locked joints, and the frames of all links by name.
 
-    ``moved`` lists the joints on the path to the tip before mimic joints on other branches; ``locked`` includes fixed
+    ``moved``: the joints on the path to the tip, followed by mimic joints on other branches. ``locked`` includes fixed
     joints. ``frames``: poses of the links at zero position, in the frames of their bodies.
     """
 

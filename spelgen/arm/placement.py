@@ -155,12 +155,12 @@ class Placement:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
         # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue the
-        # segment. `_segments` has one element for the root and for each body: the rotations of all bodies from the
-        # start of its segment to this body, relative to the start of the segment, in float64 and exact.
+        # segment. `_segments[body + 1]` has an element for each body from the start of the segment to this body: its
+        # rotation relative to the start of the segment, in float64 and exact. Index 0 is the root (body -1).
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
-        """Add the pose of the child link of a joint that is locked at the position ``value`` [rad, m]."""
+        """Add to ``frames`` the pose of the child link of a joint that is locked at the position ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value:
             axis = self._rounding.axis(joint)
@@ -170,7 +170,7 @@ class Placement:
             else:
                 # A revolute joint that is not locked at zero rotates the frames of all later links by a constant angle.
                 turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
-            frame = self._placed(frame, offset, turn)
+            frame = self._displaced(frame, offset, turn)
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
@@ -199,7 +199,7 @@ class Placement:
             self._segments.append(((np.eye(3), IDENTITY),))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return frame.body, rotation, self._seen_from_both(rotation, frame.position)
+        return frame.body, rotation, self._without_rounding_errors(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
         """Return the inertial parameters (m, m c, I) of a link in the frame of its body, (10,) [kg, kg m, kg m2].
@@ -208,7 +208,7 @@ class Placement:
         """
         where = f"link {link.name!r} inertial origin"
         origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)
-        frame = self._placed(self.frames[link.name], *origin)
+        frame = self._displaced(self.frames[link.name], *origin)
         mass, center = exact(inertial.mass), frame.position
         tensor = frame.rotation @ self._rounding.tensor(link, inertial) @ frame.rotation.T
         tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
@@ -216,12 +216,12 @@ class Placement:
 
     def _joint_origin(self, joint: UrdfJoint) -> Frame:
         origin = self._rounding.origin(joint.xyz, joint.rpy, f"joint {joint.name!r} origin", joint.line)
-        return self._placed(self.frames[joint.parent], *origin)
+        return self._displaced(self.frames[joint.parent], *origin)
 
-    def _placed(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
-        """Return a link's frame, moved by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3), both in ``frame``.
+    def _displaced(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
+        """Return a new frame: ``frame``, translated by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3).
 
-        turn: None for no rotation.
+        offset and turn are relative to the axes of ``frame``. turn: None for no rotation.
         """
         position = self._rounding.position(frame.position + frame.rotation @ offset)
         if turn is None:
@@ -229,7 +229,7 @@ class Placement:
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
-    def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Return a joint's position (3,) [m] in the parent body, with rounding errors in both frames replaced by 0.
 
         A position may have components that should be 0 in the frame of the parent body, or in the joint's own frame.
@@ -247,15 +247,16 @@ class Placement:
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
-        """Return a float64 rotation as an exact rotation (3, 3) in the frame of a body.
+        """Return the exact rotation (3, 3) of a frame relative to a body, from its rotation in float64.
 
-        A zero element of the rotation relative to a body means that two axes are normal to each other, and must remain
-        zero. The rotation is therefore approximated relative to each body of the segment in turn, and the approximation
-        that preserves the most zero elements, relative to all these bodies, is used.
+        Relative to each body of the segment (see the docstring of the module), the rotation may have zero elements: two
+        axes are normal to each other. A rational approximation relative to one body preserves its zeros, but may lose
+        the zeros relative to another body. The rotation is therefore approximated relative to each body of the segment
+        in turn, and the approximation that loses the fewest zeros is used.
 
         Args:
             body: index of the body, -1 for the root link.
-            composed: float64 rotation (3, 3) relative to the start of the segment that contains the body.
+            composed: float64 rotation (3, 3) of the frame relative to the start of the segment that contains the body.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

@@ -132,10 +132,11 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
+    """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
 
-    D and K are diagonals of matrices of W windows, (W, n) [Nm s/rad, N s/m; Nm/rad, N/m]: the friction of a joint
-    depends only on the joint's motion. width: (n,) finite-difference steps of velocity [rad/s, m/s].
+    D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
+    a joint depends only on the motion of the joint. Friction depends on position through the bristles. width: (n,)
+    finite-difference steps of velocity [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)

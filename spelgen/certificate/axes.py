@@ -95,11 +95,12 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Return True if all points that the prismatic joint ``slider`` carries have constant distances from a plane.
+        """Return True if all points that joint ``slider`` carries have constant signed distances from a plane.
 
-        The plane contains the axis of the revolute joint ``hinge`` and is parallel to the axis of ``slider``; ``hinge``
-        is nearer the root than ``slider``. The signed distances must be constant for any motion of the joints from
-        ``hinge`` to the tip. The entry of M of both joints is then constant.
+        ``hinge`` is a revolute joint, ``slider`` a prismatic joint farther from the root. The plane contains the axis
+        of ``hinge``, is parallel to the axis of ``slider``, and moves with the child link of ``hinge``. The distances
+        must be constant for any motion of the joints between ``hinge`` and the tip. The entry of M in the row of
+        ``slider`` and the column of ``hinge`` is then constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
             return False  # A revolute joint between ``hinge`` and ``slider`` could change the direction of ``slider``.

@@ -138,7 +138,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
     result: Terms = {}
     for (total, quarters), value in waves.items():
         function = sin(total) if quarters % 2 else cos(total)
-        # SymPy simplifies cos(-a) to cos(a) and sin(-a) to -sin(a).
+        # SymPy has simplified cos(-a) to cos(a) and sin(-a) to -sin(a): the sign is moved to the coefficient.
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
             sign = -sign

@@ -82,8 +82,8 @@ class _Sentences:
 
         Args:
             kind: "zero" or "constant".
-            why: function of the tests of axes and an entry that returns the reason, or None.
-            statement: predicate of the sentence about the entries.
+            why: function of (`Axes`, entry of M) that returns the reason why the entry is zero or constant, or None.
+            statement: end of the sentence about the entries, such as "always zero".
             means_one: consequence for the model, if the fact is about one entry.
             means_several: consequence for the model, if the fact is about several entries.
         """
@@ -132,7 +132,7 @@ class _Sentences:
         """Yield a fact for each joint on which no entry of M depends."""
         inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
-            return  # M is constant, and the facts about constant entries already state it.
+            return  # M is constant, as the facts about its entries state, so no joint is listed.
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             means = "It is not an input of the networks of M"
             yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))

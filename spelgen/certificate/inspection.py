@@ -173,9 +173,9 @@ class Inspection:
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
                 entries = [entry for entry in self.actuation.entries if entry.kind == kind]
                 if entries:
-                    needs.append(f"{meaning} at {_rows(entries)}")
+                    needs.append(f"{meaning} at {_driven_joints(entries)}")
         if self.actuation.couplings:
-            needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
+            needs.append(f"motors coupled at {_driven_joints(self.actuation.couplings)}")
         # Joints without a drive are listed, because they have no input.
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
@@ -193,7 +193,7 @@ class Inspection:
         return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
 
     def _matrix(self) -> str:
-        """Return a text table of the lower triangle of M: a cell has the joints on which the entry depends, C or 0."""
+        """Return a text table of the lower triangle of M with a cell per entry, see `cell_text`."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
         # Each column of the table has the width of its widest cell, so that M of seven joints fits into 80 characters.
@@ -232,8 +232,8 @@ class Inspection:
         }
 
 
-def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints in whose rows of G the given entries are, as text."""
+def _driven_joints(entries: Iterable[InputEntry]) -> str:
+    """Return the joints that entries of the input matrix G drive (their rows), as text such as ``joints 2-4``."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 

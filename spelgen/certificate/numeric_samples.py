@@ -95,7 +95,7 @@ def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
         by_joint = pin.computeJointTorqueRegressor(dynamics.model, dynamics.data, q, qd, qdd)
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         rows.append(dynamics.jacobian.T @ by_joint.reshape(bodies, -1))
     return np.concatenate(rows)
 
@@ -147,8 +147,8 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
     gravity = tuple(map(float, arm.gravity))
     as_written = make_arm(robot, joints=arm.joint_names, angle_tolerance=0.0, gravity=gravity)
-    theirs = _reading(dynamics, arm, q)
-    written, ours = (_reading(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
+    theirs = _compared_values(dynamics, arm, q)
+    written, ours = (_compared_values(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
     if all(body.inertia is None for body in arm.bodies):
         del written["masses and inertias"]
     differences = []
@@ -189,7 +189,7 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
-def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
+def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
     """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
@@ -199,9 +199,9 @@ def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]
     axes, loads = [], []
     for configuration in dynamics.configuration(q):
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         axes.append(pin.computeJointJacobians(model, data, configuration).reshape(6, -1)[:, columns])
-        # Pinocchio computes only the upper triangle of M.
+        # Pinocchio computes only the upper triangle of M. The sum of both triangles doubles the diagonal entries.
         upper = np.triu(pin.crba(model, data, configuration))
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)

@@ -121,19 +121,19 @@ class _DerivedFact:
     # [1] Sampled numbers, divided by their scales, count as zero up to this value: they may be rounding errors.
     rounding: float = 1e-12
 
-    def check(self, is_fine: bool) -> FactCheck:
+    def check(self, has_tiny_numbers: bool) -> FactCheck:
         """Return the verification of the fact by the sampled numbers.
 
-        is_fine: True if numbers of the arm are so small that nonzero results may be lost in rounding errors (see
-        `_is_fine`). If a number that should be nonzero counts as zero, the verdict is then "undecided" instead of
-        "differs".
+        has_tiny_numbers: True if numbers of the arm are so small that nonzero results may be lost in rounding errors
+        (see `_has_tiny_numbers`). If a number that should be nonzero counts as zero, the verdict is then "undecided"
+        instead of "differs".
         """
         zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
         nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
         differences = [
             f"{name} is {size_text(value)} of its scale" for name, value in zeros if value > self.rounding
         ]
-        verdict: Verdict = "undecided" if is_fine and not differences else "differs"
+        verdict: Verdict = "undecided" if has_tiny_numbers and not differences else "differs"
         differences += [f"{name} is not seen" for name, value in nonzeros if value <= self.rounding]
         if differences:
             return FactCheck(self.fact, self.derived, shortened(differences, 4), verdict)
@@ -161,7 +161,7 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
-    # All facts are verified on the same samples: with other samples for each fact, an error could pass by chance.
+    # All facts are verified on the same samples, which are computed once.
     samples = numeric_samples.draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
@@ -170,8 +170,8 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
         _potential(structure, samples),
         _rank("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameter_count),
     ]
-    is_fine = _is_fine(arm, structure)
-    checks = [fact.check(is_fine) for fact in facts]
+    has_tiny_numbers = _has_tiny_numbers(arm, structure)
+    checks = [fact.check(has_tiny_numbers) for fact in facts]
     inertials = "inertial values of its own" if is_random else "the URDF's inertial values"
     means = f"{numeric_samples.ENGINE} at {count} random configurations, each with {inertials}"
     return Verification(means, count, seed, (*checks, *_reading_checks(robot, arm, seed)))
@@ -181,7 +181,7 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     """Yield checks that compare the chain read by spelgen with Pinocchio's reading of the URDF."""
     try:
         differences = numeric_samples.differences_of_reading(robot, arm, seed)
-    except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
+    except Exception as problem:  # A failure of Pinocchio is no evidence against the chain: undecided.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
@@ -201,7 +201,10 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield two facts, with sampled numbers: which entries of M are zero, and on which joints each entry depends."""
+    """Yield the facts which entries of M are zero, and on which joints each entry depends.
+
+    Each fact has the numbers that test it: the entries in `samples`, and their changes if only one joint moves.
+    """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
@@ -222,7 +225,7 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
 
 
 def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact, with sampled numbers, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
+    """Return the fact, with the numbers that test it, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
 
     c_k are constants, f_j functions (outputs), A_k and B_j constant matrices. Each f_j must depend only on its own
     joints, the c_k on no joint.
@@ -265,16 +268,17 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # The rank of the changes of M caused by the first k joints is the number of outputs that depend on any of them.
+        # Outputs are linearly independent functions of q. Therefore the rank of the changes of M due to the first k
+        # joints must equal the number of outputs that depend on any of these joints.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact, with sampled gravity torques, that V depends on the derived joints only.
+    """Return the fact that V depends on the derived joints only, with the numbers that test it.
 
-    The gravity torque dV/dq must be zero at all other joints, and nonzero at the derived joints.
+    The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
     """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
@@ -306,7 +310,7 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
     return _DerivedFact(fact, str(rank), magnitudes)
 
 
-def _is_fine(arm: Chain, structure: Structure) -> bool:
+def _has_tiny_numbers(arm: Chain, structure: Structure) -> bool:
     """Return True if the arm has nonzero numbers below 1e-3, whose products may be lost in rounding errors.
 
     The numbers are the entries of the rotations between joint frames and, if the structure depends on inertials, the

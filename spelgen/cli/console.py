@@ -91,7 +91,7 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr, with `debug` after the traceback; exit with the exit code of the exception."""
+    """Report an exception on stderr, and exit with its exit code. debug: if True, print the traceback first."""
     if isinstance(error, BrokenPipeError):
         # A closed pipe means that the reader of stdout has ended: no message is printed, and stdout becomes /dev/null,
         # so that the flush at the exit of the interpreter does not fail.

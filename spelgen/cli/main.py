@@ -49,12 +49,12 @@ class CommandGroup(TyperGroup):
     """The group of all commands. A usage error suggests the nearest command, option or choice."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Parse the options before the name of the command; usage errors get suggestions."""
+        """Parse the options before the name of the command; a usage error names the nearest option or choice."""
         with _suggestions():
             return super().make_context(*arguments, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; usage errors get suggestions."""
+        """Run a command; a usage error names the nearest command, option or choice."""
         with _suggestions():
             return super().invoke(ctx)
 
@@ -75,7 +75,7 @@ def _suggest(error: Any) -> None:
     nearest = list(vars(error).get("possibilities") or [])[:1]
     if nearest:
         error.possibilities = []
-    # Pydantic, with which choices are checked, adds the prefix "Value error" to messages.
+    # Choices are checked by pydantic, which adds the prefix "Value error" to messages: it is removed.
     error.message = error.message.replace("Value error, ", "")
     # Click makes no suggestion for an invalid choice, so the choices are read from its message.
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)

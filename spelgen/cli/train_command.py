@@ -208,7 +208,10 @@ def _warm_start(request: Request) -> Request:
 
 
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:
-    """Return the default run folder. With --resume, the argument of the command may be the run folder itself."""
+    """Return the run folder of a command without -o: runs/NAME of the module, or runs/NAME_adapted of the run `source`.
+
+    With --resume, `module` may be the run folder itself. Raises RunError if there is no run to resume.
+    """
     if resume and module is not None and module.is_dir():
         return module
     name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem

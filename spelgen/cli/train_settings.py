@@ -111,7 +111,7 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
         # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The logs determine the objective later, and some objectives have no time limit. For these objectives an option
-        # would be an error, but a default value is ignored.
+        # The logs determine the objective later, and some objectives have no time limit. For these objectives the
+        # option `max_minutes` would be an error; as a setting, which is only a default value, it is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

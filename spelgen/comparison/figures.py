@@ -1,6 +1,6 @@
-"""Figures of a model trained on the paper's simulated protocol: losses, sizes, invariants, and the error of M.
+"""Results of a model on the simulated protocol of Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 
-Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
+The results are losses, numbers of parameters and outputs, invariants of the motion, and the error of M.
 """
 
 import statistics

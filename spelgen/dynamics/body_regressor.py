@@ -24,7 +24,7 @@ def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # Parallel-axis theorem: the inertia about the origin exceeds the inertia about the centre of mass by mass * shift.
+    # `mass * shift` is the inertia about the origin minus the inertia about the centre of mass (parallel-axis theorem).
     shift = center @ center * np.eye(3) - np.outer(center, center)
     return mass, center, about_joint - mass * shift
 

@@ -50,7 +50,7 @@ def equations_of(dynamics: object) -> EquationsAt:
     """
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
-    return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)
+    return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_dynamics, dynamics)
 
 
 def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEquations:
@@ -71,7 +71,7 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     return MotionEquations(pose.mass, force, friction)
 
 
-def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
+def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
     """Return the equations of motion of W rollouts at positions q, (W, n), for any ``RigidDynamics``.
 
     The force M qdd is computed from the forward dynamics, since ``RigidDynamics`` has no method that returns it.

@@ -125,7 +125,7 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
     """Return True if the output of a network is zero for all inputs, or if there is no network."""
     if not isinstance(network, MaskedMLP):
         return network is None
-    # Only the last layer is tested: the initial weights of hidden layers are random.
+    # The output is zero if the last layer is zero. Hidden layers are not tested: their initial weights are random.
     return not (network.weights[-1].any() or network.biases[-1].any())
 
 

@@ -78,15 +78,15 @@ class PinocchioDynamics:
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
-        upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
-        # Pinocchio guarantees only the upper triangle of M.
+        upper = np.triu(self._batched(pin.crba, self.configuration(q)))
+        # Pinocchio guarantees only the upper triangle of M, which is copied to the lower one.
         joints = upper + np.triu(upper, 1).swapaxes(-1, -2)
         return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
         """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
+        effects = self._batched(pin.nle, self.configuration(q), qd @ self.jacobian.T)
         return effects @ self.jacobian
 
     @_takes_tensors
@@ -104,7 +104,7 @@ class PinocchioDynamics:
         """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
         if self._same:  # The result of `aba` is copied, because Pinocchio overwrites it in the next call.
-            return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
+            return np.array(self._batched(pin.aba, self.configuration(q), qd, force))
         # `aba` cannot solve the equations with mimic joints, K^T M_joints K qdd = force, so M is computed.
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
@@ -116,7 +116,7 @@ class PinocchioDynamics:
         A passive joint has no input: its element is the torque that a motor at the joint would need.
         """
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
-        torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
+        torque = self._batched(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
         # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.
         passive = np.diag(~self.inputs.any(axis=1))
@@ -137,8 +137,8 @@ class PinocchioDynamics:
                 configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
         return configuration
 
-    def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Return the results of a joint-space algorithm of Pinocchio, such as `rnea`, for each state of a batch.
+    def _batched(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
+        """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.
 
         states: arguments of the algorithm after model and data, (..., nq) or (..., nv).
         """

@@ -100,7 +100,7 @@ class PreparedModel:
         return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the time derivative of the momenta, (..., n) [Nm, N], under the inputs tau: for momentum observers."""
+        """Return dp/dt, (..., n) [Nm, N], of the momenta p = M(q) qd under the inputs tau, for momentum observers."""
         past = known_past(self._model, z)
         p = self.momentum(q, qd)
         return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
@@ -175,7 +175,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            """Return the rate of the state (q, qd), or the state after dt if dt is given, (2 n,)."""
+            """Return d/dt of the state (q, qd), (2 n,), at the inputs tau (n,); if dt is given, the state after dt."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])

@@ -112,10 +112,11 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies at q, (..., n), and the derivatives of their momenta.
+        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
 
-        The derivatives with respect to qd are (..., n, 12 B). The momentum of a body is T' J, 3 x 4 elements, with the
-        time derivative T' of its homogeneous transform T and its pseudo-inertia J.
+        q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
+        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
+        pseudo-inertia J.
         """
         # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
         # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as
@@ -202,7 +203,7 @@ def identified_dynamics(
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N], at qd, (..., n), and the friction state z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 

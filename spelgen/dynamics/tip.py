@@ -49,7 +49,7 @@ class TipKinematics:
     def pose(self, q: torch.Tensor) -> torch.Tensor:
         """Return the pose of the link at q: the homogeneous transform from the link to the root frame, (..., 4, 4)."""
         poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(
-            self._rows(q), analytical_grad=False
+            self._positions(q), analytical_grad=False
         )[-1]
         return poses.reshape(*q.shape[:-1], 4, 4)
 
@@ -59,11 +59,13 @@ class TipKinematics:
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
         """Return the Jacobian of the link, (..., 6, n): its linear, then its angular velocity per qd, in root axes."""
-        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(self._rows(q)) @ self._jacobian.to(q)
+        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(
+            self._positions(q)
+        ) @ self._jacobian.to(q)
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
-    def _rows(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of the joints on the path from the root to the link, (states, joints) [rad, m]."""
+    def _positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the positions of the joints on the path to the link at q, (..., n): (states, joints) [rad, m]."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 

@@ -107,17 +107,22 @@ def spec_of(model: object) -> ModelSpec | None:
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return the mass matrix M, (..., n, n), from its functions and constants, as ``mass_entries`` of a module does.
+    """Return the mass matrix M, (..., n, n), from its functions of q and its constants (the terms).
+
+    The function ``mass_entries`` of an emitted module computes the same.
 
     Args:
-        rows: linear combinations of the terms, a list for each row of the lower triangle of M.
+        rows: for each row of the lower triangle of M, a list of the entries as linear combinations of the terms.
         terms: values of the functions of q, then of the constants, (...,) each.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source."""
+    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source.
+
+    sums: pairs (factor, index of a term).
+    """
     # Negative terms are subtracted, as in the module's source, so that rounding errors are equal.
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
@@ -137,7 +142,10 @@ def _model_class(base: str) -> Callable[..., ArmModel]:
 
 
 def _without_state(base: str) -> ArmModel:
-    """Return a new model without attributes, for unpickling: pickle then sets the attributes; base: its base class."""
+    """Return a new model without attributes; pickle calls this function, and then sets the attributes.
+
+    base: name of the class of ``spelgen.runtime`` from which the model is derived.
+    """
     model_class = cast("type[ArmModel]", _model_class(base))
     return model_class.__new__(model_class)
 

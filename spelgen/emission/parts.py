@@ -1,4 +1,6 @@
-"""Conversion of a ``ModelSpec`` to the tables JOINTS and LINKS of a module and to calls of runtime classes.
+"""Conversion of a ``ModelSpec`` to tables and constructor calls of the classes of ``spelgen.runtime``.
+
+The tables have the joints and links of the arm, and the functions and constants of M.
 
 Models in memory (`assemble`) and the source of modules (`text`) are both made from these tables and calls.
 """
@@ -87,7 +89,7 @@ def _inputs(spec: ModelSpec) -> Call:
     # `mask` is True for gains (entries of G) that are trained; known gear ratios are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
+    return call("MotorInputs", matrix, **_without_defaults({"trained": mask}, trained=not trained))
 
 
 def base_class(spec: ModelSpec) -> str:
@@ -97,7 +99,7 @@ def base_class(spec: ModelSpec) -> str:
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
 
 
-def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
+def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
     """Return ``fields`` without arguments that have their default values, so that the rows of a module are short.
 
     fields: {name of a keyword argument: value}. is_default: True for names of arguments with their default values.
@@ -113,7 +115,7 @@ def _joint(joint: JointSpec) -> Call:
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
-    statements = _unless(
+    statements = _without_defaults(
         fields | {"typical_range": typical}, gear=joint.gear == 1, typical_range=typical == limits
     )
     return call("Joint", joint.name, joint.joint_type, **statements)
@@ -133,7 +135,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
         "offset": link.offset,
         "joint_type": link.joint_type,
     }
-    statements = _unless(
+    statements = _without_defaults(
         fields,
         rotation=np.array_equal(link.rotation, np.eye(3)),
         ratio=link.ratio == 1,
@@ -168,7 +170,8 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # `breakaway` has a row for each joint type of the arm, in the order of BREAKAWAY: a module's text is deterministic.
+    # The rows of `breakaway`, one per joint type of the arm, have the order of BREAKAWAY, so that the text of a module
+    # is deterministic.
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
@@ -276,7 +279,7 @@ def _network(
         "min_units": min_units,
     }
     kind = "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"
-    return call(kind, GENERATOR, JOINTS, **_unless(options, min_units=min_units == 1))
+    return call(kind, GENERATOR, JOINTS, **_without_defaults(options, min_units=min_units == 1))
 
 
 def units(spec: ModelSpec) -> int:
@@ -327,6 +330,7 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
+    outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
     """
     mean = np.zeros((n, n))
     for constant in constants:

@@ -41,8 +41,8 @@ from spelgen.structure.structure import Structure, derive
 class ModelTuning:
     """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
 
-    # [1] Lower bound of the eigenvalues of M, divided by the smallest eigenvalue of the nominal M over the joint
-    # ranges; both are relative to the mean of the nominal M.
+    # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
+    # positions. These eigenvalues are generalised ones, relative to the mean of the nominal M.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -144,7 +144,10 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale."""
+    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale.
+
+    structure: terms of M. sizes: nominal means and standard deviations of the functions.
+    """
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -156,7 +159,10 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale."""
+    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale.
+
+    structure: terms of M. sizes: nominal values of the constants.
+    """
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
     return tuple(
         ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values

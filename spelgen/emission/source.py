@@ -45,7 +45,7 @@ def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
         reserved: number of characters that the caller adds after the text, such as a comment.
     """
     text = start + flat(value)
-    if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
+    if indent + len(text) + reserved < WIDTH or not _items(value) or _is_repeated(value):
         return text
     inner = " " * (indent + _STEP)
     opening, closing = "{}" if isinstance(value, dict) else "()"
@@ -78,7 +78,7 @@ def flat(value: object) -> str:
     if isinstance(value, str):
         return json.dumps(value) if value.isascii() and value.isprintable() else _escaped(value)
     if isinstance(value, tuple):
-        if _alike(value):
+        if _is_repeated(value):
             return f"({flat(value[0])},) * {len(value)}"
         return f"({flat(value[0])},)" if len(value) == 1 else f"({_joined(value)})"
     if isinstance(value, dict):
@@ -107,7 +107,7 @@ def _items(value: object) -> list[tuple[str, object]]:
     return [("", item) for item in value] if isinstance(value, tuple) else []
 
 
-def _alike(value: object) -> bool:
+def _is_repeated(value: object) -> bool:
     """Return True for a tuple of more than three equal items, which is written as a product: ``(0.0,) * 6``."""
     return isinstance(value, tuple) and len(value) > 3 and value.count(value[0]) == len(value)
 

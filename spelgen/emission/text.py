@@ -226,7 +226,10 @@ def _mass_entries(spec: ModelSpec) -> str:
 
 
 def _sum(sums: parts.Sums, names: list[str]) -> str:
-    """Return the source of a linear combination of terms, such as ``f1 - 2 * c1``; ``0`` if there are no terms."""
+    """Return the source of a linear combination of terms, such as ``f1 - 2 * c1``; ``0`` if there are no terms.
+
+    sums: pairs (factor, index of a term). names: names of all terms.
+    """
     text = ""
     for factor, index in sums:
         term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"

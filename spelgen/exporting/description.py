@@ -47,7 +47,7 @@ class Residuals:
         entries: (row, column) in the lower triangle of M to which each output is added.
         potential: network whose output is added to V.
         torque: {joint: spline of q that is added to dV/dq [Nm, N]}.
-        ripple: further terms of dV/dq [Nm].
+        ripple: harmonics in the position of a joint that are added to dV/dq [Nm].
         friction: {joint: spline of q, logarithm of the factor on the friction of the joint's drive}.
     """
 

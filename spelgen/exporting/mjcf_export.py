@@ -294,7 +294,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
                 continue
             carrier, pose = poses[shape.link]
             pose = pose @ shape.pose
-            form = _form(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
+            form = _geom(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
             # Shapes have no mass, since the <inertial> of the body has the whole mass.
             _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
     if not len(assets):
@@ -302,7 +302,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     return ", ".join(omitted)
 
 
-def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
+def _geom(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
     """Return type and size of the geom of a shape as attributes; a mesh is also added to `assets`."""
     if shape.mesh is None:
         sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}

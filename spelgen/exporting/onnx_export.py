@@ -100,7 +100,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """
     n = matrix.shape[-1]  # `n` is a Python integer, so that tracing unrolls the loop over k
     identity = torch.eye(n, dtype=matrix.dtype)
-    # Either `matrix` or `right` may have no batch dimension.
+    # Either `matrix` or `right` may have no batch dimension: both are expanded to the batch of the other one.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
     # The elimination transforms matrix and right-hand side together, as columns of one array.
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
@@ -172,7 +172,7 @@ class _Decomposed(TorchFunctionMode):
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Call the replacement of a torch function if it is one of ``functions``, otherwise the function itself."""
+        """Call the torch function ``func``, or its replacement if the class attribute ``functions`` has one."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 

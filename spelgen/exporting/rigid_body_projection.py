@@ -99,7 +99,8 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # The model's own rigid bodies are used if it has some; its residual terms are omitted, as the summary states.
+    # The model's own rigid bodies are used if it has some; its residual terms are omitted. The summary of the export
+    # states this.
     exact = isinstance(model, RigidBodyDynamics)
     bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(

@@ -91,11 +91,11 @@ class RigidBodies:
             force = mass * acceleration + spin @ moment
             torque = ca.cross(moment, acceleration) + inertia @ rate
             wrenches.append((force, torque + ca.cross(w, inertia @ w)))
-        self._carry(wrenches)
+        self._accumulate(wrenches)
         torques = ca.SX(len(self.arm.coordinates), 1)
         for body, wrench in reversed(list(zip(self.bodies, wrenches, strict=True))):
             # A mimic joint has the coordinate of its leader, so its torque is added there, times its multiplier.
-            torques[body.coordinate] += float(body.multiplier) * _along(body, wrench)
+            torques[body.coordinate] += float(body.multiplier) * _axis_component(body, wrench)
         return torques
 
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -115,14 +115,14 @@ class RigidBodies:
             w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
             twists.append((w, v))
             momenta.append((mass * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
-        self._carry(momenta)
+        self._accumulate(momenta)
         momentum, gradient = ca.SX(qd.shape[0], 1), ca.SX(qd.shape[0], 1)
         for body, (w, v), (linear, angular) in zip(self.bodies, twists[1:], momenta, strict=True):
             turned = ca.dot(ca.cross(w, _Z), linear)
             if body.joint_type == "revolute":
                 turned = ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
             ratio = float(body.multiplier)
-            momentum[body.coordinate] += ratio * _along(body, (linear, angular))
+            momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
 
@@ -130,7 +130,7 @@ class RigidBodies:
         """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 
-    def _carry(self, wrenches: list[Wrench]) -> None:
+    def _accumulate(self, wrenches: list[Wrench]) -> None:
         """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
 
         wrenches: one per body, in the frame of the body, parents first.
@@ -145,7 +145,7 @@ class RigidBodies:
                 wrenches[parent] = force + added, torque + turned
 
 
-def _along(body: Body, wrench: Wrench) -> ca.SX:
+def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
     """Return the force along a prismatic joint's axis, or the torque about a revolute joint's axis, (1, 1)."""
     return wrench[1][2] if body.joint_type == "revolute" else wrench[0][2]
 

@@ -54,7 +54,7 @@ def export_ros2(trained: Trained) -> Exported:
         "initialize resets it."
     )
     summary = [checked] if missing is None else [checked, f"no {missing[0]}: {missing[1]}"]
-    use = _use(package, model.name, controller=controller)
+    use = _usage(package, model.name, controller=controller)
     return with_readme(trained, "ros2", files, use=use, about=about, summary=summary)
 
 
@@ -76,7 +76,7 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
     return None
 
 
-def _use(package: str, name: str, *, controller: bool) -> str:
+def _usage(package: str, name: str, *, controller: bool) -> str:
     """Return the line of the README about the use of the ROS 2 package.
 
     controller: True if the package contains the controller.

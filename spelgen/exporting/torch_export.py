@@ -173,7 +173,8 @@ def export_program(
 ) -> torch.export.ExportedProgram:
     """Return the torch.export program of a function of the model, such as inverse_dynamics, for any batch size.
 
-    The inputs are (batch, n); the friction state z is (batch, n, K), or (batch, n K) if ``flat_state``.
+    The inputs are (batch, n). The friction state z of K bristles per joint is (batch, n, K), or (batch, n K) if
+    ``flat_state``.
     """
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(program_inputs(model, name), (model.n,))
     if "z" in shapes:

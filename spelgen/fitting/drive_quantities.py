@@ -67,8 +67,8 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
 
     The coefficients are the slope and the intercept of a straight line through the friction torque at speeds up to the
     typical speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and
-    the factor of the residual terms at these positions are computed only once, from the argument ``model``: the same
-    load and factor are also used for models with other friction parameters.
+    the factor by which residual terms multiply friction at these positions are computed only once, from the argument
+    ``model``: the same load and factor are also used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]

@@ -252,7 +252,7 @@ class Fit:
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:
-    """Return the specification of a model, which a run folder contains. Raises RunError for a model without one."""
+    """Return the specification of a model that was loaded from a run folder. Raises RunError if it has none."""
     if isinstance(model, ArmModel):
         return model.spec
     raise RunError(

@@ -180,7 +180,7 @@ class LBFGS(WindowOptimizer):
 
     @property
     def stalled(self) -> bool:
-        """Whether the last two calls lowered neither the loss nor the penalised loss significantly."""
+        """Whether the last two calls of the optimizer lowered neither the loss nor the penalised loss significantly."""
         waits: int = self._optimizer.param_groups[0]["waits"]
         return waits > 1
 

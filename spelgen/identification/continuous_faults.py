@@ -108,8 +108,8 @@ class Delay(Fault):
         """Yield least-squares fits of the log's torques in which the signals of a joint, or all torques, are delayed.
 
         Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
-        omitted. Nothing is yielded if the hypothesis of `base` has a delay, or if the samples do not contain the
-        signals around them, which a shift in time needs.
+        omitted. Nothing is yielded if the hypothesis of the fit `base` has a delay already, or if the samples lack the
+        preceding and following signals, with which they can be shifted in time.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():

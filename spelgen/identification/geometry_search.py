@@ -57,11 +57,11 @@ def kinds_of_faults(
 
 
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
-    """Return the fit of the unchanged log, then the fits of hypotheses about faults that fit significantly better.
+    """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    At most three hypotheses of about the same cost are returned, the best one first. The result has only the fit of the
-    unchanged log if no hypothesis fits significantly better; a fault with other evidence than the cost needs no
-    significant decrease. faults: kinds of faults; each kind and combinations are tested.
+    The hypotheses have about the same cost, and the best one is first. If there is none, the result has only the fit of
+    the unchanged log. Kinds of faults with other evidence, such as a comparison of the torques with the URDF's gravity,
+    need no significant decrease of the cost. faults: kinds of faults; each kind and combinations are tested.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)

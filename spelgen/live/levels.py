@@ -169,12 +169,12 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The covariance of the payload filter neglects errors of the model. It is multiplied by the factor: the mean squared
-    error of estimated payloads, divided by the variance. The logs are without payload, so each estimated payload is an
-    error. Each trial is an estimate from several consecutive blocks, with two errors: of the mass, and of mass and
-    first moments. A prior value is included in the mean, with the weight of `prior_trials` trials. Means are computed
-    for both errors and for each length of trials, and the factor is the largest mean: in longer trials the error
-    divided by the variance may be larger, because the errors of the model are correlated over time.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
+    logs are without payload, so each estimate x is an error, and the factor is the mean of x^T P^-1 x / k over trials.
+    A trial is an estimate from several consecutive blocks; x is the mass (k = 1), or mass and first moments (k = 4). A
+    prior value is included in each mean, with the weight of `prior_trials` trials. The factor is the largest mean of
+    both k and all lengths of trials: errors of the model are correlated over time, so that the mean may be larger for
+    longer trials.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -331,7 +331,9 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
     """Return the noise of the momentum observer in motion and at rest, as fields of `NoiseLevels`.
 
-    The likelihood is maximized over a grid of velocity scales and noise ratios of the additional noise near standstill.
+    The noise variance of a joint at the velocity qd is s^2 (1 + (r exp(-|qd| / v))^2). The likelihood is maximized over
+    a grid of the ratio r and the velocity scale v of the additional noise near standstill; the noise s in motion is
+    estimated for each grid point.
 
     Args:
         signal: torque residual of the observer, (T, n) [Nm, N].

@@ -56,7 +56,7 @@ class NoiseLevels(BaseModel):
     Attributes:
         drift: Noise of the blocks of the drift filter.
         load: Noise of the blocks of the payload filter.
-        observer: Standard deviation of the momentum observer for a moving joint, (n,) [Nm, N].
+        observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
         resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
             [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].

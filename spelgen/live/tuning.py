@@ -22,7 +22,8 @@ class LiveTuning:
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
-    # [1] Largest number of samples that are stored per delay of the torques: samples in between are not stored.
+    # [1] Number of samples that a `DelayLine` stores per delay: a sample is stored only if at least the time delay /
+    # `delay_samples` has passed since the last stored sample.
     delay_samples: int = 16
     # [1] A joint is at rest below this fraction of its largest speed in the training logs.
     rest: float = 0.01
@@ -45,9 +46,9 @@ class LiveTuning:
     # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
     # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Variance of friction with an unknown friction state, divided by the square of `Balance.uncertainty`. The ratio
-    # would be 1/3 for friction that is uniformly distributed between its bounds. It is larger, because the errors of
-    # the samples of a block are correlated.
+    # [1] Variance of the friction torque of a joint whose friction state is unknown, divided by the square of
+    # `Balance.uncertainty`, half the range of this torque. The value would be 1/3 for a uniform distribution over the
+    # range. It is larger, because samples are averaged in blocks, and the errors in a block are correlated.
     uncertainty: float = 3.0
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
@@ -71,9 +72,9 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
-    # [1] Standard deviation of the torque error while the derivative dp/dt of the momentum changes, divided by the
-    # difference of two estimates of dp/dt, with the bandwidth of the observer and with twice this bandwidth. Torques
-    # that lag behind the motion by 1 / (2 * 2 * bandwidth) = 12 ms have this error.
+    # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
+    # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt, with the
+    # bandwidth of the observer and with twice this bandwidth. This is the error for a lag of 1 / (4 bandwidth) = 12 ms.
     jerk: float = 0.5
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.

@@ -81,7 +81,7 @@ def check_logs(
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return the findings about logs that need the arm; raise LogError if the logs cannot be trained on.
+    """Check logs with the arm; return the findings. Raises LogError if the logs cannot be used for training.
 
     A fit calls this function before it uses the logs.
     """

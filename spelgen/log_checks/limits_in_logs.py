@@ -45,7 +45,7 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the lowest flat bottoms and the highest flat tops of several trajectories.
+        """Return the extreme values at which signals stay (flat bottoms and tops), joined over several trajectories.
 
         The fractions of the samples at them (`shares`) are means over the trajectories.
         """
@@ -125,8 +125,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.residual(problem.unchanged, fit.parameters)
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
-    # The residual of few samples underestimates the noise: the 30 degrees of freedom of a joint's parameters are
-    # subtracted.
+    # A fit to few samples has a smaller residual than the noise. The sum of squares is divided by the number of samples
+    # minus 30, about the number of parameters that are fitted to a joint's torque.
     freedom = np.maximum(free.sum(axis=0) - 30, 1e-9)
     noise = np.sqrt(np.square(residual * free).sum(axis=0) / freedom)
     certain = 3.0  # number of standard deviations that a significant difference exceeds

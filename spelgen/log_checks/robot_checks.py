@@ -35,8 +35,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [1] Gravity of the URDF shows the unit of a joint's torque if it varies by this fraction of the variation at the
-    # joint with the largest gravity. A payload may multiply the gravity of a joint with less, such as a wrist.
+    # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
+    # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
+    # multiply the gravity torque.
     loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
@@ -165,10 +166,10 @@ def torque_factors(
 ) -> list[np.ndarray]:
     """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
-    A candidate is the inverse ratio of the gravity in the logged torques to the gravity torque of the URDF; it is
-    negative if the torques have the opposite sense as well. There is one candidate for each joint whose ratio is above
-    five or below a fifth, which wrong inertials do not explain (all other joints have the factor 1), and one candidate
-    with the same factor for all joints if their median ratio is such.
+    Let r be the gravity in a joint's logged torques divided by the gravity torque of the URDF; r is negative if the
+    torques have the opposite sense. If |r| is above five or below a fifth, wrong inertials do not explain it. For each
+    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the median
+    of r over the joints is above five or below a fifth, there is also a candidate with 1 / median for all joints.
 
     Args:
         joints: the joints with their fits of gravity.

@@ -91,8 +91,8 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
-    # A difference of two levels counts as a multiple of the step if it deviates from one by less than 5 % of a step. Up
-    # to 5 % of the differences may be no multiples. Both bounds are `tolerance`.
+    # A difference of two levels counts as a multiple of the step if its distance from the nearest multiple is less than
+    # 5 % of a step. At least 95 % of the differences must be multiples. `tolerance` is the 5 % of both bounds.
     tolerance = 0.05
     # Two or three levels are multiples of some step by chance.
     if len(differences) < 3:

@@ -80,7 +80,7 @@ def _of_one_arm(
 
     A message may contain only some of the joints, and joints may be on several topics. If most of the messages contain
     all joints, the others are omitted. Raises LogError if several topics contain the same joint, or if a joint is in no
-    message.
+    message. remarks: list to which a remark on omitted messages is added.
     """
     arm = set(names)
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
@@ -152,6 +152,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     """Yield the decoded joint states in a bag: on `topic`, or on all topics if it is None.
 
     Messages are decoded with the published definition of `JointState`; message definitions in the bag are ignored.
+    remarks: list to which a remark on a recorder that was killed is added.
     """
     try:
         from rosbags.rosbag1 import Reader as Ros1Reader
@@ -191,7 +192,7 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
             )
     except (LogError, GeneratorExit):
         raise
-    except Exception as error:  # rosbags and its decompressors raise exceptions of many types
+    except Exception as error:  # rosbags raises exceptions of many types: all are caught
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
         got = f"an unreadable ROS bag ({in_one_line(error).rstrip('.')})"
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
@@ -222,7 +223,10 @@ def _unfinished(path: Path) -> list[Path]:
 
 
 def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of MCAP files whose recorder was killed. Raises LogError if none."""
+    """Yield the encoded joint states on all topics of MCAP files whose recorder was killed, and add a remark about it.
+
+    path: path of the bag, for errors. Raises LogError if there are no joint states.
+    """
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"

@@ -91,8 +91,9 @@ class Findings:
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
-        keys: settings of the group `logs` that correct the fault. A fault with such a correction is always an error, so
-        that no model is trained on the log without the correction.
+        where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
+        `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
+        the log without the correction.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))

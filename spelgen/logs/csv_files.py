@@ -121,8 +121,8 @@ def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
 def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int) -> int:
     """Return the index of the header, or of the first row of values in a file without a header.
 
-    The header is the first line with as many cells as most lines have (`width`), which is a comment only if values
-    follow it directly.
+    The header is the first line that has `width` cells, the number of cells of most lines, and is no comment. If this
+    line has values and a comment with `width` cells precedes it, the comment is the header.
     """
     # In rows that end with a delimiter, the last cell has no name.
     is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
@@ -157,9 +157,10 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 
 
 def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
-    """Return True if a line below the header of a CSV file has no values: no digits, no numbers, or the header again.
+    """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    cells: the cells of the line if they may be names, which may contain digits; else None.
+    A line of names or units has no digits. cells: cells of the line if it may have names with digits, such as "joint1":
+    it has no values if none of its cells is a number. None: it has no such names.
     """
     is_name = cells is not None and not any(map(is_number, cells))
     return bool(line) and (line == header or is_name or not re.search(r"\d", line))

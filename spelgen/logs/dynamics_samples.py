@@ -101,9 +101,14 @@ def _columns(
 ) -> list[np.ndarray]:
     """Return the arrays of `DynamicsSamples` for one gap-free piece, at the samples at which a joint moves.
 
-    The arrays are q, qd, qdd and tau, (T, n). If `reach` is given, z (T, n, K) is added, and also the direction (T, n)
-    if `reach` contains a smoothing velocity. pauses: if True, samples at rest between the first and the last motion are
-    included. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+    The arrays are q, qd, qdd and tau, (T, n), then z (T, n, K), if `reach` has bristles, and the direction (T, n), if
+    `reach` also has a smoothing velocity.
+
+    Args:
+        piece: gap-free piece of a log.
+        pauses: if True, samples at rest between the first and the last motion are included.
+        cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+        reach: break-away displacements of the friction bristles; None: z and direction are not computed.
     """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY

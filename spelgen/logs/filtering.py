@@ -70,7 +70,7 @@ def low_pass_regular(signals: np.ndarray, rate: float, cutoff: float) -> np.ndar
 # robot have few sample rates.
 @lru_cache(maxsize=8)
 def _sections(rate: float, cutoff: float) -> np.ndarray:
-    """Return the second-order sections (S, 6) of the Butterworth filter for a sample rate and a cutoff [Hz]."""
+    """Return the S second-order sections, (S, 6), of the Butterworth filter for a sample rate and a cutoff [Hz]."""
     from scipy.signal import butter
 
     # The low-pass filter has the order 4 and is applied forward and backward, as in the papers that published the

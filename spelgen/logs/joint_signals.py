@@ -311,7 +311,7 @@ def find_elastic(signals: JointSignals) -> str | None:
 def _apparent_inertia(
     qd: np.ndarray, tau: np.ndarray, rate: float, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (B,) [Hz] and apparent inertias (B,) [kg m^2, kg] of the coherent frequency bands.
+    """Return frequencies (B,) [Hz] and apparent inertias (B,) [kg m^2, kg] of the B coherent frequency bands.
 
     The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration. A band is
     coherent if its torque is nearly proportional to the acceleration.

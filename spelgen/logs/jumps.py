@@ -54,7 +54,7 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     steps = np.abs(np.diff(values[logged]))
     # Zeros between samples close to 0 are not lost samples: a continuous signal may pass through 0.
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
-    lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _usual(steps), np.diff(logged))
+    lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _typical_step(steps), np.diff(logged))
     return np.asarray(lost & (values == 0))
 
 
@@ -71,7 +71,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     steps = np.diff(values)
     sizes = np.abs(steps)
-    largest_step = TUNING.jump * _usual(sizes)
+    largest_step = TUNING.jump * _typical_step(sizes)
     logged = np.flatnonzero(values)
     # Zeros at the beginning or end of positions are lost samples if the neighbouring position is far from 0. Torques
     # and velocities may be 0 there.
@@ -129,7 +129,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
         return stale
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
     is_quantised = len(np.unique(values)) < len(starts) / 2
-    is_long &= (steps > 4.0 * _usual(steps[:-1]) * is_quantised) & (len(starts) > 1)
+    is_long &= (steps > 4.0 * _typical_step(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
         rows = slice(start + 1, start + length)
         if np.ptp(changes[rows]) > min_change:
@@ -147,7 +147,7 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.zeros(0, int)
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
-    is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
+    is_jump = (sizes > TUNING.jump * _typical_step(sizes)) & (dt <= TUNING.gap * median)
     # No arm is faster than 40 rad/s or m/s. A step is assumed to last at least the median time step, since messages
     # that arrive in bursts have time stamps that are too close to each other.
     return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
@@ -226,11 +226,11 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     # changes a sign bit at half of the steps at most.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
-    jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
+    jump, typical = float(np.median(np.abs(steps[rows]))), _typical_step(np.abs(steps))
     # Torques may reverse abruptly, so a jump of a signal with negative values counts as an overflow only if it is
     # nearly as large as the range of the signal.
     is_signed = values.min() < -FINEST_WORD * np.ptp(values)
-    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
+    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * typical):
         return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
@@ -247,7 +247,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             jumps = np.abs(np.diff(reading.values))
             # A decoding is rejected if the jumps become shorter by one period but remain large: they are then steps of
             # the motion.
-            if np.median(jumps[rows]) > TUNING.jump * usual:
+            if np.median(jumps[rows]) > TUNING.jump * typical:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
             score = (
@@ -277,7 +277,7 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     return sizes
 
 
-def _usual(sizes: np.ndarray) -> float:
+def _typical_step(sizes: np.ndarray) -> float:
     """Return the typical step of a signal: the median of its nonzero step sizes (T,); infinity if all are zero."""
     moving = sizes[sizes > 0]
     return float(np.median(moving)) if moving.size else np.inf

@@ -112,8 +112,9 @@ def _equally_long(
 ) -> pa.Table:
     """Return a table of the arrays `names`, all of T rows. Raises LogError if their lengths differ.
 
-    An array (T,) becomes a column, and a matrix (T, n) a column of lists. matrix_columns: columns that are single
-    columns of a matrix. vectors: names of arrays that are vectors, also if they have the shape (T, 1) or (1, T).
+    An array (T,) becomes a column, and a matrix (T, n) a column of lists. matrix_columns: {name: (matrix, index)}
+    for names that are single columns of a matrix. vectors: names of arrays that are vectors, also if they have the
+    shape (T, 1) or (1, T).
     """
     table: dict[str, pa.Array] = {}
     samples = None

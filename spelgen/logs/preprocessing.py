@@ -64,12 +64,18 @@ class Preprocessing:
 
     @property
     def filtered(self) -> bool:
-        """True if q, qd and tau are filtered before windows are cut from the logs; the options must be ``resolved``."""
+        """True if q, qd and tau are filtered before windows are cut from the logs.
+
+        The options must be a result of ``resolved``: before, the cutoff None is not yet decided.
+        """
         return bool(self.cutoff)
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """One remark that states the cutoff if the logs are filtered, else none; the options must be ``resolved``."""
+        """A list with a remark that states the cutoff; [] if the logs are not filtered.
+
+        The options must be a result of ``resolved``.
+        """
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
@@ -78,7 +84,7 @@ class Preprocessing:
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
         """Return the filtered gap-free pieces of the trajectories that have at least `shortest` samples.
 
-        The options must be ``resolved``. Raises LogError for a trajectory without a piece of this length.
+        The options must be a result of ``resolved``. Raises LogError for a trajectory without a piece of this length.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []

@@ -127,8 +127,8 @@ def _unwrap(rows: Rows) -> None:
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - columns["q", joint]) / period)
-        # Signals are shifted by whole periods to a median close to 0. Only angles without a wrap remain unchanged:
-        # their revolution is known.
+        # Other signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
+        # period. Exception: an angle without wraps whose period is one turn is correct as logged.
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:

@@ -68,7 +68,7 @@ class LogSegments:
         # error can state the number of faulty rows in the whole table.
         data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
-            values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
+            values = values_in_si(_rows_of(table, rows), layout, start, rows) if data is None else data[rows]
             self._segments.append(Segment(recording, name, layout, rows, values))
             self._bytes += values.nbytes
         self.rows += table.num_rows
@@ -111,7 +111,7 @@ class LogSegments:
             self._bytes = sum(x.values.nbytes for x in self._segments)
 
 
-def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
+def _rows_of(table: pa.Table, rows: np.ndarray) -> pa.Table:
     """Return a table of the rows with the indices `rows` (T,) of a table; consecutive rows are not copied."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)

@@ -208,7 +208,10 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return {quantity: unit} from the units and words in column names; the unit of times also from the time steps."""
+    """Return {quantity: unit} from the units and words in column names; the unit of times also from the time steps.
+
+    clock: column of the times. by_joint: {quantity: {joint: column}}. table: first rows of the log.
+    """
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():

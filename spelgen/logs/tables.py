@@ -81,7 +81,10 @@ class LogTable(NamedTuple):
 
     @classmethod
     def of(cls, table: pa.Table, mapping: LogMapping, **properties: Any) -> Self:
-        """Return the log table for an Arrow table in memory. properties: remarks, header, recording, see `Layout`."""
+        """Return the log table for an Arrow table in memory.
+
+        properties: values of the attributes `remarks`, `header` and `recording`.
+        """
         return cls(table.schema, lambda names: table, mapping, **properties)
 
 
@@ -188,7 +191,7 @@ def missing_columns(
 ) -> LogError:
     """Return the error about missing columns of a log, with advice for the most likely cause.
 
-    columns: names of all columns of the file.
+    missing: names in the mapping of the columns that are missing. columns: names of all columns of the file.
     """
     of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]

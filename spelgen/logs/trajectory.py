@@ -122,7 +122,7 @@ class Trajectory:
 
     @cached_property
     def regular_steps(self) -> np.ndarray:
-        """Time steps between samples (S,) [s], except gaps, for the sample rate: gaps would bias its mean."""
+        """Time steps between samples that are no gaps, (steps,) [s]; their mean is the sample interval."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 

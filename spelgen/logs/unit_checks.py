@@ -92,8 +92,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
     dq/dt to qd in these units, plus a penalty for units other than SI.
 
-    is_far: True if q, read in rad, has a range of more than two turns, so that rad is implausible. Only units in which
-    q is at most two turns are then considered.
+    is_far: True if q of a revolute joint with limits has no stated unit and, as logged, a range above 4 pi (two turns
+    in rad): units in which |q| would exceed two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
@@ -156,7 +156,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def _rate_by_velocities(signals: JointSignals) -> float | None:
-    """Return the sample rate [Hz] with which qd of all joints would be dq/dt, for logs with wrong times.
+    """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
 
     Return None if the times may be right, or if another unit of the times, such as ms, explains the factor.
     """
@@ -169,7 +169,8 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    # A factor near 1 is more probably an error of the velocities, and a factor of a unit has a check of its own.
+    # A factor near 1 is more probably an error of the velocities. For a factor between two units of time, such as 1000,
+    # the caller reports the unit.
     if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
@@ -281,7 +282,7 @@ def find_copied(signals: JointSignals) -> str | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Return a message if a measured signal of the joint has each value in several consecutive rows."""
+    """Return a message if the values of a measured signal of the joint are each repeated in consecutive rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -311,7 +312,8 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
 def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
     """Return a mask (...) of the signals `values` (T, ...) that are nearly always positive or nearly always negative.
 
-    share: upper bound of the largest magnitude of one sign, divided by the largest magnitude of the other sign.
+    share: a signal is nearly always positive if its smallest value is at least -share times its largest value, and
+    nearly always negative if this is true of -signal.
     """
     below, above = np.maximum(-values.min(axis=0), 0.0), np.maximum(values.max(axis=0), 0.0)
     return np.asarray(np.minimum(below, above) <= share * np.maximum(below, above))

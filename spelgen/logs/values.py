@@ -72,7 +72,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of rows from another topic or publisher: they contain positions only, or no values at all.
+    """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
 
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """

@@ -87,8 +87,8 @@ def cut_windows(
         measured: if True, tau[k] was measured at t[k], and the torque between two samples is the mean of both;
             otherwise torques would be delayed by half a sample. If False, tau[k] is constant from t[k] to t[k+1], as in
             a simulation with zero-order hold.
-        reach: (n, B) break-away displacements of the bristles whose states z are computed, starting from zero at the
-            start of each piece; None: z is not computed.
+        reach: (n, B) break-away displacements of the B bristles of each joint, whose states z are computed, starting
+            from zero at the start of each piece; None: z is not computed.
 
     Raises:
         LogError: if no piece is long enough for a window.

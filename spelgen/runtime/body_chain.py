@@ -133,9 +133,10 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return the accelerations of the point masses at qdd = 0, minus gravity, times sqrt(mass).
+        """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
 
-        The Jacobian of the cache times this vector is the Coriolis, centrifugal and gravity torque.
+        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian``, which has one
+        row per joint, times the returned vector is the Coriolis, centrifugal and gravity torque.
 
         Args:
             cache: configuration cache at q.

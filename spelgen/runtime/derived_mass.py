@@ -175,7 +175,10 @@ class DerivedMass(LinearMass):
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n)."""
+        """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n).
+
+        M' = C + t (M - C) is the corrected mass matrix, see ``DerivedMass``.
+        """
         network, fraction = intermediates
         # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T, since dM' = t dM;
         # the network's outputs are the entries of M.
@@ -203,10 +206,11 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal inverse of the matrix of ``DenseMass``.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of a nominal large matrix.
 
-    That matrix has a row for the x, y and z axis of each joint. The block of the z axes is the nominal M. A
-    row of an x or y axis has only a diagonal entry, equal to the diagonal entry of the same joint's z axis.
+    The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
+    axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
+    the same joint's z axis.
 
     Args:
         joints: joints of the arm, whose nominal armature is added to M.
@@ -240,7 +244,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal in the flattened matrix U, in row-major order.
+        # Indices of the entries below the diagonal of the lower triangular matrix U, in row-major order.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)

@@ -169,9 +169,10 @@ class FrictionLaws(nn.Module):
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
-    """Return 1 / sqrt(velocity^2 + width^2), (..., n) [s/rad, s/m]: the smooth sign of velocity / velocity.
+    """Return 1 / sqrt(velocity^2 + width^2), (..., n) [s/rad, s/m].
 
-    width: velocity at which the smooth sign, velocity times the result, is 0.7, (n,) [rad/s, m/s].
+    The smooth sign of the velocity is the velocity times the result. width: velocity at which the smooth sign
+    is 0.7, (n,) [rad/s, m/s].
     """
     return torch.rsqrt(velocity * velocity + width**2)
 

@@ -26,9 +26,10 @@ class PortHamiltonian(nn.Module):
     classes define M, V and friction; this class has the equations of motion.
 
     Positions q, velocities qd, accelerations qdd, inputs tau and momenta p are (..., n), with any leading
-    dimensions, in rad and Nm for revolute joints, in m and N for prismatic joints. In place of q, methods
-    also accept the configuration cache that ``at`` returns: all quantities that depend on q only, computed
-    once for several calls.
+    dimensions, in rad and Nm for revolute joints, in m and N for prismatic joints. If friction has a
+    state z, it has the deflections of K bristles per joint, (..., n, K) [rad, m]. In place of q, methods also
+    accept the configuration cache that ``at`` returns: all quantities that depend on q only, computed once
+    for several calls.
 
     Args:
         joints: joints of the arm, in the order of q.

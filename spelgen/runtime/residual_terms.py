@@ -124,7 +124,7 @@ class ResidualTerms(nn.Module):
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution of each function and constant to R, (functions + constants, n, n).
+        """Return the contribution to R of each function and constant of R, (functions + constants, n, n).
 
         sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
         """
@@ -134,10 +134,11 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        If no function or constant exceeds its bound, A + R is positive definite: it is the sum of
-        A - diag(d) and diag(d) + R, with d = 1 / (row sums of |A^-1|). By diagonal dominance, the first
-        matrix is positive semi-definite, and the second is positive definite if all row sums of
-        |R| / sqrt(d d^T) are less than one.
+        R is the residual term of M, linear in its functions and constants (see the class). If no function
+        or constant exceeds its bound, A + R is positive definite: it is the sum of A - diag(d) and
+        diag(d) + R, with d = 1 / (row sums of |A^-1|). By diagonal dominance, the first matrix is positive
+        semi-definite, and the second is positive definite if all row sums of |R| / sqrt(d d^T) are less
+        than one.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.
@@ -147,7 +148,7 @@ class ResidualTerms(nn.Module):
         return self.part * smallest
 
     def friction_logarithms(self) -> Tensor:
-        """Return the spline coefficients of the logarithm of the friction factor, (n, SPLINES)."""
+        """Return spline coefficients, (n, SPLINES), of the log of the position-dependent factor on friction."""
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:
@@ -210,7 +211,7 @@ class ResidualTerms(nn.Module):
         return energy
 
     def gradient(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
-        """Return the gradient of the residual terms of 1/2 qd^T M(q) qd - V(q) in q, (..., n) [Nm, N].
+        """Return d/dq of the residual terms of 1/2 qd^T M(q) qd - V(q), (..., n) [Nm, N].
 
         cache: configuration cache at q. qd: velocities, (..., n) [rad/s, m/s].
         """
@@ -303,7 +304,7 @@ class ResidualDynamics(RigidBodyDynamics):
         return cache.gravity - self.residuals.gradient(cache.residual, 0 * cache.gravity)
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return the gradient of 1/2 qd^T M(q) qd - V(q), with residual terms, in q, (..., n) [Nm, N]."""
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), with residual terms, (..., n) [Nm, N]."""
         cache: RigidConfiguration = self.at(q, qd)
         gradient = super().lagrangian_gradient(cache, qd)
         return gradient if self.residuals is None else gradient + self.residuals.gradient(cache.residual, qd)

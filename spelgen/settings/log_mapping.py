@@ -107,7 +107,9 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of all columns; default: SI units. Without a unit, positions in degrees are detected.
+    """Units of the times and of the columns of all joints; default: SI units.
+
+    If no unit of positions is set, positions in degrees are detected.
 
     Attributes:
         t: Time.
@@ -323,15 +325,16 @@ class LogMapping(Group):
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
-        """Return the period, at which logged values wrap, or the sign bit of a quantity of a joint; None if not set.
+        """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
 
-        Both are in the unit of the log. quantity: "q", "qd", "tau" or "u".
+        At a period logged values wrap. Both are in the unit of the log. key: name of the setting. quantity: "q", "qd",
+        "tau" or "u".
         """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
     def period(self, quantity: str, joint: str) -> float:
-        """Return the period, at which logged values wrap, of a quantity of a joint in SI units; 0 if it is not set."""
+        """Return the period in SI units at which logged values of a quantity of a joint wrap; 0 if it is not set."""
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def unit(self, quantity: str, joint: str) -> str | None:
@@ -343,7 +346,7 @@ class LogMapping(Group):
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor that converts logged values of a quantity of a joint to SI units, with the `sign`."""
+        """Return the factor, with sign, that converts logged values of a quantity of a joint to SI units."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:

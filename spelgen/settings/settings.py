@@ -106,8 +106,8 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # The errors of the group must not be raised for attributes with double underscores, which copy and pickle read,
-        # except for those with which pydantic reads the values of the group.
+        # Attributes with double underscores raise AttributeError, because copy and pickle search for some of them. The
+        # attributes `__pydantic...` raise the errors of the group, because pydantic reads the values through them.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)

@@ -65,7 +65,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of all settings that are options of a fit, of any objective, and are not None."""
+        """{name: value} of the settings that are not None and are options of a fit with any objective."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property

@@ -46,7 +46,8 @@ class YamlDocument:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
             raise _yaml_error(error, self.path) from error
-        # The loader of PyYAML raises ValueError for some values, for example for the date 2025-99-99.
+        # The loader of PyYAML raises ValueError for some values, for example for the date 2025-99-99: each is an error
+        # of the file, too.
         except ValueError as error:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
@@ -170,7 +171,7 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         return unknown_name(location, "key", str(location[-1]), names, document)
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
-    # The location of an invalid key of a dict ends with "[key]", which pydantic adds.
+    # Pydantic adds "[key]" to the location of an invalid key of a dict: it is removed.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
         if error_type == "string_pattern_mismatch":

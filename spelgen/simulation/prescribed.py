@@ -129,6 +129,6 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
     elements = np.geomspace(presliding / AS_BUILT.presliding_span, presliding, AS_BUILT.elements)
     # breakaway: displacements (n, K) [rad, m] of K friction elements per joint
     breakaway = scale[:, None] * elements
-    # deflection: (T, n, K) [rad, m]
+    # deflection: (T, n, K) [rad, m] of the K elements of each joint
     deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))
     return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))

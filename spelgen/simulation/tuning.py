@@ -78,7 +78,7 @@ class AsBuiltTuning:
     range_fraction: float = 0.7
     # [rad] Largest break-away displacement of the friction elements of a joint.
     presliding: float = 0.03
-    # [1] Largest break-away displacement of a joint, divided by the smallest one.
+    # [1] Largest break-away displacement divided by the smallest one, of the friction elements of a joint.
     presliding_span: float = 150.0
     # [1] Number of friction elements per joint.
     elements: int = 5

@@ -136,9 +136,10 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield the sets of joints on which a functional of M may depend, in the order of the greedy selection.
+    """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
 
-    Sets close to the tip are first, small sets before large ones.
+    The selection is described in the docstring of the module. Sets close to the tip are first, small sets before large
+    ones.
     """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
@@ -153,19 +154,19 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield two lists of functionals that depend on ``joints`` only: single entries of M, then sums of entries.
+    """Yield two lists of candidates for f_j that depend on ``joints`` only: single entries of M, then sums of entries.
 
-    A functional is a pair of its coefficients in the prime field and in double precision, (entries,) each. Sums with
-    the smallest number of entries are first.
+    A candidate is a linear functional of M: its coefficients in the prime field and in double precision, (entries,)
+    each. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of m functionals that do not change with the positions of all other joints, (m, entries).
-        bound: indices of the entries of M at the pivots of the echelon basis of the changes of M with the other
-            joints. Each row of `kernel` is 1 at one entry that is not in `bound`, and 0 at all others not in `bound`.
-        tried: indices of the entries that were candidates for another set of joints; they are skipped. The function
-            adds the indices of its single entries.
+        kernel: basis of the m functionals that vanish on all changes of M caused by other joints, (m, entries).
+        bound: indices of the entries of M at the pivots of an echelon basis of these changes. Outside of `bound`, a row
+            of `kernel` has a single nonzero element, which is 1.
+        tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
+            entries of this call are added.
     """
     singles = []
     for index in reversed(range(len(spans.keys))):

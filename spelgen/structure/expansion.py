@@ -100,12 +100,14 @@ class Expansion:
     def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
         """Return the coefficient of an inertial parameter in an entry of M or in V, as a polynomial.
 
+        The variables of the polynomial are cosines, sines and lengths that depend on the joint positions.
+
         Args:
-            element: recorded operation of the entry, from ``energies``.
+            element: the entry as a tree of recorded operations, from ``energies``.
             parameter: index of the inertial parameter, 10 body + i.
 
         Raises:
-            TooLarge: the budget of multiplications does not suffice.
+            TooLarge: more multiplications are needed than this object permits.
         """
         # The keys of `values` are the id() of recorded operations: a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}

@@ -86,7 +86,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def row_basis(rows: np.ndarray) -> np.ndarray:
     """Return the reduced row echelon form of ``rows``, (m, n), without zero rows: (rank, n)."""
-    # FLINT raises errors for matrices without rows or columns.
+    # FLINT raises errors for matrices without rows or columns: their row space is empty.
     if not rows.size:
         return rows[:0]
     reduced, rank = _matrix(rows).rref()

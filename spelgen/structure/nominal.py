@@ -119,7 +119,7 @@ def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return the ten inertial parameters of each body as floats, from the URDF or default bodies of 1 kg."""
+    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body."""
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 

@@ -93,7 +93,7 @@ def energies(
         inertias: ten inertial parameters (m, h, I) of each body, in the order of ``Body.inertia``.
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
     """
-    motions = _motions(arm, positions, number)
+    transforms = _joint_transforms(arm, positions, number)
     poses = [
         _Pose(tuple(_vector(row, number) for row in body.rotation), _vector(body.translation, number))
         for body in arm.bodies
@@ -104,7 +104,7 @@ def energies(
     # Parents precede children in `arm.bodies`. In reverse order, all children are added to the composite inertia of a
     # body before its column of M is computed.
     for index, body in reversed(list(enumerate(arm.bodies))):
-        for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
+        for ancestor, entry in _column(arm, poses, transforms, index, composites[index]):
             first, second = body.coordinate, ancestor.coordinate
             # The velocity of a mimic joint is `multiplier` times the velocity of its leader.
             multiplier = body.multiplier * ancestor.multiplier
@@ -116,7 +116,7 @@ def energies(
                 entry = entry + entry
             key = max(first, second), min(first, second)
             mass[key] = mass[key] + entry
-        moved = _posed_inertia(poses[index], _moved_inertia(motions[index], composites[index]))
+        moved = _posed_inertia(poses[index], _inertia_at_zero(transforms[index], composites[index]))
         if body.parent < 0:
             total = _sum(total, moved)
         else:
@@ -148,10 +148,10 @@ def coefficients(
     return [*result.mass.values(), result.potential]
 
 
-def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
-    """Return the rotation about z, or the translation along z, of the joint of each body at ``positions``."""
+def _joint_transforms(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
+    """Return the transform of each body in its joint's frame due to ``positions``: rotation about z or translation."""
     bases = base_denominators(arm)
-    motions = []
+    transforms = []
     for body in arm.bodies:
         position = positions[body.coordinate]
         if body.joint_type == "prismatic":
@@ -160,15 +160,15 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_Pose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (0, 0, slide)))
+            transforms.append(_Pose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (0, 0, slide)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
             if body.offset:
                 c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            motions.append(_Pose(((c, -s, 0), (s, c, 0), (0, 0, 1)), (0, 0, 0)))
-    return motions
+            transforms.append(_Pose(((c, -s, 0), (s, c, 0), (0, 0, 1)), (0, 0, 0)))
+    return transforms
 
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
@@ -212,17 +212,17 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 
 
 def _column(
-    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_Pose], index: int, inertia: _Inertia
+    arm: Chain, poses: Sequence[_Pose], transforms: Sequence[_Pose], index: int, inertia: _Inertia
 ) -> Iterator[tuple[Body, Element]]:
     """Yield (ancestor, entry of M) for a body itself, and then for each of its ancestors.
 
-    The entry is in the row of the body's joint and the column of the ancestor's joint, in the mass matrix of all
+    The entry is in the row of the body's joint and the column of the ancestor's joint. M is the mass matrix of all
     joints, before mimic joints are eliminated.
 
     Args:
         arm: the arm.
         poses: pose of each joint frame in the frame of the parent body.
-        motions: rotation or translation of each joint due to its position.
+        transforms: transform of each body in its joint's frame due to the joint's position.
         index: index of the body in `arm.bodies`.
         inertia: composite inertia of the body and all its descendants.
     """
@@ -239,7 +239,7 @@ def _column(
         yield body, moment[2] if body.joint_type == "revolute" else force[2]
         if body.parent < 0:
             return
-        wrench = _posed_wrench(poses[index], _posed_wrench(motions[index], wrench))
+        wrench = _posed_wrench(poses[index], _posed_wrench(transforms[index], wrench))
         index, body = body.parent, arm.bodies[body.parent]
 
 
@@ -248,14 +248,16 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
     return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
 
 
-def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return the inertia of a body in the joint frame at q = 0, from its inertia in the frame that moves with it.
+def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
+    """Return the inertia of a body about the axes of its joint's frame at q = 0, which does not move with the body.
 
-    motion: rotation about z, or translation along z, of the joint at its current position.
+    inertia: inertia of the body in the frame that moves with it. transform: rotation about z, or translation along z,
+    from the moving frame to the frame at q = 0.
     """
-    s, c, _ = motion.rotation[1]
-    if isinstance(c, int):  # the motion is a translation, whose rotation consists of integers
-        return _translated(motion.translation, inertia)
+    s, c, _ = transform.rotation[1]
+    # The rotation of a prismatic joint is the identity, which consists of integers.
+    if isinstance(c, int):
+        return _translated(transform.translation, inertia)
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     # sin^2 is replaced by 1 - cos^2: otherwise the polynomials would contain both squares, and need a reduction.

@@ -179,9 +179,9 @@ class Spans:
         self._nearer_tip = _sums(self.change_bases[::-1])[::-1]
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
-        """Return samples of the changes of M caused by each of ``joints``, in double precision, (2 S joints, entries).
+        """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        There are 2 S samples per joint.
+        Joints are in increasing order; each has as many samples as ``floats`` has positions, 2 S.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])

@@ -116,7 +116,7 @@ def mesh_file(urdf: Path, name: str) -> Path:
 def _shape(link: str, element: etree._Element) -> LinkShape:
     """Return the shape of a <visual> or <collision> element, read by yourdfpy. Raises ValueError if it is invalid.
 
-    link: name of the link. A mesh has no triangles yet; see `_meshes`.
+    link: name of the link. The triangles of a mesh are not read here, but later for all meshes by `_meshes`.
     """
     import yourdfpy  # yourdfpy is imported here, because it imports trimesh, which takes long.
 
@@ -141,7 +141,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
             scale, file_name = geometry.mesh.scale, geometry.mesh.filename
             size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
-    except Exception as error:  # yourdfpy raises errors of many types.
+    except Exception as error:  # yourdfpy raises errors of many types, so all are caught.
         raise ValueError("a shape that is not valid") from error
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")

@@ -49,7 +49,7 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         meshes: Path, and scale factors along x, y and z, of each mesh.
         output: Binary file to which the arrays are written as an NPZ archive.
     """
-    with suppress(ImportError):  # The module `resource` does not exist on Windows.
+    with suppress(ImportError):  # On Windows there is no module `resource`, and the process has no limits.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)

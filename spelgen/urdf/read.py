@@ -146,11 +146,11 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")
-        elif _is_circle(joint, by_name):
+        elif _is_in_cycle(joint, by_name):
             notes.error(joint.line, where, "a circle of mimic joints", "a leader that moves by itself")
 
 
-def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
+def _is_in_cycle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
     """Whether ``joint`` is part of a cycle of mimic joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint

@@ -77,7 +77,7 @@ class Element:
         return 0 if self.xml is None else int(self.xml.sourceline)
 
     def error(self, got: str, expected: str | None = None, do: str | None = None, key: str = "") -> None:
-        """Add an error about the element, or about one of its attributes."""
+        """Add an error about the element or, if ``key`` is given, its attribute; other arguments as for `UrdfError`."""
         self.notes.error(self.line, f"{self.where} {key}".rstrip(), got, expected, do)
 
     def child(self, tag: str) -> Element:

@@ -30,7 +30,7 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
     """
     # With the option -P of Python, modules in the current folder cannot shadow the package.
     command = [sys.executable, "-P", "-X", "utf8", "-m", "spelgen.urdf.xacro_input", str(path)]
-    # The output of xacro is a file and not a pipe, because output of any size would fill the memory of this process.
+    # xacro writes to a file: a pipe would be read into the memory of this process, and the output may be very large.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(
@@ -57,7 +57,7 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
         return UrdfError("a xacro file, and no package to expand it", file=path, do=do)
     # The message of xacro is cut at 400 characters, because its length is not limited.
     reason = " ".join(" ".join(lines).split())[:400] or f"it ended with code {code}"
-    # Xacro states some exceptions twice, the first time with their class.
+    # Xacro states some exceptions twice, the first time with their class: one statement is removed.
     reason = re.sub(r"^<class '[\w.]+'>: (.+) \1", r"\1", reason)
     return UrdfError(f"xacro cannot expand it ({reason})", file=path, do=f"correct it, or {_BY_HAND}")
 
@@ -80,7 +80,8 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
                         return str(candidate)
         # A package without package.xml is recognised by the name of its folder.
         named = [folder for folder in path.parents if folder.name == package]
-        # The search of xacro raises errors of any type if ROS is absent or does not know the package.
+        # The search of xacro raises errors of any type if ROS is absent or does not know the package: the error below
+        # replaces them.
         with suppress(Exception):
             return str(named[0]) if named else installed(package)
         raise ValueError(
@@ -92,7 +93,7 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
 
 def main(path: str) -> None:
     """Write the expanded URDF to stdout, with the line breaks of the command ``xacro FILE``."""
-    with suppress(ImportError):  # The module `resource` does not exist on Windows.
+    with suppress(ImportError):  # On Windows there is no module `resource`, and no limit of memory.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))

@@ -56,8 +56,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
         # Logs of positions determine only the sum of viscous friction and kd. The sum is fitted as kd, and viscous
-        # friction is negligible: exp(-6) times nominal friction. The Stribeck effect starts from exp(-2) times nominal
-        # friction.
+        # friction is set to a negligible value, exp(-6) times the nominal friction. The initial guess of the Stribeck
+        # effect is exp(-2) times the nominal friction.
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)

@@ -65,8 +65,8 @@ class ServoPosterior(Posterior):
     def unidentifiable(self) -> tuple[str, ...]:
         """Names of the quantities that logs determine only in combinations, or not at all.
 
-        The quantities are masses and first moments, pairs of quantities whose sum has a smaller error than either of
-        them (`SUMS`), and a common factor if no kp is known.
+        Masses and first moments are tested, and pairs of quantities (`SUMS`): a pair is listed if its sum has a smaller
+        error than either quantity. If no kp is known, the common factor of all torques and inertias is listed, too.
         """
         pairs, delays = [], (self.delay,) * self.model.n
         for name, (first, second) in SUMS.items():

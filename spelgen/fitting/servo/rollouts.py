@@ -47,7 +47,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts for the measured motion of `windows`, with the model's current parameters as x0."""
+        """Return the rollouts from the measured states of `windows`; x0 are the model's current parameters."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()

@@ -104,10 +104,10 @@ class JointFunction:
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] to which the torque of this residual term is fitted.
+        """Return values (T,) [Nm, N] of this residual term's torque that explain the torque residual best.
 
-        At each sample it is the torque of the term that minimizes the squared torque residual (n,) of all joints, with
-        the weights 1 / noise^2. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque noise
+        At each sample, the value minimizes the sum over all joints of (residual - effect of the term)^2 / noise^2. The
+        term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque noise
         [Nm, N].
         """
         # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on

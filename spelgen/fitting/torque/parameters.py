@@ -298,9 +298,10 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # The parameters are logarithms: the logarithm of the factor common to all joints adds its variance to all
-            # entries. Bristle fractions have one parameter per joint and bristle, (n, bristles): there is a separate
-            # common factor for bristle 1 of all joints, bristle 2 of all joints, and so on.
+            # The parameters are logarithms, and their prior has a random factor that is common to all joints. The
+            # variance of its logarithm is added to all entries of the covariance matrix of these parameters. Bristle
+            # fractions have one parameter per joint and bristle, (n, bristles): there is a separate common factor for
+            # bristle 1 of all joints, bristle 2 of all joints, and so on.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):

@@ -266,11 +266,11 @@ class TorqueEstimate:
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
-        """Return the estimate with the same x on segments of consecutive samples, and with the current covariance.
+        """Return this estimate, converted to segments of consecutive samples, with a recomputed covariance.
 
-        The estimate may belong to subsampled samples, from which the correlation time of the torque errors cannot be
-        estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`. The noise is converted
-        to the sample interval of the segments.
+        The estimate may have been fitted to a subset of the samples with gaps, from which the correlation time of the
+        torque errors cannot be estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`.
+        The parameters x are unchanged; the noise is converted to the sample interval of the segments.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
