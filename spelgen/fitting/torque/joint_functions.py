@@ -107,8 +107,8 @@ class JointFunction:
         """Return values (T,) [Nm, N] of this residual term's torque that explain the torque residual best.
 
         At each sample, the value minimizes the sum over all joints of (residual - effect of the term)^2 / noise^2. The
-        term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque noise
-        [Nm, N].
+        term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque
+        noise [Nm, N].
         """
         # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on
         # several joints.
