@@ -148,7 +148,7 @@ class ResidualTerms(nn.Module):
         return self.part * smallest
 
     def friction_logarithms(self) -> Tensor:
-        """Return spline coefficients, (n, SPLINES), of the log of the position-dependent factor on friction."""
+        """Return spline coefficients, (n, SPLINES), of the log of the position-dependent friction factor."""
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:

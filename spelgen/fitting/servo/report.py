@@ -189,7 +189,7 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    The ratios are kd, armature and friction divided by kp, each with its 95 % interval. The key
+    The ratios are kd / kp, armature / kp and friction / kp, each with its 95 % interval. The key
     "determined" of a ratio is True if the upper end of its interval is below `ServoTuning.max_factor` times the ratio.
     For dry friction and the dead zone, the logs must also distinguish one from the other (see `identifiable`).
     """
