@@ -28,7 +28,7 @@ ENTRIES = (
 
 @pytest.fixture(scope="module", autouse=True)
 def functions_parsed_once():
-    """For each file, torch's exporter parses the source of 500 functions anew, which takes half a second."""
+    """For each file, the exporter of torch parses the source of 500 functions again, which takes half a second."""
     parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TracedOnnxFunction, "function_ir", parsed)
