@@ -24,7 +24,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.fits import CONFIGS, OWNERS
 from spelgen.settings.settings import Settings
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Group
+from spelgen.settings.yaml_document import Group
 
 DOCS = Path(__file__).parents[1] / "docs"
 OF_TRAINING = ("simulation", "tracking", "training", "comparison")

@@ -1,5 +1,6 @@
 """ONNX Runtime computes the same numbers as the torch model, for any batch size."""
 
+import functools
 import logging
 
 import numpy as np
@@ -7,6 +8,7 @@ import onnx
 import pytest
 import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, readme_results
+from onnxscript.values import TracedOnnxFunction
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.tip import tip_kinematics
@@ -22,6 +24,15 @@ ENTRIES = (
     *("inverse_dynamics", "forward_dynamics", "gravity"),
     *("friction_step", "friction_memory", "tip_pose"),
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def functions_parsed_once():
+    """For each file, the exporter of torch parses the source of 500 functions again, which takes half a second."""
+    parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TracedOnnxFunction, "function_ir", parsed)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -65,11 +65,14 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 def test_an_ascent_direction_ends_the_solver():
     """If steps have the wrong sign, so that no damping lowers the cost, the solver ends with this reason.
 
-    It ends with the reason of a small prediction, if the predicted reduction is negligible.
+    It ends with the reason of a small prediction, if the predicted reduction is negligible. Small dampings that
+    give the same step are tried once.
     """
+    tried = []
 
     class Ascending(Rosenbrock):
         def candidates(self, x, step):
+            tried.append(step)
             yield x - step
 
     problem = Ascending()
@@ -77,6 +80,7 @@ def test_an_ascent_direction_ends_the_solver():
         first = replace(first_state(problem), damping=damping)
         result = levenberg_marquardt(problem, first, max_steps=5)
         assert result.termination is termination and result.state is first
+    assert all((after - before).norm() > 1e-3 * before.norm() for before, after in pairwise(tried))
 
 
 def test_systems_of_a_batch_have_their_own_damping():

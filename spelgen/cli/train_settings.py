@@ -15,8 +15,7 @@ from pydantic import ValidationError
 from spelgen.errors import suggestion
 from spelgen.settings.fits import OWNERS, Adaptation
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count
-from spelgen.settings.yaml_document import explain
+from spelgen.settings.yaml_document import Count, explain
 
 if TYPE_CHECKING:
     from spelgen.fitting.fit import FitOptions

@@ -23,8 +23,7 @@ from spelgen.logs.trajectory import Trajectory, set_aside
 from spelgen.logs.windows import split_validation
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.training import TrainingSettings
-from spelgen.settings.values import Count, Group
-from spelgen.settings.yaml_document import Location, dotted, read_document, validated
+from spelgen.settings.yaml_document import Count, Group, Location, dotted, read_document, validated
 
 YAML = (".yaml", ".yml")
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,60}$")]

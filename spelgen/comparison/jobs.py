@@ -27,7 +27,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig, Rollout, fit_config
 from spelgen.settings.training import ComparisonSettings, TrainingSettings
-from spelgen.settings.values import Group
+from spelgen.settings.yaml_document import Group
 from spelgen.version import __version__
 
 Errors = dict[str, dict[str, float | None]]

@@ -6,11 +6,10 @@
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
@@ -149,25 +148,24 @@ def friction_factor(model: object, q: Tensor) -> Tensor:
     return model.residuals.at(q, model.prepare().residual).friction
 
 
-class _Caller(nn.Module):
-    """Module that calls a given function with its model as argument, since `functional_call` can only call modules."""
-
-    def __init__(self, model: nn.Module) -> None:
-        super().__init__()
-        self.model = model
-
-    def forward(self, function: Callable[..., Result]) -> Result:
-        """Return function(model)."""
-        return function(self.model)
-
-
 def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
     """Return function(model) at the given parameters, without changing the model.
 
     The result is differentiable with respect to the given parameters. Parameters that are not given have the values of
     the model.
     """
-    named = {f"model.{name}": tensor for name, tensor in parameters.items()}
-    # tie_weights is off: models have no tied weights, and the search for them takes longer than most functions.
-    result: Result = functional_call(_Caller(model), named, (function,), tie_weights=False)
-    return result
+    # The tensors of the model are replaced while the function is evaluated, as in `torch.func.functional_call`, which
+    # takes longer than most of the functions.
+    replaced = []
+    for name, tensor in parameters.items():
+        path, _, key = name.rpartition(".")
+        module = model.get_submodule(path)
+        own = module._parameters if key in module._parameters else module._buffers
+        tensors = cast("dict[str, Tensor]", own)
+        replaced.append((tensors, key, tensors[key]))
+        tensors[key] = tensor
+    try:
+        return function(model)
+    finally:
+        for tensors, key, tensor in replaced:
+            tensors[key] = tensor

@@ -77,7 +77,7 @@ def residual_terms(model: object) -> ResidualTerms | None:
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
     """Return True if friction of ``dynamics`` depends on a friction state: the deflections z of bristles."""
     # The test of a class is first: isinstance of a protocol takes ten times as long.
-    if isinstance(dynamics, RigidBodyDynamics):
+    if isinstance(dynamics, PortHamiltonian | VelocityState):
         return dynamics.elements > 0
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 

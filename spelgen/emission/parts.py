@@ -13,11 +13,35 @@ import numpy as np
 
 from spelgen.design import BREAKAWAY, SERVO_STRIBECK_ROUNDING
 from spelgen.emission.source import Call, Code, call
-from spelgen.emission.tuning import TUNING
 from spelgen.spec import ConstantSpec, JointSpec, LinkSpec, ModelSpec, OutputSpec
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
 FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code("mass_entries")
+
+
+@dataclass(frozen=True)
+class NetworkTuning:
+    """Constants of untrained networks: numbers of hidden units, and the scale of inputs."""
+
+    # [1] Factor on the encoded positions that are inputs of friction networks: positions are initially weaker inputs
+    # than velocities, which are divided by typical speeds and are of the order of one.
+    position_sensitivity: float = 0.1
+    # [1] Number of hidden units per joint of the friction networks.
+    friction_units: int = 8
+    # [1] Smallest number of hidden units per group of outputs (of a network) that depend on the same joints.
+    min_units: int = 4
+    # [1] Smallest number of hidden units per group of outputs of a Kolmogorov-Arnold network, whose units have a
+    # learned function per edge.
+    min_kan_units: int = 2
+    # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
+    # option `width`); smaller, because each edge has several weights.
+    kan_fraction: float = 0.25
+    # [1] Number of hidden units of the network of V, divided by the number of the network of M; smaller, because V is a
+    # single output.
+    potential_fraction: float = 0.5
+
+
+TUNING = NetworkTuning()
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """The function ``derive_spec``: the ``ModelSpec`` of an arm, from its structure, nominal values and settings."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -11,7 +12,6 @@ from spelgen.arm.configured_arm import Arm
 from spelgen.arm.rational import Vector
 from spelgen.design import Design, load_design
 from spelgen.emission.parts import mean_mass, rounded
-from spelgen.emission.tuning import TUNING
 from spelgen.errors import SettingsError
 from spelgen.settings.settings import JointSettings
 from spelgen.spec import (
@@ -35,6 +35,49 @@ from spelgen.structure.nominal import (
     reference_factor,
 )
 from spelgen.structure.structure import Structure, derive
+
+
+@dataclass(frozen=True)
+class ModelTuning:
+    """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
+
+    # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
+    # positions. These eigenvalues are generalised ones, relative to the mean of the nominal M.
+    margin: float = 0.1
+    # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
+    friction_of_effort: float = 0.02
+    # [1] Typical friction, divided by the joint's typical torque for gravity and unit acceleration, for joints without
+    # an effort limit.
+    friction_of_torque: float = 0.1
+    # [Nm, N] A larger effort limit in a URDF is regarded as a placeholder for an unknown limit.
+    largest_effort: float = 1e4
+    # [rad/s, m/s] A larger velocity limit in a URDF is regarded as a placeholder for an unknown limit.
+    largest_speed: float = 100.0
+    # [1] Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough that the
+    # decimals of a URDF are reproduced.
+    inertia_digits: int = 12
+    # [1] Smallest allowed principal second moment of mass of a body about its center of mass, divided by the largest:
+    # large enough that rounding errors do not make the body physically inconsistent.
+    min_second_moment: float = 1e-10
+    # [rad/s] Typical speed of a revolute joint without a velocity limit.
+    angular_speed: float = 2.0
+    # [m/s] Typical speed of a prismatic joint without a velocity limit.
+    linear_speed: float = 0.5
+    # [s] Time in which the effort limit accelerates the armature of a drive with unknown rotor inertia to full speed:
+    # the armature is initially this time * effort / speed.
+    rise: float = 0.02
+    # [Nm, N] Full effort of a servo without an effort limit, which determines the initial kp.
+    servo_effort: float = 5.0
+    # [rad, m] Position error at which a servo with unknown kp initially has its full effort.
+    full_effort_at: float = 0.5
+    # [s] Initial ratio kd / kp of a servo.
+    servo_lag: float = 0.05
+    # [1] Armature of a drive of unknown rotor inertia, effort or speed, divided by the joint's diagonal entry of the
+    # nominal M.
+    min_armature: float = 0.01
+
+
+TUNING = ModelTuning()
 
 
 def derive_spec(arm: Arm, options: Options) -> ModelSpec:

@@ -13,8 +13,7 @@ from pydantic import Field, field_validator
 from spelgen.arm.arm import Chain
 from spelgen.errors import ArmError, collect
 from spelgen.excitation.tuning import TUNING
-from spelgen.settings.values import Group, Number, Positive
-from spelgen.settings.yaml_document import read_document, validated
+from spelgen.settings.yaml_document import Group, Number, Positive, read_document, validated
 from spelgen.urdf.robot import UrdfJoint
 
 SPEEDS = {"revolute": TUNING.revolute_speed, "prismatic": TUNING.prismatic_speed}

@@ -168,7 +168,7 @@ def _accepted_step(
     The damping is raised until a step lowers the cost. min_decrease: smallest predicted decrease of the cost for which
     a step is tried.
     """
-    damping = state.damping
+    damping, rejected = state.damping, torch.full_like(normal.descent, torch.inf)
     for _ in range(TUNING.max_trials):
         step = normal.step(damping)
         predicted = normal.predicted_decrease(step)
@@ -176,11 +176,15 @@ def _accepted_step(
         # smaller one.
         if predicted < max(TUNING.min_predicted_decrease * state.cost, min_decrease):
             return Termination.SMALL_PREDICTION
-        best = _best_candidate(problem, state, step, predicted)
-        if best.cost < state.cost:
-            # The damping has a lower bound: from a much smaller value, many rejected steps would be needed to raise it
-            # again.
-            return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
+        # A damping far below the eigenvalues of the scaled H hardly changes the step. A step that is nearly equal to
+        # the last rejected step would be rejected, too, and its cost is not computed.
+        if (step - rejected).abs().max() > TUNING.same_step * step.abs().max():
+            best = _best_candidate(problem, state, step, predicted)
+            if best.cost < state.cost:
+                # The damping has a lower bound: from a much smaller value, many rejected steps would be needed to raise
+                # it again.
+                return replace(best, damping=max(damping / TUNING.damping_factor, TUNING.min_damping))
+            rejected = step
         damping *= TUNING.damping_factor
     return Termination.NO_DECREASE
 

@@ -22,8 +22,7 @@ from spelgen.labels import LAST_PART
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.settings.fits import CONFIGS, FitConfig, Objective, Substeps
 from spelgen.settings.log_mapping import LogMapping
-from spelgen.settings.values import Count, NonNegative, Positive, Whole
-from spelgen.settings.yaml_document import validated
+from spelgen.settings.yaml_document import Count, NonNegative, Positive, Whole, validated
 
 Content = dict[str, Any]
 """Content of a file of a run folder, key -> value: a JSON object, or a dictionary that torch saved."""

@@ -20,6 +20,9 @@ class FittingTuning:
     # [1] Largest number of dampings tried for one step. From the smallest damping, this reaches 1e5, where steps are
     # negligible.
     max_trials: int = 15
+    # [1] After a rejected step, a step is tried only if a component differs by more than this fraction of the largest
+    # component: otherwise both steps are nearly equal.
+    same_step: float = 1e-3
     # [1] Smallest predicted decrease of the cost for which a step is tried, as a fraction of the cost; smaller ones are
     # within rounding errors.
     min_predicted_decrease: float = 1e-10

@@ -175,14 +175,16 @@ class GeometryProblem:
         total = np.square(tau).sum(axis=0)
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
+        flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
         for _ in range(6):  # number of reweightings: further ones change the cost by less than 0.1
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
-            matrix = np.tensordot(weights, normal, 1)
+            matrix = (weights[None] @ flat).reshape(precision.shape)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
-            ridge = 1e-9 * np.diag(matrix) + 1e-9
-            ridge[: self._bodies] = 0.0
-            matrix += scale * precision + np.diag(ridge)
+            drives = np.diagonal(matrix)[self._bodies :]
+            ridge = np.append(np.zeros(self._bodies), 1e-9 * drives + 1e-9)
+            matrix += scale * precision
+            np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
             x = solution(matrix, weights @ right + scale * precision @ mean)
             squares = total - 2 * right @ x + (normal @ x) @ x
             errors = np.maximum(squares / variance, 0.0)
@@ -371,6 +373,8 @@ def _with_unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Rows and columns are divided by the scale, the square root of the diagonal. A tiny ridge makes the matrix
     invertible.
     """
-    scale = np.sqrt(np.diag(matrix))
+    scale = np.sqrt(np.diagonal(matrix))
     scale = np.where(scale > 0, scale, 1.0)
-    return matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(matrix)), scale
+    scaled = matrix / (scale[:, None] * scale)
+    np.fill_diagonal(scaled, np.diagonal(scaled) + 1e-12)
+    return scaled, scale

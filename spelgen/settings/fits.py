@@ -10,8 +10,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from spelgen.errors import OptionError, SettingsError, suggestion
-from spelgen.settings.values import Count, Group, NonNegative, Positive, Whole
-from spelgen.settings.yaml_document import validated
+from spelgen.settings.yaml_document import Count, Group, NonNegative, Positive, Whole, validated
 
 Objective = Literal["torque", "momentum", "rollout", "servo"]
 Optimizer = Literal["adamw", "lbfgs"]

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from spelgen.errors import SettingsError
-from spelgen.settings.values import Group, Number, Positive
+from spelgen.settings.yaml_document import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}

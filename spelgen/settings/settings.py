@@ -18,8 +18,18 @@ from spelgen.errors import Diagnostic, SettingsError, SpelgenError, SpelgenError
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.simulation import SimulationSettings, TrackingSettings
 from spelgen.settings.training import ComparisonSettings, TrainingSettings
-from spelgen.settings.values import Group, Inputs, NonNegative, Number, Positive
-from spelgen.settings.yaml_document import Location, YamlDocument, read_document, unknown_name, validated
+from spelgen.settings.yaml_document import (
+    Group,
+    Inputs,
+    Location,
+    NonNegative,
+    Number,
+    Positive,
+    YamlDocument,
+    read_document,
+    unknown_name,
+    validated,
+)
 
 OF_A_STEP = ("simulation", "tracking", "training", "comparison", "logs")
 """Groups of keys that only one step uses, such as simulation or training; all other keys describe the arm."""

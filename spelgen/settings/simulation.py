@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from spelgen.settings.values import Count, Group, Inputs, NonNegative, Number, Positive, Share, Whole
+from spelgen.settings.yaml_document import Count, Group, Inputs, NonNegative, Number, Positive, Share, Whole
 
 
 class SimulationSettings(Group):

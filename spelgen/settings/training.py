@@ -6,7 +6,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from spelgen.settings.fits import OWNERS, GaussianPrior, Objective, Optimizer, Solver, Substeps, Window
 from spelgen.settings.log_mapping import LONGEST_DELAY
-from spelgen.settings.values import Count, Group, NonNegative, Number, Positive, Whole
+from spelgen.settings.yaml_document import Count, Group, NonNegative, Number, Positive, Whole
 
 PREPROCESSING = {"cutoff", "decimation", "gap", "torque_delay"}
 OF_LOGS = PREPROCESSING | {"validation_fraction", "seed"}
