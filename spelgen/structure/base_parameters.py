@@ -16,7 +16,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Chain
-from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
+from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, base_name, parameter_name
 from spelgen.structure import field
 from spelgen.structure.recursion import Position, coefficients
 from spelgen.structure.sampling import regressor_rows
@@ -63,7 +63,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
         weights = tuple((index, Fraction(int(x.p), int(x.q))) for index, x in pairs if x)
         # The first nonzero element of a row is its pivot, and equal to 1: the first parameter has the coefficient 1.
         first, _ = weights[0]
-        name = parameter_name(first) + "R" * (len(weights) > 1)
+        name = base_name(parameter_name(first), len(weights))
         result.append(BaseParameter(name, first, weights, _value(arm, weights)))
     return tuple(result)
 
