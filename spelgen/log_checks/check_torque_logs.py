@@ -34,6 +34,7 @@ from spelgen.log_checks.robot_checks import (
     torque_factors,
 )
 from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.dynamics_samples import NEEDED
 from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
@@ -98,6 +99,9 @@ class TorqueLogs:
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
+        if moving is None:
+            message = f"no samples for identify and for fits of torques: they need {NEEDED}"
+            summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
         if is_sound:
             # with unknown motor gains a wrong hypothesis about the log may have the lowest cost
             # unfiltered samples of logs whose sample rate is too low for accelerations
