@@ -17,6 +17,8 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
+# [1] Smallest factor between torques and the URDF's gravity that wrong inertials do not explain.
+OTHER_UNIT = 5.0
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
@@ -209,7 +211,12 @@ class TorqueUnit(WrongScale):
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
         # such factors also correct errors of the URDF's masses, and so lower the cost a little; no factor explains a
         # torque that does not resemble the URDF's, such as its magnitude
-        if best.cost < lowest.cost - GEOMETRY.needed and best.errors.max() <= GEOMETRY.unexplained:
+        is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
+        if (
+            is_unit
+            and best.cost < lowest.cost - GEOMETRY.needed
+            and best.errors.max() <= GEOMETRY.unexplained
+        ):
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
@@ -238,6 +245,11 @@ class TorqueUnit(WrongScale):
         """Return a code for factors between 0.1 and 10; inertials of a URDF are never wrong by a factor of ten."""
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
+
+
+def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
+    """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
+    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(OTHER_UNIT))
 
 
 class PositionUnit(WrongScale):

@@ -67,6 +67,11 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which a log is probably in another order.
     unexplained: float = 0.15
+    # [1] Relative residual variance above which a hypothesis is no advice. Mended logs of recorded arms have at most
+    # 0.07 in the mean of the joints, and at most 0.27 at a joint whose torque is mostly friction.
+    no_advice: float = 0.2
+    # [1] Relative residual variance of the unchanged log above which its torques are no joint torques.
+    no_torque: float = 0.6
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.

@@ -11,7 +11,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
-from spelgen.identification.column_faults import UNITS
+from spelgen.identification.column_faults import UNITS, is_other_unit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
@@ -22,7 +22,7 @@ from spelgen.identification.motion_samples import DriveLog, MotionSamples, joine
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.geometry_finding import geometry_finding
+from spelgen.log_checks.geometry_finding import UNEXPLAINED, find_unexplained, geometry_finding
 from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
@@ -192,11 +192,19 @@ class TorqueLogs:
             summary.errors.extend(limits.errors)
             return False
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        unexplained = find_unexplained(problem, unchanged, better[0] if better else unchanged)
+        if unexplained:
+            summary.errors.extend(unexplained if UNEXPLAINED not in accepted else [])
+            return UNEXPLAINED in accepted
         if not better:
             summary.notes.extend(_link_notes(problem, unchanged))
             return True
-        if {fault.code for fault in better[0].hypothesis.faults} <= accepted:
+        faults = better[0].hypothesis.faults
+        if {fault.code for fault in faults} <= accepted:
             return True
+        # gravity alone shows another unit of a torque, and may as well show one wrong link of the URDF
+        links = list(_link_notes(problem, unchanged)) if not any(fault.needed for fault in faults) else []
+        summary.notes.extend(links if len(links) == 1 else [])
         corrections = []
         for fit in better:
             corrections.append(
@@ -221,12 +229,12 @@ class TorqueLogs:
         loads = of_urdf.std(axis=0)
         candidates = torque_factors(evidence, undeclared, loads > TUNING.loaded * loads.max())
         ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
-        if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
+        if all(undeclared) and ratio > 0 and is_other_unit(ratio):
             candidates.append(rounded_factor(1 / ratio) * ones)
         # torques a thousandth as large show that mNm in the mapping is wrong, even if the masses of the URDF are wrong
         is_milli = np.array([self._mapping.unit("tau", name) == "mNm" for name in names])
         for factor in candidates:
-            is_unit = is_milli & (np.abs(factor) > 1e3 / 5) & (np.abs(factor) < 1e3 * 5)
+            is_unit = is_milli & ~is_other_unit(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
         # velocities must have the unit of the positions per second, so that both are changed by the same factor
         units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
@@ -271,24 +279,22 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose mass or first moment (mass times centre of mass) is far from the URDF's.
 
-    Of the first moment, the component along the URDF's is compared. A difference must be large enough to be visible in
-    the torques, since wrong parameters of small distal bodies can compensate each other.
+    Of the first moment, the component along the URDF's is compared. The difference must change the torque of a joint by
+    a visible part, since wrong parameters of bodies that hardly affect the torques are no matter.
     """
-    visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
-    gravity = float(np.linalg.norm(fit.hypothesis.gravity))
-    levers: list[float] = []  # [m] length of the chain from the first joint to each body
+    rows, _ = problem.equations(fit.hypothesis)
+    torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
     for k, body in enumerate(problem.arm.bodies):
-        length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
-        levers.append(0.0 if body.parent < 0 else levers[body.parent] + length)
         first = 10 * k
-        quantities = (
-            ("first moment (mass times centre of mass)", slice(first + 1, first + 4), 1.0),
-            ("mass", slice(first, first + 1), levers[k]),
-        )
-        for name, block, lever in quantities:
+        quantities = {
+            "first moment (mass times centre of mass)": slice(first + 1, first + 4),
+            "mass": slice(first, first + 1),
+        }
+        for name, block in quantities.items():
             stated, found = problem.prior_mean[block], fit.parameters[block]
             size = float(np.linalg.norm(stated))
-            if not size or float(np.linalg.norm(found - stated)) * lever * gravity < visible:
+            effect = (rows[..., block] @ (found - stated)).std(axis=0)
+            if not size or not (effect > 0.5 * torque).any():
                 continue
             axis = stated / size
             ratio = float(axis @ found) / size

@@ -11,6 +11,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
+from spelgen.identification.column_faults import is_other_unit
 from spelgen.identification.motion_samples import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
@@ -172,12 +173,12 @@ def torque_factors(
         if factor is None or not (is_known and undeclared[k] and loaded[k]):
             continue
         seen.append(factor)
-        if not 1 / 5 < abs(factor) < 5:
+        if is_other_unit(factor):
             single = np.ones(len(joints))
             single[k] = rounded_factor(1 / factor)
             factors.append(single)
     median = float(np.median(seen)) if seen else 1.0
-    if all(undeclared) and not 1 / 5 < abs(median) < 5:
+    if all(undeclared) and is_other_unit(median):
         factors.append(np.full(len(joints), rounded_factor(1 / median)))
     return factors
 
