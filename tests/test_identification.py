@@ -67,7 +67,7 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     base = base_parameters(arm, FrictionModel())
     inertial = 10 * len(arm.bodies)
     assert base.bodies == len(exact) == inspect(path).to_dict()["base_parameters"]
-    # drives may add terms: the rotor of a symmetric last link cannot be told from the link
+    # drives may add terms: the rotor of a symmetric last link acts as the link does
     names = [name.removesuffix("R") for name in base.names[: base.bodies]]
     assert names == [each.name.removesuffix("R") for each in exact]
     assert {each.name for each in inspect(path).closed_forms().base} == {each.name for each in exact}

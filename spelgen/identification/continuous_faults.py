@@ -157,7 +157,7 @@ class JointClock(Fault):
     advice = "no setting corrects it: log all joints with one clock"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with a delay that changes, if the base has a constant delay; else those that a step shows."""
+        """Yield the fit with a delay that changes, if the base has a constant delay; else near a delay of 0."""
         delay = base.hypothesis.delay
         if delay.any() and not base.hypothesis.drift.any():
             faults = tuple(x for x in base.hypothesis.faults if not isinstance(x, Delay))

@@ -72,11 +72,13 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         base = min(fits, key=RANK)
         tried = _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, base)], base)
         better = min(tried, key=RANK)
-        # orders of all joints are searched only if no single correction explains the torques
+        # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
+        # of other signals may be nearer than the right one
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
-        if base is unchanged and is_wrong and better.errors.max() > GEOMETRY.explained:
+        is_open = better.errors.max() > GEOMETRY.explained or better.hypothesis.drift.any()
+        if base is unchanged and is_wrong and is_open:
             orders = [fit for fault in faults for fit in fault.thorough_fits(coarse, base)]
             tried += _weighed(coarse, orders, base)
         if min(tried, key=RANK).cost > base.cost - GEOMETRY.needed:

@@ -202,7 +202,7 @@ class TorqueLogs:
         faults = better[0].hypothesis.faults
         if {fault.code for fault in faults} <= accepted:
             return True
-        # gravity alone shows another unit of a torque, and may as well show one wrong link of the URDF
+        # the evidence for another unit is gravity, which one wrong link of the URDF may change as well
         links = list(_link_notes(problem, unchanged)) if not any(fault.needed for fault in faults) else []
         summary.notes.extend(links if len(links) == 1 else [])
         corrections = []

@@ -76,8 +76,8 @@ def find_unexplained(
         return []
     names = [name for name, is_wrong in zip(problem.arm.joint_names, wrong, strict=True) if is_wrong]
     got = (
-        "torques that no hypothesis about senses, order, zeros, units and gravity explains: the best one leaves "
-        f"{min(remaining, 1.0):.0%} of the variance"
+        "torques that no hypothesis about senses, order, zeros, units and gravity explains: "
+        f"{min(remaining, 1.0):.0%} of the variance remains"
     )
     do = (
         "check that the columns are the torques of these joints, with their sign and at the times of the positions; "
