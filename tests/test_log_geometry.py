@@ -245,7 +245,7 @@ def exact_log_and_mistyped_arm(arm, k, factor):
 
 @pytest.mark.parametrize(("arm", "k"), [("ur10e", 3), ("ur10e", 5), ("rpr", 2)], indirect=["arm"])
 def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
-    """Ten times the mass of a link that only other joints carry, or whose torque is small compared with other torques."""
+    """Ten times the mass of a link that only other joints carry, or whose own torque is relatively small."""
     log, mistyped, link = exact_log_and_mistyped_arm(arm, k, 10)
     report = check_logs([log], mistyped)
     assert report.errors == ()

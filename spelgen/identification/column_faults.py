@@ -110,8 +110,13 @@ class WrongScale(Fault):
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the fits with each candidate."""
+        return self._scaled_by(self.factors, problem, base)
+
+    def _scaled_by(
+        self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
+    ) -> Iterator[HypothesisFit]:
         reading = base.hypothesis
-        for factor in self.factors:
+        for factor in factors:
             # the offset in the mapping may have been measured with the right or with the wrong sign
             offsets = {x.tobytes(): x for x in (reading.offset, np.sign(factor[0]) * reading.offset + 0.0)}
             for offset in offsets.values():
@@ -181,7 +186,7 @@ class TorqueSense(WrongScale):
 
 
 class TorqueUnit(WrongScale):
-    """Torques in another unit.
+    """Torques in another unit, which has a factor larger than 5.
 
     The evidence for a factor is the magnitude of the gravity in the torques, and no decrease of the cost is required:
     light bodies can explain torques that are too small.
@@ -192,16 +197,38 @@ class TorqueUnit(WrongScale):
     needed = 0.0
     evidence = "by the URDF's gravity"
 
+    def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
+        """Define the candidates.
+
+        factors: factors (n,) on the torques. is_open: (n,) True for joints whose torque may have another unit.
+        is_milli: (n,) True for joints whose torques are declared in mNm.
+        """
+        super().__init__([])
+        self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
+
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the fits with each candidate, and with a factor of its own for each joint if the factors differ."""
-        if self in base.hypothesis.faults or not self.factors:
+        is_open, is_found = self._is_open, self in base.hypothesis.faults
+        candidates = [] if is_found else [x.copy() for x in self._torque_factors]
+        if is_open.all():
+            # Under a hypothesis with other senses or orders, the gravity in the torques has another magnitude. A factor
+            # that was found with a wrong sense is corrected.
+            fitted, of_urdf = problem.gravity_torques(base)
+            ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
+            if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
+                candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+        if not candidates:
             return
-        fits = list(super().fits(problem, base))
+        for factor in candidates:
+            # mNm in the mapping is wrong, whatever the masses of the URDF
+            is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
+            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
+        fits = list(self._scaled_by(scales, problem, base))
         yield from fits
+        if is_found:
+            return
         best = lowest = min(fits, key=lambda fit: fit.cost)
-        is_open = np.any(
-            [factor[1] != 1 for factor in self.factors], axis=0
-        )  # not of a unit that is declared
         # the couplings of the joints show the ratios of the factors, and the URDF's masses a common factor
         for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
             exponent = minimize_scalar(
@@ -250,6 +277,18 @@ class TorqueUnit(WrongScale):
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
     """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(OTHER_UNIT))
+
+
+def rounded_factor(factor: float) -> float:
+    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
+
+    One digit is enough if it changes the factor by less than 10 %.
+    """
+    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
+        # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
+        return float(np.copysign(1e-3, factor))
+    one = float(f"{factor:.1g}")
+    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 class PositionUnit(WrongScale):

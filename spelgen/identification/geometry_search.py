@@ -29,12 +29,12 @@ RANK = attrgetter("rank")
 
 
 def kinds_of_faults(
-    arm: Chain, torque_factors: Sequence[np.ndarray] = (), position_scale: np.ndarray | None = None
+    arm: Chain, torque_unit: TorqueUnit | None = None, position_scale: np.ndarray | None = None
 ) -> tuple[Fault, ...]:
     """Return all kinds of faults of logs of an arm with n joints that the search corrects.
 
-    torque_factors: candidates (n,) for factors on the torques. position_scale: (n,) factor from logged positions to SI
-    units; None: the unit of positions is right.
+    torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
+    logged positions to SI units; None: the unit of positions is right.
     """
     n, units = len(arm.coordinates), list[np.ndarray]()
     if position_scale is not None:
@@ -47,7 +47,7 @@ def kinds_of_faults(
         JointSense(n),
         TorqueSense(n),
         PositionUnit(units),
-        TorqueUnit([np.stack([np.ones(n), factor]) for factor in torque_factors]),
+        *([] if torque_unit is None else [torque_unit]),
         ZeroOffset(),
         Delay(),
         JointClock(),

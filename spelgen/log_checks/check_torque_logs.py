@@ -11,7 +11,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
-from spelgen.identification.column_faults import UNITS, is_other_unit
+from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
@@ -30,7 +30,6 @@ from spelgen.log_checks.robot_checks import (
     TUNING,
     JointEvidence,
     fit_gravity,
-    rounded_factor,
     torque_factors,
 )
 from spelgen.logs.checks import Check, Findings, run_checks
@@ -202,9 +201,10 @@ class TorqueLogs:
         faults = better[0].hypothesis.faults
         if {fault.code for fault in faults} <= accepted:
             return True
-        # the evidence for another unit is gravity, which one wrong link of the URDF may change as well
-        links = list(_link_notes(problem, unchanged)) if not any(fault.needed for fault in faults) else []
-        summary.notes.extend(links if len(links) == 1 else [])
+        # the evidence for another unit of one torque is gravity, which a wrong link of the URDF may change as well
+        changed = better[0].hypothesis.scale != problem.unchanged.scale
+        if changed.sum() == 1 and not any(fault.needed for fault in faults):
+            summary.notes.extend(_link_notes(problem, unchanged))
         corrections = []
         for fit in better:
             corrections.append(
@@ -222,25 +222,19 @@ class TorqueLogs:
 
         A unit of torques that the mapping states is not changed, unless it is mNm.
         """
-        names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
-        undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
+        names = self._arm.chain.joint_names
+        units = [self._mapping.unit("tau", name) for name in names]
+        is_milli = np.array([unit == "mNm" for unit in units])
+        is_open = is_milli | np.array([unit is None for unit in units])
         coarse = problem.thinned(GEOMETRY.coarse_samples)
-        fitted, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
+        _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
         loads = of_urdf.std(axis=0)
-        candidates = torque_factors(evidence, undeclared, loads > TUNING.loaded * loads.max())
-        ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
-        if all(undeclared) and ratio > 0 and is_other_unit(ratio):
-            candidates.append(rounded_factor(1 / ratio) * ones)
-        # torques a thousandth as large show that mNm in the mapping is wrong, even if the masses of the URDF are wrong
-        is_milli = np.array([self._mapping.unit("tau", name) == "mNm" for name in names])
-        for factor in candidates:
-            is_unit = is_milli & ~is_other_unit(factor / 1e3)
-            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
         # velocities must have the unit of the positions per second, so that both are changed by the same factor
-        units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
+        motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
-        scale = problem.unchanged.scale[0] if units <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, candidates, scale)
+        scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
+        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning about a coupling of motors that the logs show, or else a note on a delay of the torques."""

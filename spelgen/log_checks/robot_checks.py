@@ -11,7 +11,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.identification.column_faults import is_other_unit
+from spelgen.identification.column_faults import is_other_unit, rounded_factor
 from spelgen.identification.motion_samples import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
@@ -181,18 +181,6 @@ def torque_factors(
     if all(undeclared) and is_other_unit(median):
         factors.append(np.full(len(joints), rounded_factor(1 / median)))
     return factors
-
-
-def rounded_factor(factor: float) -> float:
-    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
-
-    One digit is enough if it changes the factor by less than 10 %.
-    """
-    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
-        return float(np.copysign(1e-3, factor))
-    one = float(f"{factor:.1g}")
-    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
