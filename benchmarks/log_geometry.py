@@ -153,15 +153,16 @@ def compared(problem: GeometryProblem) -> list[HypothesisFit]:
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two readings are the same but for small angles."""
+    """Whether two readings are the same but for small angles, and a delay of the whole log."""
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
+    delay, drift = one.delay - other.delay, one.drift - other.drift
     gravity = np.array(one.gravity) - np.array(other.gravity)
     return bool(
         (one.source == other.source).all()
         and np.allclose(one.scale, other.scale)
         and np.abs(turn).max() < NEAR
-        and np.abs(one.delay - other.delay).max() < NEAR_DELAY
-        and SECONDS * np.abs(one.drift - other.drift).max() < NEAR_DELAY
+        and np.abs(delay - delay.mean()).max() < NEAR_DELAY
+        and SECONDS * np.abs(drift - drift.mean()).max() < NEAR_DELAY
         and np.linalg.norm(gravity) < NEAR * 9.81
     )
 

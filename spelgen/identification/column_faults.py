@@ -166,9 +166,11 @@ class JointSense(WrongScale):
     def text(self, correction: Correction) -> str:
         """Return a description of the signals of the opposite sense."""
         motion, torque = correction.factors
-        if (torque[motion < 0] < 0).all():
+        is_reversed = torque[motion < 0] < 0
+        if is_reversed.all():
             return "positions, velocities and torques of the opposite sense"
-        return "positions and velocities of the opposite sense, and torques of the right one"
+        right = "torques of the right one" if not is_reversed.any() else "torques of either sense"
+        return f"positions and velocities of the opposite sense, and {right}"
 
 
 class TorqueSense(WrongScale):

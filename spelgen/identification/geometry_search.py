@@ -70,7 +70,11 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     # explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
-        tried = _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, base)], base)
+        # one fault of two may look like another one: the first correction is then left open
+        is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
+        tried: list[HypothesisFit] = []
+        for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
+            tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
         # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
         # of other signals may be nearer than the right one

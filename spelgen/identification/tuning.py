@@ -61,6 +61,8 @@ class LogGeometryTuning:
     slight: float = 3.0
     # [1] Number of the best hypotheses that are also compared with hysteresis.
     weighed: int = 10
+    # [1] Number of the best hypotheses to which a further correction is added if the best one is not enough.
+    beam: int = 3
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
