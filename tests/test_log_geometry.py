@@ -151,6 +151,15 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
     assert check_logs([read], again).errors == ()
 
 
+def test_two_reversed_joints_are_not_taken_for_a_third(shared):
+    """The best single correction is a wrong one, the reversed torque of a joint whose position is reversed."""
+    arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
+    wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
+    error = told(arm, wrong)
+    assert "'joints: {joint2: {sign: -1, gain: -1}, joint5: {sign: -1}}'" in error
+    assert "torques of either sense" in error
+
+
 @pytest.mark.parametrize("angle", [90, 180, -90, 37])
 def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     rng = np.random.default_rng(angle % 360)
