@@ -8,7 +8,7 @@ TOOLS := $(VENV)/installed-tools
 DEMO := demo
 MINUTES ?= 20
 
-# The networks are tiny: more threads than one only cost time, and one makes runs repeatable.
+# One thread: the networks are too small to gain from more, and the results are then reproducible.
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
@@ -42,7 +42,7 @@ demo: $(STAMP) ## robots/rpr.urdf from URDF to C: train on a simulated arm that 
 test: lint ## format and lint, then all tests on all cores, among them types and import direction
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 
-fuzz: $(TOOLS) ## random URDFs, logs, settings, meshes and run folders, new ones for MINUTES=20
+fuzz: $(TOOLS) ## test random URDFs, logs, settings, meshes and run folders for MINUTES=20
 	FUZZ_MINUTES=$(MINUTES) $(BIN)/python -m pytest -q -s tests/test_fuzz_urdf.py tests/test_fuzz_files.py \
 	    tests/test_emitted_module.py::test_mass_matrix_is_positive_definite_for_any_weights
 
@@ -67,14 +67,14 @@ golden: $(TOOLS) ## rewrite the golden files after an intended change; read the 
 	$(BIN)/python -m pytest -q tests/test_emit.py::test_golden_text --update
 	$(BIN)/python tests/settings_page.py --write
 
-# Where pip finds no build of torch for the CPU alone (UV_FIND_LINKS), NVIDIA's packages are locked too.
+# If pip finds no CPU build of torch (UV_FIND_LINKS), the packages of NVIDIA are locked, too.
 LOCK = .lock-venv/bin/uv pip compile --quiet --upgrade --generate-hashes --no-annotate --no-header \
     --constraints requirements-torch.txt --no-emit-package torch
-# Trimesh's reader of meshes works without these, which yourdfpy names for all else that trimesh can do.
+# yourdfpy requires these packages for parts of trimesh that spelgen does not use.
 UNUSED := anyio certifi charset-normalizer colorlog embreex h11 httpcore httpx idna jsonschema jsonschema-specifications \
     attrs referencing rpds-py manifold3d mapbox-earcut rtree setuptools shapely svg-path vhacdx xxhash
 
-lock: ## write the pinned versions and hashes anew: the newest that the ranges of pyproject.toml admit
+lock: ## update the pinned versions and hashes to the newest that the ranges of pyproject.toml allow
 	$(PYTHON) -m venv .lock-venv
 	.lock-venv/bin/pip install -qq uv
 	printf 'hatchling\neditables\ncasadi\n' | $(LOCK) $(UNUSED:%=--no-emit-package %) --extra simulate pyproject.toml - > .lock-venv/demo
@@ -86,13 +86,14 @@ lock: ## write the pinned versions and hashes anew: the newest that the ranges o
 clean: ## remove the environment, caches and demo output
 	rm -rf $(VENV) .lock-venv $(DEMO) site build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
-# Each file of packages is checked against its hash in requirements.txt, where no package is left out (--no-deps). Headers
-# of C++ (Boost's with Pinocchio) and torch's tests are a sixth of the disk space, and nothing here uses them.
+# Each package file is compared with its hash in requirements.txt. The list is complete, so pip installs no dependency
+# that is not listed (--no-deps). The C++ headers (Boost, Pinocchio) and the tests of torch are removed: they take a
+# sixth of the disk space and are not used.
 $(STAMP): requirements.txt requirements-torch.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "spelgen needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." >&2; \
 	    echo "Name another one: make $(MAKECMDGOALS) PYTHON=python3.11" >&2; exit 1; }
-	@echo "Installing the pinned packages into $(VENV): once, then never again." >&2
+	@echo "Installing the pinned packages into $(VENV): only once." >&2
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install -qq --no-compile --no-deps --require-hashes --requirement requirements.txt
 	@$(BIN)/python -m pip install -qq --no-compile --requirement requirements-torch.txt
@@ -100,8 +101,8 @@ $(STAMP): requirements.txt requirements-torch.txt pyproject.toml
 	@rm -rf $(VENV)/lib/python*/site-packages/cmeel.prefix/include $(VENV)/lib/python*/site-packages/torch/test
 	@touch $@
 
-# What the tests, the checks and the docs need beside that, into the same environment.
+# Additional packages for tests, checks and docs, in the same environment.
 $(TOOLS): $(STAMP) requirements-tools.txt
-	@echo "Installing what the tests need beside that: once, then never again." >&2
+	@echo "Installing the packages of the tests into $(VENV): only once." >&2
 	@$(BIN)/python -m pip install -qq --no-compile --no-deps --require-hashes --requirement requirements-tools.txt
 	@touch $@

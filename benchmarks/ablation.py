@@ -51,7 +51,8 @@ SIMULATED = (
         truth.PANDA, number=1_000_002, arm="random", friction="stribeck", urdf_error=np.inf, seconds=20.0
     ),
     replace(truth.PANDA, number=118, arm="realman_rm_75", springs=True, seconds=10.0),
-    replace(truth.PANDA, number=1_000_004, arm="niryo_ned3pro", friction="load"),  # a wrist without load
+    # an arm whose wrist joints carry no gravity load
+    replace(truth.PANDA, number=1_000_004, arm="niryo_ned3pro", friction="load"),
     replace(
         truth.PANDA, number=1_000_005, seconds=20.0, errors=draw_errors(np.random.default_rng(1_000_005))
     ),
@@ -64,14 +65,14 @@ OWN_BRISTLES = {kind: shared for kind, shared in torque_prior.SHARED.items() if 
 
 @dataclass(frozen=True)
 class Mechanism:
-    """One thing that fits do, and how it is switched off: attributes of modules, replaced for a while."""
+    """A mechanism of the torque fit, and its switches: (module, attribute, value) to replace to disable it."""
 
     name: str
     switches: tuple[tuple[Any, str, Any], ...]
 
 
 def tuned(table: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
-    """Return the switches that change fields of a table of constants, in all modules that read it."""
+    """Return switches (module, attribute, value) that change fields of a table of constants in all its importers."""
     changed = replace(table, **changes)
     readers = [x for name, x in sys.modules.items() if name.startswith("spelgen.")]
     return tuple(
@@ -80,25 +81,25 @@ def tuned(table: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
 
 
 def keep_prior(prior: Any, *_: Any) -> Any:
-    """Replace `update_widths`: the prior's standard deviations are the initial ones."""
+    """Replace `update_widths`: all standard deviations of the prior keep their initial values."""
     return prior
 
 
 def keep_armatures(prior: Any, *estimate: Any) -> Any:
-    """Replace `update_widths`: the standard deviation of armatures is the initial one."""
+    """Replace `update_widths`: the prior standard deviation of the armatures keeps its initial value."""
     updated = torque_prior.update_widths(prior, *estimate)
     widths = updated.widths.model_copy(update={"armature": prior.widths.armature})
     return replace(updated, widths=widths)
 
 
 def one_body_width(prior: Any, *estimate: Any) -> Any:
-    """Replace `update_widths`: the prior of the bodies is Gaussian, of one standard deviation."""
+    """Replace `update_widths`: all bodies share one prior standard deviation, instead of one per body."""
     updated = torque_prior.update_widths(prior, *estimate)
     return replace(updated, body_widths=torch.full_like(updated.body_widths, updated.widths.bodies))
 
 
 def no_freedom(estimator: Any, squared_residual: Any, *_: Any) -> Any:
-    """Replace `NoiseEstimator.estimate`: the noise is the root mean square residual of the fit."""
+    """Replace `NoiseEstimator.estimate`: root mean square residual, not corrected for the degrees of freedom."""
     return ESTIMATE(estimator, squared_residual)
 
 
@@ -120,11 +121,11 @@ def no_occam_factor(estimate: Any) -> float:
 
 
 def no_limit(model: Any, samples: Any) -> None:
-    """Replace `limit_friction`: nominal friction depends on effort limits only."""
+    """Replace `limit_friction`: nominal friction depends on effort limits only, not on the measured torque."""
 
 
 def not_orthogonalized(projection: Any, joint: int, torque: Any) -> Any:
-    """Replace `orthogonalize`: rigid bodies absorb no torque of position."""
+    """Replace `orthogonalize`: a residual term keeps the part of its torque that rigid bodies could absorb."""
     return torque
 
 
@@ -139,7 +140,7 @@ def alternately(model: Any, samples: Any, *rest: Any) -> joint_functions.Project
 
 
 def mechanisms() -> list[Mechanism]:
-    """Return all mechanisms."""
+    """Return all mechanisms of the torque fit that the ablation disables, one at a time."""
     return [
         Mechanism("correlated errors", tuned(TUNING, correlation_time=0.02, correlation_weight=NEVER)),
         Mechanism("correlation time from the data", tuned(TUNING, correlation_weight=NEVER)),
@@ -185,7 +186,7 @@ def mechanisms() -> list[Mechanism]:
 
 @contextlib.contextmanager
 def switched_off(mechanism: Mechanism | None) -> Iterator[None]:
-    """Replace the attributes of a mechanism for a while."""
+    """Context in which a mechanism of the torque fit is disabled; with None nothing is replaced."""
     with contextlib.ExitStack() as stack:
         for module, name, value in mechanism.switches if mechanism else ():
             stack.callback(setattr, module, name, getattr(module, name))
@@ -194,7 +195,7 @@ def switched_off(mechanism: Mechanism | None) -> Iterator[None]:
 
 
 def real_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Yield fits to the documented splits of recordings: 3 s, and all training recordings."""
+    """Yield names and functions that fit `hybrid` to documented splits: 3 s of recordings, and all of the training."""
     for fold in folds(folder):
         if "/split" in fold.name:
             tests = next(iter(fold.tests.values()))
@@ -204,7 +205,7 @@ def real_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float
 
 
 def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[str, float]]:
-    """A function that fits `hybrid` and gives its torque nMSE."""
+    """Return a function that fits `hybrid` to the training recordings and returns its torque nMSE on the tests."""
 
     def run() -> dict[str, float]:
         fit = trained(urdf, training, "hybrid")
@@ -214,7 +215,7 @@ def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[st
 
 
 def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Fits to arms whose truth is known."""
+    """Yield names and functions that fit `hybrid` to the simulated arms of `SIMULATED`, whose true M is known."""
     for case in SIMULATED:
         if case.arm != "random" and not (folder / f"{case.arm}.urdf").exists():
             continue
@@ -223,7 +224,7 @@ def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, 
 
 
 def effect_cases() -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Fits to a simulated UR10e with torques that rigid bodies do not explain."""
+    """Yield names and functions that fit `hybrid` to a simulated UR10e with springs, gear ripple or uneven friction."""
     for effect, logs, test in arms.with_effects():
 
         def run(logs: Any = logs, test: Any = test) -> dict[str, float]:
@@ -235,7 +236,7 @@ def effect_cases() -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
 
 
 def fit_truth(case: truth.Case, folder: Path) -> dict[str, float]:
-    """Errors of `hybrid` on one simulated arm."""
+    """Simulate the arm of a case, fit `hybrid` to its logs, and return the torque nMSE and the relative error of M."""
     rng = np.random.default_rng([case.number, 1])
     with tempfile.TemporaryDirectory() as temporary:
         given, urdf = Path(temporary) / "given.urdf", folder / f"{case.arm}.urdf"

@@ -4,7 +4,7 @@ effects in addition to rigid bodies.
     python benchmarks/arms.py [FOLDER]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. nMSE: mean squared torque
-error by the torque's variance, mean of the joints, pauses included. The presets are fitted as `spelgen train` does,
+error divided by the torque's variance, mean over joints, pauses included. The presets are fitted as by `spelgen train`,
 everything else to the same samples. The networks are the ones of `rivals.py`; `+ network` is a network for the torque
 residual of least squares. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
 evaluate` has it, open loop and with a constant disturbance from a momentum observer.
@@ -57,7 +57,7 @@ PRESETS = ("closed-form", "hybrid")
 
 @dataclass(frozen=True)
 class Case:
-    """Training and test samples of an arm, and by preset the model that was fitted, with the seconds that it took."""
+    """Training and test samples of an arm. models: per preset, the fitted model and the time of its fit [s]."""
 
     name: str
     urdf: Path
@@ -66,7 +66,7 @@ class Case:
     models: dict[str, tuple[Any, float]]
 
 
-AHEAD = (0.1, 0.5, 1.0)  # s
+AHEAD = (0.1, 0.5, 1.0)  # [s] prediction horizons
 
 ROBOT = Path(__file__).parents[1] / "robots" / "ur10e.urdf"
 EFFECTS = {
@@ -119,7 +119,7 @@ def table(cases: Iterator[Case]) -> None:
 
 
 def states_ahead(folder: Path) -> None:
-    """Print the errors of `spelgen evaluate` for each arm."""
+    """Print the errors of states predicted `AHEAD` seconds ahead, as `spelgen evaluate` reports them, for each arm."""
     predictors = (CONSTANT_VELOCITY, MODEL, observed(MODEL))
     print(f"{'':30}" + "".join(f"{f'{name}, {ahead:g} s':>30}" for ahead in AHEAD for name in predictors))
     for name, urdf, training, tests in splits(folder):
@@ -132,7 +132,7 @@ def states_ahead(folder: Path) -> None:
 
 
 def splits(folder: Path) -> Iterator[Split]:
-    """Yield the documented splits of the recordings."""
+    """Yield the documented splits of the recordings: name, URDF, training recordings and test recordings of an arm."""
     for fold in folds(folder):
         if "/split" in fold.name:
             tests = next(iter(fold.tests.values()))
@@ -140,7 +140,7 @@ def splits(folder: Path) -> Iterator[Split]:
 
 
 def real(folder: Path) -> Iterator[Case]:
-    """The same, as samples of torque."""
+    """Yield a case per documented split of the recordings: models of both presets, and the filtered torque samples."""
     for name, urdf, training, tests in splits(folder):
         fits, models = {}, {}
         for preset in PRESETS:
@@ -152,7 +152,7 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def simulated() -> Iterator[Case]:
-    """Print the errors for a simulated UR10e that differs from its URDF, with each effect and with all effects."""
+    """Yield a case per effect, and one with all effects, of a simulated UR10e that differs from its URDF."""
     for name, logs, test in with_effects():
         models = {}
         for preset in PRESETS:
@@ -163,7 +163,7 @@ def simulated() -> Iterator[Case]:
 
 
 def with_effects() -> Iterator[tuple[str, list[DynamicsSamples], DynamicsSamples]]:
-    """Names of effects, with the training logs and the test of an arm that has them."""
+    """Yield names of `EFFECTS`, and training and test samples of the simulated UR10e with these effects."""
     true = build(ROBOT, "closed-form")
     rng = np.random.default_rng(0)
     with torch.no_grad():
@@ -177,9 +177,9 @@ def with_effects() -> Iterator[tuple[str, list[DynamicsSamples], DynamicsSamples
 
 
 def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) -> DynamicsSamples:
-    """Return 30 s of a smooth random motion.
+    """Return samples of 30 s of a smooth random motion, with the torque of a model, of `effects`, and of noise.
 
-    The torque is the one of the model, with added torques and noise in proportion to its standard deviation.
+    noise: standard deviation of the noise, relative to the standard deviation of each joint's torque.
     """
     rng = np.random.default_rng(seed)
     q, qd, qdd = smooth_motion(model.n, 30.0, rng)
@@ -200,7 +200,7 @@ def recorded(model: Any, effects: Sequence[str], seed: int, noise: float = 0.0) 
 
 
 def of_the_urdf(urdf: Path, arm: Chain) -> Torque:
-    """Return the torque function of the URDF, with the drives of the settings if they have any."""
+    """Return the torque function of the URDF's bodies, with the drives of the arm's settings if they state any."""
     names = [x.name for x in arm.coordinates]
     dynamics = urdf_dynamics(urdf, names, drives=drives_known(urdf, names))
     return torque_of(dynamics)

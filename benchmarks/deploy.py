@@ -43,12 +43,15 @@ PRESETS = ("closed-form", "hybrid")
 RESIDUALS = "residuals."
 STATES = 10_000
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}
-CALLS = 50  # of which the clock sees the sum: it ticks in tens of nanoseconds
+CALLS = 50  # calls between two readings of the clock, whose resolution is tens of nanoseconds
 FLAGS = ("-O2",)
 
 
 def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = True) -> Trained:
-    """Return a model of an arm with changed parameters; without ``residuals`` only of its bodies and drives."""
+    """Return a model whose parameters are changed by normal numbers with standard deviation ``size``.
+
+    Without ``residuals`` the parameters of residual terms are unchanged.
+    """
     arm = load_arm(ROBOTS / f"{robot}.urdf")
     model, random = build(arm, preset), torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -59,7 +62,10 @@ def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = Tr
 
 
 def parity() -> None:
-    """The largest difference to the torch module at STATES states, relative to the largest value, by export."""
+    """Print per export the largest difference from the torch module at `STATES` states, relative to the largest value.
+
+    Models are the ones of `trained`.
+    """
     names = list(ENTRIES)
     print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'ONNX':>12s}{'MuJoCo':>12s}")
     for robot in ARMS:
@@ -88,13 +94,13 @@ def parity() -> None:
 
 
 def _largest(found: Parity) -> float:
-    """Return the largest difference of all entry points."""
-    # the reference of the tip rounds to single precision
+    """Return the largest relative difference over all entry points except the ones of the tip."""
+    # tip poses are omitted: the forward kinematics that they are compared with have single precision
     return max(value for name, value in found.differences.items() if not name.startswith("tip_"))
 
 
 def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> Called:
-    """The model's C, compiled."""
+    """Compile the C of a model; return the function that calls its entry points. kind: NumPy type of its numbers."""
     program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
     own_folder.mkdir()
@@ -156,7 +162,7 @@ int main(void)
 
 
 def latency(robot: str = "ur10e") -> None:
-    """Medians and p99 [us] of one call, one core."""
+    """Print the median and the 99th percentile of the time of one call [us], per export, on one core."""
     print(f"{robot}, one call on one core; {compiler()} {' '.join(FLAGS)}{'':20s} median      p99  [us]")
     for preset, each in (
         ("closed-form", trained(robot, "closed-form")),
@@ -245,7 +251,7 @@ def _generated(function: ca.Function) -> str:
 
 
 def show(name: str, call: Callable[[], object], repeats: int = 2000) -> None:
-    """Median and p99 of single calls."""
+    """Print the median and the 99th percentile of the time of a call [us]."""
     for _ in range(50):
         call()
     seconds = []

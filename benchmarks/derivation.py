@@ -1,6 +1,7 @@
-"""Times of the derivation, of the panda from its URDF and of random geometry, compared with sympy's Lagrange equations.
+"""Times of the derivation of M, V and G from geometry, compared with sympy's Lagrange equations.
 
-Medians of repeats in one run. Sympy derives only the smallest arms, as a user would by hand.
+The arms are the Panda from its URDF, and chains with random geometry. Times are medians of repeats in one run. Sympy
+derives only the smallest arms, in the way of a user who derives equations by hand.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ ROBOTS = Path(__file__).parents[1] / "robots"
 
 
 def median_seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """Median processor time of ``work`` after one call that warms up."""
+    """Return the median processor time [s] of ``work``, after one call whose time does not count."""
     work()
     times = []
     for _ in range(repeats):
-        derive.cache_clear()  # derived structures are cached per arm
+        derive.cache_clear()  # each repeat derives the structure again, which would otherwise be cached
         start = time.process_time()
         work()
         times.append(time.process_time() - start)
@@ -34,7 +35,7 @@ def median_seconds(work: Callable[[], object], repeats: int = 5) -> float:
 
 
 def lagrange(joints: int) -> None:
-    """The mass matrix of a planar chain by sympy.physics.mechanics, simplified until its structure shows."""
+    """Derive and simplify the mass matrix of a planar chain by sympy.physics.mechanics, only to measure the time."""
     import sympy
     from sympy.physics import mechanics
 
@@ -58,7 +59,7 @@ def lagrange(joints: int) -> None:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the time of the derivation per arm; for planar chains also the time of sympy and the ratio of the two."""
     panda = ROBOTS / "panda.urdf"
     print(f"panda, URDF to structure      {median_seconds(lambda: derive(load_arm(panda).chain)):8.3f} s")
     for joints in (6, 7, 8, 10, 12):

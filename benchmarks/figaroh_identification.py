@@ -3,9 +3,9 @@
     python benchmarks/figaroh_identification.py ARM.urdf LOGS...
 
 figaroh 1.0's own workflow of functions: the regressor with viscous and Coulomb friction, armature and an offset of each
-joint, columns without effect left out, base parameters by its double QR decomposition, then least squares weighted by
-the inverse variance of each joint's residual. It gets the samples that `spelgen identify` has: filtered, thinned, and
-moved by the delay of the torques.
+joint, without its zero columns; base parameters by its double QR decomposition; then least squares weighted by the
+inverse variance of each joint's residual. It gets the samples of `spelgen identify`: filtered, subsampled, and shifted
+by the delay of the torques.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EXTRAS = (
     "fs",
     "ia",
     "off",
-)  # the columns of each joint after the columns of the bodies, in figaroh's order
+)  # regressor columns of each joint, in figaroh's order, after the columns of the bodies
 OURS = [
     0,
     1,
@@ -49,25 +49,25 @@ OURS = [
     6,
     8,
     9,
-]  # places of (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) in Pinocchio's ten numbers
+]  # indices of m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz in Pinocchio's ten inertial parameters
 
 
 @dataclass(frozen=True, eq=False)
 class FigarohDynamics:
-    """Give the dynamics of figaroh's constants, (14 n,): ten of each body, then `EXTRAS` of each joint."""
+    """Dynamics of the constants that figaroh identifies, (14 n,): ten per body, then `EXTRAS` of each joint."""
 
     builder: Any
     constants: np.ndarray
     n: int
 
     def _torque(self, columns: Sequence[str], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the torque (T, n) of these groups of columns."""
+        """Return the torque (T, n) [Nm] of the regressor columns named: "bodies", and names of `EXTRAS`."""
         rows = self.builder.build_basic_regressor(q, qd, qdd, {"act_idxv": range(self.n)})
         groups = np.repeat(("bodies", *EXTRAS), [10 * self.n, *[self.n] * len(EXTRAS)])
         return (rows @ (self.constants * np.isin(groups, columns))).reshape(self.n, -1).T
 
     def mass_matrix(self, q: torch.Tensor) -> np.ndarray:
-        """Return M, (T, n, n), with armature."""
+        """Return the joint-space inertia M at positions (T, n), (T, n, n), with armatures."""
         still = np.zeros(q.shape)
         inertial = ("bodies", "ia")
         bias = self._torque(inertial, q.numpy(), still, still)
@@ -75,31 +75,31 @@ class FigarohDynamics:
         return np.stack(columns, axis=-1)
 
     def gravity(self, q: torch.Tensor) -> np.ndarray:
-        """Return dV/dq, (T, n)."""
+        """Return the gravity torque dV/dq at positions (T, n), (T, n) [Nm]."""
         still = np.zeros(q.shape)
         return self._torque(("bodies",), q.numpy(), still, still)
 
     def friction_torque(self, q: torch.Tensor, qd: torch.Tensor) -> np.ndarray:
-        """Return friction, (T, n)."""
+        """Return viscous and Coulomb friction at positions and velocities (T, n), (T, n) [Nm]."""
         return self._torque(("fv", "fs"), q.numpy(), qd.numpy(), np.zeros(q.shape))
 
     def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> np.ndarray:
-        """Return tau, (T, n)."""
+        """Return the torque of a motion (T, n), with friction, armatures and offsets, (T, n) [Nm]."""
         return self._torque(("bodies", *EXTRAS), q.numpy(), qd.numpy(), qdd.numpy())
 
     @property
     def inertial_parameters(self) -> np.ndarray:
-        """Return (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about the joints' frames, (n, 10), regrouped."""
+        """Return m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz per body, joint frame, (n, 10): zeros but for base parameters."""
         return self.constants[: 10 * self.n].reshape(-1, 10)[:, OURS]
 
     @property
     def armature(self) -> np.ndarray:
-        """Return the armatures, (n,)."""
+        """Return the armatures, (n,) [kg m^2, kg]."""
         return self.constants[12 * self.n : 13 * self.n]
 
 
 def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSamples]) -> FigarohDynamics:
-    """Identify an arm. Raises ImportError without figaroh, ArmError for arms with mimic joints."""
+    """Identify an arm from samples by figaroh. Raises ImportError without figaroh, ArmError for mimic joints."""
     from figaroh.tools.qrdecomposition import QRDecomposer
     from figaroh.tools.regressor import RegressorBuilder, RegressorConfig, eliminate_non_dynaffect
     from figaroh.tools.solver import solve_linear_system
@@ -108,7 +108,7 @@ def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSample
     if len(arm.bodies) != n:
         raise ArmError("mimic joints", expected="a joint for each body, as figaroh has it")
     model = pinocchio_model(arm, settings)
-    # its regressor multiplies a column with qdd: the model's own armature would count twice
+    # figaroh's regressor has a column of armature: an armature of Pinocchio's model would count twice
     model.armature = np.zeros(n)
     builder = RegressorBuilder(
         SimpleNamespace(model=model, data=model.createData()), RegressorConfig(**CONFIG)
@@ -117,13 +117,13 @@ def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSample
         np.concatenate([getattr(x, name) for x in samples]) for name in ("q", "qd", "qdd", "tau")
     )
     full = builder.build_basic_regressor(q, qd, qdd, {"act_idxv": range(n)})
-    torque = tau.T.ravel()  # one joint after the other, in the order of the rows of W
+    torque = tau.T.ravel()  # all samples of joint 1 first, as the rows of figaroh's regressor
     names = dict.fromkeys(map(str, range(full.shape[1])), 0.0)
     reduced, columns = eliminate_non_dynaffect(full, names)
     decomposer = QRDecomposer()
     base, _, _, ordinary = decomposer.double_decomposition(torque, reduced, columns)
     residual = (torque - base @ ordinary).reshape(n, -1)
-    # its own "weighted" solver forms a square matrix of all samples; scaled rows are the same
+    # figaroh's "weighted" solver forms a square matrix of all samples; scaled rows have the same solution
     weight = np.repeat(1.0 / np.sqrt(np.square(residual).mean(axis=1) + 1e-12), len(q))
     solution, _ = solve_linear_system(base * weight[:, None], torque * weight)
     constants = np.zeros(full.shape[1])
@@ -132,7 +132,7 @@ def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSample
 
 
 def main() -> None:
-    """Identify an arm, and print the torque error per joint."""
+    """Identify an arm from logs by figaroh, and print the torque nMSE per joint on the same logs."""
     from spelgen.logs.dynamics_samples import dynamics_samples
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -1,8 +1,8 @@
-"""Up to which size of weights M stays positive definite, and accelerations finite, in single precision.
+"""Largest magnitude of parameters at which M is positive definite and accelerations finite in single precision.
 
     python benchmarks/float32.py
 
-All weights are drawn from a normal distribution of each standard deviation, 8 times, with 300 states each.
+All parameters are drawn from a normal distribution, 8 times per standard deviation, with 300 states each.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DRAWS, STATES = 8, 300
 
 
 def main() -> None:
-    """Print, for each robot and preset, the largest deviation up to which nothing failed."""
+    """Print, for each robot and preset, the largest standard deviation of parameters up to which nothing failed."""
     for robot in ("two_link", "rpr", "six_dof"):
         for preset in PRESET_NAMES:
             source = spelgen.generate(ROBOTS / f"{robot}.urdf", preset, width=16, depth=1)
@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def holds(source: str, deviation: float, seed: int) -> bool:
-    """Whether M is positive definite and qdd finite at all states, with weights of this deviation."""
+    """Return True if M is positive definite and qdd finite at all states, for parameters of this standard deviation."""
     generator = torch.Generator().manual_seed(seed)
     model = spelgen.load_module(source)
     with torch.no_grad():

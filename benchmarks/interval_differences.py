@@ -5,7 +5,8 @@
 
 Each recording, or each of its parts, is fitted separately, and each pair of fits is compared. With --halvings both
 halves of the logs are fitted, the logs in order of their names first, then in random orders. For each quantity the
-difference is compared with both half intervals, added as squares. Printed is the share of differences inside.
+difference of two fits is compared with the root sum of squares of their half intervals, and the share of differences
+that are smaller is printed.
 
 Quantities of a fit to torques: base parameters, constants of the drives, and the diagonal of M and the gravity torque
 at positions within 30 % of the joints' ranges. Of a fit of servos: the delay, and the ratios to kp that both fits
@@ -27,7 +28,8 @@ from spelgen.fitting.run_record import Content
 from spelgen.identification.intervals import QUANTILE
 
 POSITIONS = 10
-FRACTION = 0.3  # of half a joint's range
+# [1] largest distance of positions from the centre of a joint's range, relative to half the range
+FRACTION = 0.3
 RATIOS = ("kd", "armature", "dry", "static_error", "dead_zone")
 
 Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -35,7 +37,7 @@ Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def main() -> None:
-    """Fit all recordings, and print the shares of the differences that lie inside the intervals."""
+    """Fit recordings separately, and print the shares of differences between fits that lie inside the intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -65,7 +67,7 @@ def main() -> None:
 def groups(
     logs: Sequence[spelgen.Trajectory], parts: int, halvings: int
 ) -> Iterator[list[list[spelgen.Trajectory]]]:
-    """Yield groups of disjoint sets of recordings, whose fits are compared: all parts, or both halves per halving."""
+    """Yield groups of disjoint sets of recordings, whose fits are compared: all parts, or two halves per halving."""
     if not halvings:
         yield [[part] for part in parts_of(logs, parts)]
     for number in range(halvings):
@@ -84,15 +86,20 @@ def parts_of(logs: Sequence[spelgen.Trajectory], count: int) -> Iterator[spelgen
 
 
 def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> list[bool]:
-    """Return True for each difference inside both half intervals, of the values that both fits determine."""
+    """Return, for each value that two fits determine, whether the difference is within their combined half interval.
+
+    Args:
+        first: values and half intervals of one fit, (k,) each; NaN for values that it does not determine.
+        second: likewise, of the other fit.
+    """
     difference = np.abs(first[0] - second[0])
-    # both may be exactly zero: a joint that gravity does not load
+    # difference and half intervals may be exactly zero, for a joint that gravity does not load
     inside = difference <= np.hypot(first[1], second[1]) + 1e-12
     return list(inside[np.isfinite(difference)])
 
 
 def estimates(fit: spelgen.Fit) -> Estimates:
-    """Return values and half intervals by quantity."""
+    """Return values and half 95 % intervals of a fit, (k,) each, by quantity: base, drives, M and g, or of servos."""
     if fit.record.servo is not None:
         return servo_estimates(fit.record.servo)
     posterior, result = fit.posterior, {}
@@ -109,7 +116,7 @@ def estimates(fit: spelgen.Fit) -> Estimates:
 
 
 def servo_estimates(servo: Content) -> Estimates:
-    """Return the delay [s] and the logarithms of the ratios to kp of a fit of servos, with their half intervals."""
+    """Return the delay [s] and the logarithms of `RATIOS` to kp of a fit of servos, with half intervals, by name."""
     delay = servo["delay"]
     result = {"delay": (np.array([delay["value"]]), np.array([delay["half"]]))}
     for ratio in RATIOS:

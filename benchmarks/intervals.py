@@ -1,4 +1,4 @@
-"""95 % intervals of a fitted arm, compared with the truth of a simulated arm."""
+"""95 % intervals of a fitted arm, compared with the true values of the simulated arm that made its logs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from spelgen.fitting.posterior import Posterior
 
 QUANTITIES = ("base", "friction", "mass", "gravity")
 QUANTILE = 1.96
-NEGLIGIBLE = 1e-6  # relative to the largest true value of a quantity
+# [1] error below which a true value of zero is omitted, relative to the quantity's largest true value
+NEGLIGIBLE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class SteadySliding:
-    """Conditions under which friction constants are compared: magnitudes of Coulomb and viscous friction at two speeds.
+    """Positions and speeds at which the friction of a fitted arm is compared with the true friction.
 
-    q: (T, n) positions over which friction is averaged. speeds: (speeds, n) [rad/s, m/s]. The friction of a speed is
-    half the difference of both directions, long after a reversal.
+    The friction of a speed is half the difference of the torques in both directions, long after a reversal.
+
+    q: (T, n) positions over which friction is averaged. speeds: (speeds, n) [rad/s, m/s].
     """
 
     q: np.ndarray
@@ -30,9 +32,10 @@ class SteadySliding:
 
 @dataclass(frozen=True, eq=False)
 class TrueValues:
-    """True values. combination: (r, K), base parameters from bodies and armatures. base: (r,). friction: (speeds, n).
+    """True values of a simulated arm, with which the intervals of its fit are compared.
 
-    mass: M (T, n, n) and gravity: g (T, n), at some positions.
+    combination: (r, K), maps inertial parameters and armatures to base parameters. base: (r,) base parameters.
+    friction: (speeds, n) of steady sliding [Nm, N]. mass: M, (T, n, n), and gravity: g, (T, n), at T positions.
     """
 
     combination: np.ndarray
@@ -51,16 +54,16 @@ def interval_ratios(
 
     Args:
         posterior: of the fitted model.
-        true: values, with g and M at the positions q.
-        sliding: conditions of the friction constants.
-        q: (T, n) positions.
+        true: values of the simulated arm, with g and M at the positions q.
+        sliding: positions and speeds at which friction is compared.
+        q: (T, n) positions at which g and the diagonal of M are compared.
     """
     positions, combination = torch.from_numpy(q), torch.from_numpy(true.combination)
     diagonal = np.diagonal(true.mass, axis1=1, axis2=2)
     truths = [x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)]
 
     def quantities(model: ArmModel) -> torch.Tensor:
-        """Return base parameters, friction, diagonal of M and gravity in one vector, (K,)."""
+        """Return base parameters, friction, diagonals of M and gravity torques of a model in one vector, (K,)."""
         base = combination @ torch.cat([model.inertial_parameters.flatten(), model.armature])
         mass = model.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
         friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)

@@ -30,11 +30,12 @@ from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
 ADAMW = ["--set", "optimizer=adamw", "--set", "batch=8", "--set", "momentum_steps=0"]
-LONGEST, SHORTER = 6.0, 2.0  # [s] from the first write of a process to its death; of servos, which end sooner
+# [s] longest time from a process's first write to its kill: of trainings, and of fits of servos
+LONGEST, SHORTER = 6.0, 2.0
 
 
 def main() -> None:
-    """Train once in peace and once under fire, and compare."""
+    """Train once without and once with kills, compare the final weights, and exit with 1 if they differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=5)
     parser.add_argument("--servos", action="store_true", help="a fit of position servos")
@@ -51,7 +52,8 @@ def main() -> None:
         source = generate(arm, "closed-form") if asked.servos else generate(arm, "spel", width=4, depth=1)
         (folder / "module.py").write_text(source)
         options = ["--set", "progress=false", "--robot", str(urdf)] + ([] if asked.servos else ADAMW)
-        epochs = str(20 + 16 * kills)  # of some 0.2 s: more than are done before the last kill
+        # enough epochs, of about 0.2 s each, that the training does not end before the last kill
+        epochs = str(20 + 16 * kills)
         always = [] if asked.servos else ["--set", f"epochs={epochs}", "--set", f"patience={epochs}"]
 
         def command(run: Path, *, resume: bool) -> list[str]:
@@ -85,7 +87,7 @@ def main() -> None:
 
 
 def _killed(command: list[str], run: Path, after: float) -> bool:
-    """Kill the process some seconds after it first wrote to the run folder; return False if it ended before."""
+    """Run a command and kill it `after` seconds after it first wrote to the run folder; False if it ended earlier."""
     before = _writes(run)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ)
     while process.poll() is None and _writes(run) == before:
@@ -96,7 +98,7 @@ def _killed(command: list[str], run: Path, after: float) -> bool:
 
 
 def _writes(run: Path) -> int:
-    """A number that grows with each file that is written to the folder; some go away meanwhile."""
+    """Return the sum of the modification times of the run folder's files, which changes with each write."""
     found = 0
     for path in run.glob("[!.]*"):
         with suppress(FileNotFoundError):

@@ -70,13 +70,14 @@ from spelgen.logs.trajectory import Trajectory
 SECONDS: tuple[float, ...] = (3.0, 5.0, 10.0, 20.0, np.inf)
 RIDGES = tuple(10.0**k for k in range(-9, 3))
 RIDGE_FOLDS = 5
-TRAINED_FIRST = {"panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4}  # [s] of the only recording
+# [s] duration of the training part, of arms with a single recording
+TRAINED_FIRST = {"panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4}
 AIRBOT_TRAINING = ("ps_N7T25QR-5", "ps_N7T25QR-6_again")
 
 
 @dataclass(frozen=True)
 class Fold:
-    """Training recordings of an arm, and groups of test recordings by name."""
+    """Training recordings of an arm, and test recordings by the name of their group; each group has its own errors."""
 
     name: str
     urdf: Path
@@ -84,7 +85,7 @@ class Fold:
     tests: Mapping[str, tuple[Trajectory, ...]]
 
     def first(self, seconds: float) -> list[Trajectory]:
-        """Return the first seconds of the training recordings, one after the other."""
+        """Return the training recordings, in order, cut after `seconds` seconds in total."""
         parts: list[Trajectory] = []
         for log in self.training:
             if seconds > 0:
@@ -94,13 +95,16 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return the durations of `SECONDS` that are shorter than the training recordings, and infinity for all."""
+        """Return the training durations [s]: the ones of `SECONDS` that the recordings exceed, and infinity for all."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
 
 class Problem:
-    """Samples of a fold at one duration: common to all methods. Raises LogError if nothing moves."""
+    """Training samples of a fold's first seconds, and its test samples, equal for all methods.
+
+    Raises LogError if nothing moves.
+    """
 
     def __init__(self, fold: Fold, seconds: float) -> None:
         self.fold, self.logs = fold, fold.first(seconds)
@@ -114,18 +118,19 @@ class Problem:
             raise LogError("no moving samples", expected="motion faster than 0.02 rad/s")
 
     def samples_of(self, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-        """Return the samples that `train` and `evaluate` take from logs."""
+        """Return the filtered torque samples of logs, as `train` and `evaluate` use them."""
         return dynamics_samples(logs, pauses=pauses, preprocessing=self.preprocessing, reach=self.reach)
 
     @cached_property
     def tests(self) -> dict[str, list[DynamicsSamples]]:
-        """Samples of the test recordings by group, pauses included."""
+        """Test samples of the fold, with pauses, by the name of the group of recordings."""
         return {group: self.samples_of(logs, pauses=True) for group, logs in self.fold.tests.items()}
 
     def figures(self, prediction: Prediction) -> Row:
-        """Return, per group of tests, the mean nMSE: moving samples, and pauses included; and the coverage.
+        """Return the errors of a prediction per group of test recordings, as fields of a row of results.
 
-        coverage: share of the torques of moving samples within their 95 % intervals, if the method has any.
+        nmse: mean over recordings, of moving samples only and with pauses. coverage: share of the torques of moving
+        samples within their 95 % intervals, if the method has intervals.
         """
         nmse, coverage = {}, {}
         for group, samples in self.tests.items():
@@ -143,7 +148,7 @@ class Problem:
 
 
 def urdf_values(problem: Problem) -> Prediction:
-    """Return the torque of the URDF, with the drives of the settings if there are any."""
+    """Return the torque of the URDF's bodies, unfitted, with the drives of the arm's settings if they state any."""
     urdf, names = problem.fold.urdf, problem.arm.chain.joint_names
     return Prediction(torque_of(urdf_dynamics(urdf, names, drives=drives_known(urdf, names))))
 
@@ -157,12 +162,13 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
     friction = FrictionModel()
 
     def columns(x: DynamicsSamples) -> np.ndarray:
-        """Return the regressor of bodies and friction, (T, n, K)."""
+        """Return the regressor of rigid bodies and friction at the samples, (T, n, K) for K parameters."""
         return np.concatenate([regressor(chain, x.q, x.qd, x.qdd), friction.columns(x.qd, x.qdd)], axis=2)
 
     tau = np.concatenate([x.tau for x in samples])
     scale = np.maximum(tau.std(axis=0), 1e-3 * tau.std(axis=0).max())[:, None]
-    rows = np.concatenate([*map(columns, samples)]) / scale  # (T, n, K)
+    # regressor (T, n, K), each joint divided by the range of its torque
+    rows = np.concatenate([*map(columns, samples)]) / scale
     length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
     length[length == 0] = 1.0
     rows = np.concatenate([rows / length, tau[:, :, None] / scale], axis=2)
@@ -170,11 +176,12 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
     grams = np.stack([x.T @ x for x in blocks])
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
-        """Return the ridge solution (K,) for the Gram matrix (K + 1, K + 1) of columns and torque."""
+        """Return the ridge solution (K,) for the Gram matrix (K + 1, K + 1) of K regressor columns and the torque."""
         return np.linalg.solve(gram[:-1, :-1] + penalty * np.eye(len(length)), gram[:-1, -1])
 
     def held_out_error(penalty: float) -> float:
-        share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS  # of the squared length of the columns
+        # share of the samples that are in training blocks, by which the penalty is scaled
+        share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS
         error = 0.0
         for block, gram in zip(blocks, grams, strict=True):
             parameters = solution(grams.sum(axis=0) - gram, share * penalty)
@@ -186,7 +193,10 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
 
 def by_least_squares(*, memory: bool) -> Method:
-    """Return the method of `identify` with Coulomb friction or with bristle states, joints weighted by range."""
+    """Return the method least squares, as `identify` has it, with Coulomb friction or (`memory`) with bristle states.
+
+    Joints are weighted by the range of their torque.
+    """
     method = LeastSquares("range", friction=FrictionModel(memory=memory))
 
     def fitted(problem: Problem) -> Prediction:
@@ -196,7 +206,7 @@ def by_least_squares(*, memory: bool) -> Method:
 
 
 def by_preset(preset: str) -> Method:
-    """Return the method of `spelgen train` with a preset and without options."""
+    """Return the method that fits a preset as `spelgen train` does without options."""
 
     def fitted(problem: Problem) -> Prediction:
         model = spelgen.build(problem.fold.urdf, preset)
@@ -206,7 +216,7 @@ def by_preset(preset: str) -> Method:
         posterior = fit.posterior
 
         def std(x: DynamicsSamples) -> np.ndarray:
-            """Return standard deviations of the torque, (T, n) [Nm]."""
+            """Return posterior standard deviations of the torque at the samples, (T, n) [Nm]."""
             past = [state for state in (x.z, x.direction) if state is not None]
             return posterior.torque(x.q, x.qd, x.qdd, *past).std
 
@@ -227,7 +237,7 @@ METHODS: dict[str, Method] = {
 
 
 def folds(folder: Path) -> Iterator[Fold]:
-    """Yield all folds, the documented splits first."""
+    """Yield all folds of the folder of recordings: the documented splits first, then single motions."""
     motions: list[Fold] = []
     for name in ("ur10e", "airbot", "shanghai"):
         urdf = folder / name / f"{name}.urdf"
@@ -245,13 +255,13 @@ def folds(folder: Path) -> Iterator[Fold]:
 
 
 def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
-    """Return all recordings of an arm by name."""
+    """Return all recordings in the folder of an arm, by the name of their file."""
     arm = load_arm(urdf)
     return {path.stem: spelgen.read_logs([path], arm)[0] for path in sorted(folder.glob("*.parquet"))}
 
 
 def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield the documented splits of an arm with several recordings."""
+    """Yield the documented splits of an arm's recordings; Shanghai has one split per recording, which is its test."""
 
     def chosen(names: Iterable[str]) -> tuple[Trajectory, ...]:
         return tuple(logs[x] for x in names)
@@ -270,19 +280,19 @@ def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fo
 
 
 def motion_folds(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield a fold per recording, tested on every recording of another motion."""
+    """Yield a fold per recording: trained on this recording, tested on every recording of another motion."""
     for trained, log in logs.items():
         tests = {x: (test,) for x, test in logs.items() if motion_of(x) != motion_of(trained)}
         yield Fold(f"{name}/motion {trained}", urdf, (log,), tests)
 
 
 def motion_of(recording: str) -> str:
-    """Return the name of the motion of a recording: some are repeated."""
+    """Return the name of a recording's motion: a second recording of the same motion has the suffix `_again`."""
     return recording.removesuffix("_again")
 
 
 def measured(fold: Fold, seconds: float, methods: Iterable[str]) -> Iterator[Row]:
-    """Yield the result of each method for a fold and a duration; an error in place of figures if it fails."""
+    """Yield a row of results per method, fitted to the first seconds of a fold; a failed fit's row has its error."""
     common: Row = {"fold": fold.name, "seconds": duration_name(seconds)}
     try:
         problem = Problem(fold, seconds)
@@ -295,7 +305,7 @@ def measured(fold: Fold, seconds: float, methods: Iterable[str]) -> Iterator[Row
         try:
             prediction = METHODS[name](problem)
             row: Row = {"fit_s": round(time.process_time() - since, 2)} | problem.figures(prediction)
-        except ImportError as error:  # a rival that is not installed
+        except ImportError as error:  # the method needs a package that is not installed
             print(f"{name} skipped: {error}", file=sys.stderr)
             continue
         except (SpelgenError, np.linalg.LinAlgError) as error:
@@ -308,7 +318,7 @@ def duration_name(seconds: float) -> str:
 
 
 def rows_of(path: Path) -> list[Row]:
-    """Return the results in a file of JSON lines, [] if there is none."""
+    """Return the rows of results in a file of JSON lines; [] if the file does not exist."""
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
@@ -353,7 +363,7 @@ def main() -> None:
 
 
 def by_rivals(options: argparse.Namespace) -> list[Row]:
-    """Append the results of the rivals, in their own environment; return all results."""
+    """Run the methods of `rivals.py` in their own environment, which appends to the results; return all results."""
     command = [
         options.rivals,
         __file__,
@@ -372,7 +382,7 @@ def by_rivals(options: argparse.Namespace) -> list[Row]:
 
 
 def missing(options: argparse.Namespace, rows: Sequence[Row]) -> Iterator[Row]:
-    """Yield the results that are requested and not among the rows; all durations of a fold after one another."""
+    """Fit the requested folds, durations and methods that `rows` do not contain; yield the results, fold by fold."""
     done = {(row["fold"], row["seconds"], row["method"]) for row in rows}
     for fold in folds(folder_of(options.folder)):
         if not any(x in fold.name for x in options.only):

@@ -10,9 +10,10 @@ import numpy as np
 
 DEFAULT = "hybrid"
 REFERENCES = ("URDF", "ridge", "least squares", "with memory", "closed-form")
-GOALS = (1.05, 1.25)  # of the default divided by the best reference: on 95 % of the cells, and on every cell
+# limits of the default's error relative to the best reference: on 95 % of the cells, and on every cell
+GOALS = (1.05, 1.25)
 MARKS = "<!-- leaderboard -->", "<!-- end of leaderboard -->"
-LARGE = 100.0  # a larger nMSE is not a figure
+LARGE = 100.0  # [1] nMSE above which tables print only "> 100"
 
 Row = dict[str, object]
 Cell = tuple[str, str, str]
@@ -20,7 +21,7 @@ Cell = tuple[str, str, str]
 
 
 def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
-    """Return the error on moving samples of each method, by cell."""
+    """Return the nMSE of each method on moving samples, by cell (fold, duration, group) and method."""
     cells: dict[Cell, dict[str, float]] = {}
     for row in rows:
         groups = row.get("nmse")
@@ -32,7 +33,7 @@ def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
 
 
 def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
-    """Return the table of errors: one row per cell of the splits, one per fold and duration of the motions."""
+    """Return the table of errors: a row per cell of the splits, and medians per arm and duration of motion pairs."""
     table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
     for (fold, seconds, group), errors in cells.items():
         arm, kind = fold.split("/")
@@ -56,13 +57,13 @@ def _median(values: Sequence[float]) -> str:
 
 
 def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the error of the default divided by the least of the references; None if one of both is absent."""
+    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`; None if one of them is absent."""
     best = min((errors[name] for name in REFERENCES if name in errors), default=None)
     return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
 
 
 def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines about the default divided by the best reference."""
+    """Return lines on the error of the preset `hybrid` divided by the smallest of `REFERENCES`, and the worst cells."""
     ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
     if not ratios:
         return []
@@ -90,7 +91,7 @@ def changes(
     now: Mapping[Cell, Mapping[str, float]],
     methods: Iterable[str],
 ) -> list[str]:
-    """Return lines about the errors of each method divided by the errors of other results, per cell."""
+    """Return a line per method on the ratios of its errors now to its errors before, over the cells of both."""
     lines = []
     for name in methods:
         ratios = {
@@ -110,7 +111,7 @@ def changes(
 
 
 def text(table: Sequence[Sequence[str]]) -> str:
-    """Return a table as aligned text."""
+    """Return a table of cells as text with aligned columns: the first three to the left, others to the right."""
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return "\n".join(
         "  ".join(
@@ -138,7 +139,7 @@ def method_lines(rows: Sequence[Row], methods: Sequence[str]) -> list[list[str]]
 def write_page(
     page: Path, rows: Sequence[Row], cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]
 ) -> None:
-    """Write the tables between the marks of a Markdown page."""
+    """Replace the text between the two `MARKS` of a Markdown page by the date, the summary and the tables."""
     text = page.read_text()
     before, rest = text.split(MARKS[0])
     after = rest.split(MARKS[1])[1]
@@ -153,11 +154,11 @@ def write_page(
 
 
 def _lists(lines: Sequence[str]) -> Iterator[str]:
-    """Yield the lines of a summary as a list, indented lines as a list within it."""
+    """Yield the lines of a summary as a Markdown list; indented lines become items of the second level."""
     yield "\n".join(f"    - {x.strip()}" if x.startswith(" ") else f"- {x}" for x in lines)
 
 
 def markdown(table: Sequence[Sequence[str]]) -> str:
-    """Return a table as Markdown."""
+    """Return a table of cells, whose first row is the head, as Markdown."""
     head, *rows = table
     return "\n".join(f"|{'|'.join(row)}|" for row in [head, ["---"] * len(head), *rows])

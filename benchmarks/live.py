@@ -1,4 +1,4 @@
-"""The estimator on recordings: every figure of docs/live.md in one command.
+"""Payload, friction and contact estimates of the live estimator on recordings: every figure of docs/live.md.
 
     python benchmarks/live.py [FOLDER] [--arms ur10e panda ...] [--runs FOLDER]
 
@@ -52,7 +52,10 @@ PAYLOAD = 2
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """An arm: its fit, the noise levels, and logs that the fit has not seen."""
+    """An arm: its fit, the noise levels of its estimator, and logs that are not in the training.
+
+    tests: logs without a load, of which figures are means. others: logs of other conditions, for example with a load.
+    """
 
     name: str
     fit: Fit
@@ -62,12 +65,12 @@ class Case:
 
     @cached_property
     def compiled(self) -> CompiledEstimator:
-        """The estimator in C."""
+        """The exported C estimator of the fitted model, compiled."""
         assert self.fit.urdf is not None
         return CompiledEstimator(self.fit.model, arm_of_spec(self.fit.model.spec, self.fit.urdf), self.levels)
 
     def run(self, log: Trajectory, tau: np.ndarray | None = None) -> Columns:
-        """Run a new estimator along a log, with other torques (T, n)."""
+        """Return the outputs of a restarted C estimator along a log; tau: (T, n) torques in place of the log's."""
         self.compiled.start()
         return self.compiled.run(log.t, log.q, log.qd, log.tau if tau is None else tau)
 
@@ -78,18 +81,21 @@ class Case:
         return found[0] if found and len(found[0].q) > 50 else None
 
     def load(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """Return the torque of a payload, (T, n)."""
-        # of the last body, with which the payload moves
+        """Return the torque of a payload along a motion (T, n), (T, n) [Nm]; theta: (10,) in the last joint's frame."""
+        # the payload moves with the last body, whose ten columns are the last of the regressor
         return chain_regressor(torque_model(self.fit).chain, q, qd, qdd)[..., -10:] @ theta
 
     def loaded(self, log: Trajectory, theta: np.ndarray) -> np.ndarray:
-        """Return the torques of a log with a payload, (T, n): accelerations are of the filtered velocities."""
+        """Return the torques of a log plus the torques of a payload theta (10,), (T, n) [Nm].
+
+        Accelerations are differences of the velocities after a low-pass of 8 Hz.
+        """
         qd = low_passed(log.t, log.qd, 8.0) if log.sample_rate > 17 else log.qd
         return log.tau + self.load(log.q, log.qd, np.gradient(qd, log.t, axis=0), theta)
 
 
 def payload(mass: float, random: np.random.Generator) -> np.ndarray:
-    """Return the parameters (10,) of a homogeneous ball that is held off the axis."""
+    """Return the inertial parameters (10,) of a homogeneous ball at a random offset from the last joint's frame."""
     center = np.array([*random.uniform(-0.08, 0.08, 2), random.uniform(0.0, 0.15)])
     radius = 0.05 * max(mass, 0.1) ** (1 / 3)
     inertia = 0.4 * mass * radius**2 * np.eye(3) + mass * (
@@ -99,7 +105,7 @@ def payload(mass: float, random: np.random.Generator) -> np.ndarray:
 
 
 def moved(columns: Columns, seconds: float) -> int:
-    """Return the first row after some motion [s]."""
+    """Return the first row of the estimator's outputs at which the arm has moved for `seconds` seconds in total."""
     return int(np.searchsorted(columns.moved, seconds))
 
 
@@ -111,7 +117,7 @@ def real_loads(case: Case) -> None:
             continue
         columns = case.run(log)
         for seconds in (2, 5, 10):
-            # the report after this motion
+            # k: row of the estimate after `seconds` seconds of motion
             k = moved(columns, seconds)
             rest = case.samples(after(log, float(log.t[k] - log.t[0])))
             if rest is None:
@@ -169,7 +175,10 @@ def synthetic_loads(case: Case, draws: int = 3) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return friction scale minus one, and disturbance, by the estimate of some time before, (2, T, n)."""
+    """Return the estimate of `ahead` seconds before each sample: friction scale minus one, and disturbance, (2, T, n).
+
+    The disturbance decays with the time constant of the noise levels; after more than 0.3 s it is zero.
+    """
     k = np.maximum(np.searchsorted(log.t, log.t - ahead, side="right") - 1, 0)
     scale, disturbance = columns.friction_scale[k] - 1, columns.disturbance[k]
     decay = np.exp(-ahead / case.levels.drift.time_constant) if ahead <= 0.3 else 0.0
@@ -206,7 +215,7 @@ def drift(case: Case) -> None:
 
 
 def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
-    """Return the friction of the model at samples, (T, n)."""
+    """Return the friction torque of the fitted model at samples, (T, n) [Nm, N]."""
     model = torque_model(case.fit)
     arrays = [samples.q, samples.qd, *([] if samples.z is None else [samples.z])]
     with torch.no_grad():
@@ -214,7 +223,7 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the times of samples, (T,), from a log with the time in place of torques."""
+    """Return the times of filtered samples of a log, (T,) [s]: filtered likewise, with the time in place of torques."""
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)
@@ -223,9 +232,10 @@ def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool
 
 
 def contacts(case: Case, theta: np.ndarray | None = None) -> None:
-    """Print alarms, and detected steps of external torque of 0.5 s at each joint in turn, every 2 s.
+    """Print the rate of false contact alarms, and the share and delay of detected contacts.
 
-    theta: (10,) inertial parameters of a payload, after 10 s of motion with it; None: without payload.
+    Contacts are added external torques of 0.5 s, every 2 s, at each joint in turn.
+    theta: (10,) inertial parameters of a payload, with which the arm moves for 10 s before contacts; None: no payload.
     """
     effort, n = case.levels.effort, len(case.levels.effort)
     alarms = minutes = 0.0
@@ -236,7 +246,7 @@ def contacts(case: Case, theta: np.ndarray | None = None) -> None:
         begin = moved(quiet, 10.0 if theta is not None else 1.0)
         over = (np.abs(quiet.external_torque) > quiet.threshold).any(axis=1)
         times = log.t[begin:][over[begin:]]
-        # alarms within half a second are one
+        # rows over the threshold within half a second of each other are one alarm
         alarms += len(times) and 1 + (np.diff(times) > 0.5).sum()
         minutes += (log.t[-1] - log.t[min(begin, len(log) - 1)]) / 60
         for fraction, delays in found.items():
@@ -261,7 +271,7 @@ def contacts(case: Case, theta: np.ndarray | None = None) -> None:
 
 
 def changes(case: Case) -> None:
-    """A payload that appears and one that disappears in mid-log, and contacts of 2 s, which are no load."""
+    """Print how fast a payload that appears or disappears in mid-log is found, and contacts mistaken for a payload."""
     random, delays, taken, trials = np.random.default_rng(1), [], 0, 0
     effort = case.levels.effort
     for log in case.tests:
@@ -295,7 +305,7 @@ def changes(case: Case) -> None:
 
 
 def parity(case: Case) -> None:
-    """Print the largest difference of the C estimator from the Python estimator, over all logs of an arm."""
+    """Print the largest difference between the outputs of the C and the Python estimator, over all logs of an arm."""
     estimator, largest, count = spelgen.Estimator(case.fit, levels=case.levels), 0.0, 0
     logs = [*case.fit.logs, *case.tests, *case.others]
     for log in logs:
@@ -320,7 +330,7 @@ def report(case: Case) -> None:
 
 
 def cases(folder: Path, names: Sequence[str], runs: Path) -> list[Case]:
-    """Return the arms with these names, fitted, or as fitted before in a folder of runs."""
+    """Return the arms with these names, each with a fit to its training logs; fits are kept in the folder `runs`."""
     sources = {
         "ur10e": (folder / "ur10e" / "ur10e.urdf", TRAINING, (*TESTS, OUTSIDE), LOADED, 0.0),
         "panda": (panda_urdf(folder), ("exciting_traj1",), (), (), 12.0),

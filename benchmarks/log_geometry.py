@@ -1,4 +1,4 @@
-"""Draw faults of the geometry of logs, and count how often `spelgen logs` names the right line.
+"""Draw faults of the geometry of logs, and count how often `spelgen logs` names the fault.
 
     python benchmarks/log_geometry.py [--arms rpr,ur10e] [--folder ../shared/arms] [--draws 3] [--faults 12] [--first 0]
                                       [--out runs/log_geometry.jsonl]
@@ -10,9 +10,10 @@ the sense of a joint's position, torque or both, an order of all columns or of t
 torque or all signals of a joint logged 40 to 140 ms late or early, and a joint's clock that runs 0.4 to 1.4 % fast or
 slow.
 
-A fault is named if the first reading is the right one, named with others if it is among the readings that the
-message lists, and not found without a finding. It is invisible if the evidence for the right reading is below the
-threshold even with the inertials of the true arm: a vertical first axis, a wrist that is symmetric.
+A reading is a hypothesis on the meaning of a log's columns (`Hypothesis`); the right reading undoes the fault. A fault
+is `named` if the first reading that `spelgen logs` lists is the right one, `with others` if a later one is, `wrong` if
+all are wrong. If no reading is listed, the fault is `invisible` if the evidence for the right reading is below the
+threshold even with the inertials of the true arm (a vertical first axis, a symmetric wrist); otherwise it is not found.
 
 Results are appended to a file of JSON lines; a run continues where it stopped, and the tables include all rows.
 """
@@ -56,13 +57,14 @@ KINDS = (
     "zero, any angle", "gravity", "unit of angles", "late motion", "late torque", "late joint", "clock",
 )  # fmt: skip
 SECONDS = 20.0
-NEAR = 0.2  # rad, and of the size of gravity: angles that are found within it are right
-NEAR_DELAY = 0.03  # s
+# [rad] largest error of a zero offset that counts as right; [1] of gravity, relative to its magnitude
+NEAR = 0.2
+NEAR_DELAY = 0.03  # [s] largest error of a delay that counts as right
 RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
 def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, list[Trajectory]]:
-    """Return a case, the arm of its wrong URDF, the true arm, and its logs."""
+    """Return a random case of an arm, the arm with wrong inertials, the true arm, and the logs of the true arm."""
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
         number=number,
@@ -98,7 +100,7 @@ def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
 
 
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
-    """Return the reading that mends a fault of a kind."""
+    """Return a random fault of a kind of `KINDS`, as the reading that undoes it (see the module)."""
     right, n = Hypothesis.unchanged(arm), len(arm.coordinates)
     joint, present = np.eye(n)[rng.integers(n)], right.source[0]
     order, pair = rng.permutation(n), present.copy()
@@ -135,7 +137,7 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
 
 
 def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
-    """Return the log for which a reading is right: the inverse of the reading."""
+    """Return the log with the fault that the reading `right` undoes: the inverse of the reading."""
     n = len(right.offset)
     motion, torque = np.argsort(right.source)
     columns = [(log.q - right.offset) / right.scale[0], log.qd / right.scale[0], log.tau / right.scale[1]]
@@ -147,13 +149,16 @@ def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
 
 
 def compared(problem: GeometryProblem) -> list[HypothesisFit]:
-    """Return the readings of a log that are better than the unchanged one."""
+    """Return the readings of a log that explain its torques better than the unchanged one, the best first."""
     faults = kinds_of_faults(problem.arm, position_scale=problem.unchanged.scale[0])
     return list(compare_hypotheses(problem, faults)[1:])
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Whether two readings are the same but for small angles, and a delay of the whole log."""
+    """Return True if two readings of a log's columns agree up to the tolerances and to a delay of the whole log.
+
+    The tolerances are `NEAR` and `NEAR_DELAY`.
+    """
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
     delay, drift = one.delay - other.delay, one.drift - other.drift
     gravity = np.array(one.gravity) - np.array(other.gravity)
@@ -168,9 +173,9 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right: Hypothesis) -> str:
-    """Return the result for a fault, one of `RESULTS`."""
+    """Return the result of `spelgen logs` for the fault that the reading `right` undoes: one of `RESULTS`."""
     drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
-    if kind == "gravity":  # the log is right, and the settings state another gravity
+    if kind == "gravity":  # the fault is in the settings, which state another gravity; the log is right
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
         right = Hypothesis.unchanged(arm.chain)
     wrong = samples_of(arm, [wrong_log(log, right) for log in logs])
@@ -183,14 +188,14 @@ def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right:
     if named:
         return "wrong"
     visible = unchanged.cost - mended.cost > GEOMETRY.needed
-    if kind.startswith("zero"):  # the masses must not be able to make up for it
+    if kind.startswith("zero"):  # a zero offset is visible only if no other inertials explain it
         visible &= unchanged.misfit - mended.misfit > GEOMETRY.needed / 2
     return "missed" if visible else "invisible"
 
 
 @dataclass(frozen=True)
 class Row:
-    """Result of one random fault, or of the clean log (kind "clean"), of one arm and log."""
+    """Result for one random log of an arm, with a random fault or without one (kind "clean")."""
 
     arm: str
     number: int
@@ -201,7 +206,7 @@ class Row:
 
 
 def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
-    """Yield the results of one random log of an arm: unchanged, and with this number of single faults."""
+    """Yield the result of a random log of an arm without a fault, then the results with `faults` single faults."""
     with tempfile.TemporaryDirectory() as folder:
         case, arm, true, logs = draw_log(urdf, number, Path(folder))
     log = (urdf.stem, number, case.motion, case.noise)
@@ -237,7 +242,7 @@ def print_tables(rows: Sequence[Row]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw, compare, append the results to the file, and print the tables."""
+    """Draw logs and faults, append the result of each to the file of results, and print the tables of all rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--arms", default=",".join(OWN + OTHERS))
     parser.add_argument("--folder", type=Path, default=Path("../shared/arms"))
@@ -250,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     lines = options.out.read_text().splitlines() if options.out.exists() else []
     rows = [Row(**json.loads(line)) for line in lines]
     present = {(row.arm, row.number) for row in rows}
-    # a log of each arm before the next log of any arm, so that an interrupted run covers all arms
+    # logs are the outer loop and arms the inner one, so that an interrupted run covers all arms
     for number in range(options.first, options.first + options.draws):
         for name in options.arms.split(","):
             urdf = (ROBOTS if name in OWN else options.folder) / f"{name}.urdf"

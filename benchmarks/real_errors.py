@@ -18,37 +18,37 @@ RIPPLE_PERIODS = (
     60,
     100,
     160,
-)  # per revolution of a joint: eccentric bearings, gear teeth, motors
+)  # periods of torque ripple per revolution of a joint: eccentric bearings, gear teeth, motors
 CABLE_BREAKAWAY = (0.05, 0.5)  # [rad, m] displacement at which the hysteresis of a cable saturates
-CURRENT_CORRELATION = 0.01  # [s]
+CURRENT_CORRELATION = 0.01  # [s] correlation time of the noise of the motor current
 BACKLASH_TORQUE = (
-    0.05  # of the torque's standard deviation: half width of the transition between tooth flanks
+    0.05  # [1] torque at which gears change the tooth flank, relative to the torque's standard deviation
 )
 
 
 @dataclass(frozen=True)
 class RealErrors:
-    """Levels of errors; `none` has all of them absent."""
+    """Levels of the errors of an arm and its sensors; by default all errors are absent."""
 
     friction_position: float = 0.0  # [1] largest relative change of dry friction with position
     warm_up: float = 0.0  # [1] relative decrease of friction during a recording
-    warm_up_time: float = np.inf  # [s]
+    warm_up_time: float = np.inf  # [s] time constant of the decrease of friction
     friction_drift: float = 0.0  # [1] relative standard deviation of friction between recordings
     cable: float = 0.0  # [1] hysteresis of cables, relative to nominal dry friction
     ripple: float = 0.0  # [1] torque ripple of gears, relative to nominal dry friction
-    resonance: float = np.inf  # [Hz] of the elastic joints
-    backlash: float = 0.0  # [rad, m]
-    encoder_step: float = 0.0  # [rad, m]
-    sensor_cutoff: float = np.inf  # [Hz] of the first-order low-pass of the torque signal
-    current_noise: float = 0.0  # [1] of the motor current, relative to the standard deviation of the torque
-    slow_noise: float = 0.0  # [1] changes of the torque without a cause in this list, likewise
-    slow_correlation: float = 0.0  # [s] correlation time of the slow noise
+    resonance: float = np.inf  # [Hz] natural frequency of a link on its elastic joint
+    backlash: float = 0.0  # [rad, m] play of the gears between both tooth flanks
+    encoder_step: float = 0.0  # [rad, m] resolution of positions
+    sensor_cutoff: float = np.inf  # [Hz] cutoff of the first-order low-pass of the torque signal
+    current_noise: float = 0.0  # [1] noise of the motor current, relative to the torque's standard deviation
+    slow_noise: float = 0.0  # [1] slow torque errors of other causes, relative to its standard deviation
+    slow_correlation: float = 0.0  # [s] correlation time of `slow_noise`
     gain: float = 0.0  # [1] relative standard deviation of the torque's unit, per joint
     zero: float = 0.0  # [rad, m] standard deviation of the zero of positions, per joint
 
 
 def draw_errors(rng: np.random.Generator) -> RealErrors:
-    """Draw levels: log-uniform, each error present with a probability of its own."""
+    """Draw the errors of an arm: each is present with its own probability, and its level is log-uniform."""
 
     def level(probability: float, low: float, high: float, absent: float = 0.0) -> float:
         present, value = rng.random() < probability, float(np.exp(rng.uniform(*np.log([low, high]))))
@@ -74,10 +74,10 @@ def draw_errors(rng: np.random.Generator) -> RealErrors:
 
 
 class ErrorProcess:
-    """Errors of one arm with n joints: levels, and the values that are random once per arm."""
+    """Errors of a simulated arm with n joints, from their levels and random phases, periods and factors per joint."""
 
     def __init__(self, errors: RealErrors, dry: np.ndarray, rng: np.random.Generator) -> None:
-        """dry: (n,) nominal dry friction [Nm, N]."""
+        """Draw the phases, periods and factors of the errors per joint; dry: (n,) nominal dry friction [Nm, N]."""
         n = len(dry)
         self.errors = errors
         self.gain = np.exp(errors.gain * rng.normal(size=n))
@@ -90,30 +90,33 @@ class ErrorProcess:
         self._breakaway = np.exp(rng.uniform(*np.log(CABLE_BREAKAWAY), n))
 
     def friction_factor(self, q: np.ndarray) -> np.ndarray:
-        """Return the factor of dry friction at positions (T, n) [rad, m]."""
+        """Return the factor on dry friction at positions (T, n) [rad, m], (T, n): one plus waves along the range."""
         wave = 0.6 * np.sin(q + self._phase) + 0.4 * np.sin(self._waves * q + self._second_phase)
         return 1 + self.errors.friction_position * wave
 
     def temperature_factor(self, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the factor of friction along a recording, (T, n); its mean over recordings is one."""
+        """Return the factor on friction at times t (T,) [s] of a recording, (T, n): warm-up and a random drift."""
         drift = np.exp(self.errors.friction_drift * rng.normal(size=len(self.gain)))
         warm = np.exp(-t / self.errors.warm_up_time)
         return (1 + self.errors.warm_up * (warm - warm.mean()))[:, None] * drift
 
     def ripple(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque ripple at positions (T, n)."""
+        """Return the torque ripple of the gears at positions (T, n) [rad, m], (T, n) [Nm, N]."""
         return np.asarray(self._ripple * np.sin(self._periods * q + self._ripple_phase))
 
     def hysteresis(self, q: np.ndarray) -> np.ndarray:
-        """Return the friction of cables along a motion (T, n); it is `cable` long after a reversal."""
+        """Return the friction of cables along positions (T, n) [rad, m], (T, n) [Nm, N].
+
+        Long after a reversal its magnitude is `cable`, (n,).
+        """
         return self.cable * play(q, self._breakaway) if self.cable.any() else np.zeros_like(q)
 
     def deflection(self, torque: np.ndarray, inertia: np.ndarray) -> np.ndarray:
         """Return the positions of the motor less the ones of the link, (T, n) [rad, m].
 
         Args:
-            torque: (T, n) of the link [Nm, N].
-            inertia: (n,) of the link [kg m^2, kg], from which the stiffness has the resonance of `RealErrors`.
+            torque: (T, n) [Nm, N] that deflects the elastic joint.
+            inertia: (n,) [kg m^2, kg] of the link; with it the joint's stiffness has the `resonance` of the errors.
         """
         twist = torque / (inertia * (2 * np.pi * self.errors.resonance) ** 2)
         if self.errors.backlash:
@@ -122,7 +125,10 @@ class ErrorProcess:
         return twist
 
     def sensed(self, torque: np.ndarray, rate: float, rng: np.random.Generator) -> np.ndarray:
-        """Return the torque (T, n) after the low-pass of its sensor, with correlated noise; rate: of samples [Hz]."""
+        """Return a torque (T, n) [Nm, N] as its sensor shows it: low-passed, with correlated noise, (T, n).
+
+        rate: of the samples [Hz].
+        """
         errors, seen = self.errors, torque
         if np.isfinite(errors.sensor_cutoff):
             keep = np.exp(-2 * np.pi * errors.sensor_cutoff / rate)
@@ -135,13 +141,13 @@ class ErrorProcess:
         return seen
 
     def encoded(self, q: np.ndarray) -> np.ndarray:
-        """Return positions (T, n) in steps of the encoder."""
+        """Return positions (T, n) [rad, m] rounded to steps of the encoder."""
         step = self.errors.encoder_step
         return q if not step else step * np.round(q / step)
 
 
 def _correlated_noise(shape: tuple[int, ...], time: float, rng: np.random.Generator) -> np.ndarray:
-    """Return stationary noise (T, n) of variance one, with autocorrelation exp(-lag / time), in samples."""
+    """Return stationary noise (T, n) of variance one, with autocorrelation exp(-lag / time); time: in samples."""
     keep = np.exp(-1 / time)
     first = keep * rng.normal(size=(1, shape[1]))
     white = np.sqrt(1 - keep**2) * rng.normal(size=shape)
@@ -149,9 +155,13 @@ def _correlated_noise(shape: tuple[int, ...], time: float, rng: np.random.Genera
 
 
 def play(q: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return the state of a spring and slider per joint along positions (T, n), in -1..1; reach: (..., n) [rad, m].
+    """Return the state of Maxwell-slip elements (a spring and a slider) per joint along positions, (T, n), in -1..1.
 
-    The initial state is zero. A reach (K, n) is of K elements; the result is their mean.
+    The initial state is zero.
+
+    Args:
+        q: (T, n) positions [rad, m].
+        reach: (n,) break-away displacement [rad, m]; or (K, n) of K elements, for the mean of their states.
     """
     reaches = np.atleast_2d(reach)
     z = np.zeros_like(reaches)

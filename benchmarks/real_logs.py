@@ -3,7 +3,7 @@
     python benchmarks/real_logs.py [FOLDER]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
-squared error by the torque's variance, mean of the joints), once over the samples that move and once with the pauses
+squared error divided by the torque's variance, mean over joints), once over the moving samples and once with the pauses
 between motions; the published figures of the baselines include pauses. Nothing is chosen here: the settings are
 the defaults of spelgen, and fits are made by `spelgen train`, with the delay of torques that it finds; least squares
 has the same samples.
@@ -59,8 +59,8 @@ TESTS = (
 )  # fmt: skip
 OUTSIDE = "20_01_17_ptp_10_points"
 LOADED = ("20_01_13_load_2600", "20_01_31_load", "20_02_19_14harm50secLoad")
-AHEAD = {"0.1 s": 10, "0.5 s": 47}  # samples at 94 Hz
-WINDOWS = 60  # of each trajectory
+AHEAD = {"0.1 s": 10, "0.5 s": 47}  # prediction horizons, in samples at 94 Hz
+WINDOWS = 60  # predicted windows per trajectory
 SUBSTEPS = 4
 
 
@@ -121,14 +121,14 @@ def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
                 row.append(
                     missed_after(adapted(fit, first(logs[name], seconds), "load"), logs[name], seconds)
                 )
-            except LogError:  # nothing moves within this time
+            except LogError:  # nothing moves within the first `seconds` seconds
                 row.append(np.nan)
         print(f"{name:26}" + "".join(f"{x:15.5f}" for x in row))
     print()
 
 
 def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
-    """Print the effect of friction and torque offsets of the day: tests and training are of different days."""
+    """Print torque errors on other days' tests: as trained, and with friction or torque offsets adapted to each."""
     print(
         "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
     )
@@ -144,7 +144,7 @@ def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
-    """Return the fit of `spelgen train --from` to a log."""
+    """Return the fit with part of its parameters refitted to a log, as by `spelgen train --from`; adapt: which part."""
     return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
 
 
@@ -166,7 +166,7 @@ def rollouts(model: Any, found: Identification, logs: Sequence[Trajectory]) -> N
 
 
 def tested(logs: Sequence[Trajectory], steps: int) -> Windows:
-    """Evenly spread windows of each trajectory."""
+    """Return about `WINDOWS` evenly spread windows per log, of filtered samples, for predictions of `steps` samples."""
     filtered = Preprocessing(cutoff=8.0)
     pieces = [piece for x in logs for piece in filtered.pieces([x], shortest=steps + 1)]
     cut = []
@@ -222,7 +222,7 @@ def characters(folder: Path, scratch: Path) -> None:
 def _torques(
     model: Any, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque, and its Coriolis and centrifugal part, both (T, n) [Nm]."""
+    """Return the model's torque along a motion (T, n), and its Coriolis and centrifugal part, both (T, n) [Nm]."""
     with torch.no_grad():
         steady, still = (model.inverse_dynamics(q, x, torch.zeros_like(q)) for x in (qd, torch.zeros_like(q)))
         friction = model.friction_torque(q, qd)
@@ -230,12 +230,12 @@ def _torques(
 
 
 def trained(urdf: Path, logs: Sequence[Trajectory], preset: str = "closed-form") -> Fit:
-    """Return the fit of `spelgen train` to the logs."""
+    """Return the fit of a preset to the logs, as by `spelgen train`."""
     return spelgen.fit(build(urdf, preset), logs, arm=urdf)
 
 
 def samples_of(fit: Fit, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-    """The samples that `spelgen train` and `evaluate` take of logs."""
+    """Return the filtered torque samples of logs, as `spelgen train` and `evaluate` use them."""
     reach = bristle_reach(fit.model)
     return dynamics_samples(logs, pauses=pauses, preprocessing=fit.preprocessing, reach=reach)
 

@@ -35,7 +35,7 @@ Read = Callable[[str], bytes]
 
 @dataclass(frozen=True)
 class Repository:
-    """A repository at a commit. licence: as it states it."""
+    """Address and commit of a repository. licence: as the repository states it."""
 
     address: str
     commit: str
@@ -43,16 +43,16 @@ class Repository:
 
     @property
     def name(self) -> str:
-        """Name of its clone."""
+        """Name of the folder into which the repository is cloned."""
         return self.address.rsplit("/", 1)[1]
 
 
 @dataclass(frozen=True)
 class Source:
-    """Recordings of one arm.
+    """Source of the recordings of one arm.
 
-    make: writes them into a folder. urdf: repository and path of the URDF, if it is a published one.
-    train, test: names of the recordings, or a split by time.
+    make: function that writes the recordings into a folder. train, test: names of recordings, or a split by time.
+    urdf: repository and path of the URDF, if one is published; otherwise `make` writes it.
     """
 
     repository: Repository
@@ -63,7 +63,7 @@ class Source:
 
 
 def write_log(path: Path, t: np.ndarray, joints: Sequence[str], **quantities: np.ndarray) -> None:
-    """Write a recording: times (T,), and quantities (T, n) by the prefix of their columns."""
+    """Write a recording of times t (T,) [s] and quantities (T, n); a keyword `q` gives the columns `q_<joint>`."""
     columns = {"t": t}
     for prefix, values in quantities.items():
         columns |= {f"{prefix}_{joint}": values[:, k] for k, joint in enumerate(joints)}
@@ -78,8 +78,9 @@ def numbers(content: bytes, delimiter: str | None = ",", skiprows: int = 0) -> n
 UR10E_JOINTS = [
     f"{x}_joint" for x in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
-UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # [Nm/A], as the authors identified them
-UR10E_LOGS = {  # path without "ur-" and suffix -> the rows that the authors use
+# [Nm/A] drive gains that the authors of the logs identified
+UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])
+UR10E_LOGS = {  # path of a log without "ur-" and suffix: its rows that the authors use
     "identification_data/19_12_23_free": slice(None),
     "identification_data/20_01_13-load_2600": slice(None),
     "identification_data/20_01_31-load": slice(None),
@@ -100,7 +101,7 @@ UR10E_LOGS = {  # path without "ur-" and suffix -> the rows that the authors use
 
 
 def ur10e(read: Read, folder: Path) -> None:
-    """Torques are measured motor currents times drive gains; currents are kept as i_<joint> [A]."""
+    """Write the UR10e's logs: torques are motor currents times drive gains; currents are the columns i_<joint> [A]."""
     for path, rows in UR10E_LOGS.items():
         kind, name = path.split("/")
         table = numbers(read(f"dataset_ur10e/{kind}/ur-{name}.csv"))[rows]
@@ -112,7 +113,7 @@ def ur10e(read: Read, folder: Path) -> None:
 
 
 def panda(read: Read, folder: Path) -> None:
-    """Torques of joint torque sensors."""
+    """Write the Panda's log, with the torques of joint torque sensors."""
     log = "matlab/data/Exciting_Traj/Trajectory_1/rbt_log/exciting_traj_{}.txt"
     t, *rest = (numbers(read(log.format(x)), None) for x in ("time", "positions", "velocity", "torques"))
     q, qd, tau = (values.reshape(-1, 7) for values in rest)
@@ -121,7 +122,10 @@ def panda(read: Read, folder: Path) -> None:
 
 
 def shanghai(read: Read, folder: Path) -> None:
-    """Each value is logged three times, 2 ms apart; velocities are differences, torques scaled as the authors do."""
+    """Write the Shanghai arm's logs at 6 ms: each value is logged three times, and one of the three is used.
+
+    Velocities are differences of positions; torques are scaled by the authors' factors.
+    """
     joints = [f"joint{k}" for k in range(1, 7)]
     scale = 101 * np.array([3.442383e-4, 3.442383e-4, -3.442383e-4, 1.342773e-4, 1.342773e-4, 1.342773e-4])
     count, step = 3665, 0.006
@@ -140,12 +144,12 @@ def shanghai(read: Read, folder: Path) -> None:
 
 
 def _plc_number(line: str) -> float:
-    """Return the number in a line such as `DataOutput.OutData[0]:=0.6995783F16#B3178FH-6`."""
+    """Return the number in a line of a PLC's log such as `DataOutput.OutData[0]:=0.6995783F16#B3178FH-6`: 0.6995783."""
     return float(line.split(":=")[1].split("F")[0])
 
 
 def xmate3(read: Read, folder: Path) -> None:
-    """Torques of joint torque sensors, 1 kHz."""
+    """Write the xMate3's log at 1 kHz, with the torques of joint torque sensors."""
     files = [f"filtering/data/excit/excit_{x}_record.txt" for x in ("ang", "vel", "torque")]
     q, qd, tau = (numbers(read(file), None) for file in files)
     joints = [f"joint{k}" for k in range(1, 8)]
@@ -154,7 +158,7 @@ def xmate3(read: Read, folder: Path) -> None:
 
 
 def ar5(read: Read, folder: Path) -> None:
-    """Torques of joint torque sensors, 50 Hz; the arm hangs on its side."""
+    """Write the AR5's log at 50 Hz, with the torques of joint torque sensors; gravity is along x of its base."""
     table = numbers(read("src/config/dynamics_identification_data_real.csv"), skiprows=1)
     joints = [f"AR5-5_07R-W4C4A2_joint_{k}" for k in range(1, 8)]
     write_log(
@@ -168,7 +172,7 @@ AIRBOT_ONCE = ["ptrnSrch_N8T25QR-8", "ptrnSrch_N8T25QR", "ptrnSrch_N8T25QR_maxq1
 
 
 def airbot(read: Read, folder: Path) -> None:
-    """Eight motions, five of them recorded twice (`_again`)."""
+    """Write the Airbot's logs of eight motions; five were recorded twice, the second time with the suffix `_again`."""
     joints = [f"joint{k}" for k in range(1, 7)]
     logs = {name: name for name in (*AIRBOT_LOGS, *AIRBOT_ONCE)} | {
         f"{x}_again": f"{x}(1)" for x in AIRBOT_LOGS
@@ -180,7 +184,10 @@ def airbot(read: Read, folder: Path) -> None:
 
 
 def tx40(read: Read, folder: Path) -> None:
-    """Motor positions and torques through the gears and the coupling of the wrist; 5 kHz averaged to 1 kHz."""
+    """Write the TX40's log: motor positions and torques converted to joints, averaged from 5 kHz to 1 kHz.
+
+    The conversion has the gear ratios and the coupling of joint 6 to joint 5.
+    """
     motors, torques = (
         numbers(read(f"examples/staubli_TX40/data/{x}_data.csv"), skiprows=1) for x in ("pos_read", "curr")
     )
@@ -203,7 +210,7 @@ SO101_TEST = (
 
 
 def so101(read: Read, folder: Path) -> None:
-    """Positions and commands at 50 Hz; load_<joint> is the register of the servo, without a sign."""
+    """Write the SO-101's logs at 50 Hz: positions, commands, and load_<joint>, the servo's unsigned load register."""
     joints = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
     for name in f"{SO101_TRAIN} {SO101_TEST}".split():
         motion = f"output/real/so101/custom/{name}"
@@ -226,7 +233,7 @@ RECONSTRUCT = np.zeros(0).__reduce__()[0]
 
 
 class Arrays(pickle.Unpickler):
-    """Read a pickle of arrays, and nothing else: a pickle may name any function, this one may not."""
+    """Reader of pickles of NumPy arrays that rejects all functions but the ones of arrays, so that no code runs."""
 
     allowed: ClassVar[dict[tuple[str, str], object]] = {
         ("numpy", "ndarray"): np.ndarray,
@@ -236,14 +243,14 @@ class Arrays(pickle.Unpickler):
     }
 
     def find_class(self, module: str, name: str) -> object:
-        """Return one of the few functions that arrays need."""
+        """Return a function that a pickle names, if it is in `allowed`; raise `UnpicklingError` otherwise."""
         if (module, name) not in self.allowed:
             raise pickle.UnpicklingError(f"{module}.{name} in a file of arrays")
         return self.allowed[module, name]
 
 
 def delan_characters(read: Read, folder: Path) -> None:
-    """The simulated characters of Deep Lagrangian Networks; dt 0.04 s."""
+    """Write the arrays of the simulated arm that draws characters, of Deep Lagrangian Networks; dt 0.04 s."""
     content = Arrays(io.BytesIO(read("data/character_data.pickle"))).load()
     arrays = {"labels": np.array(content["labels"])}
     for name in sorted(content.keys() - {"labels"}):
@@ -255,7 +262,7 @@ def delan_characters(read: Read, folder: Path) -> None:
 class Link:
     """A link and the joint that moves it: origin (xyz [m], roll [rad]), centre of mass [m], mass [kg], effort [Nm].
 
-    Kinematics are the authors', masses are made up, inertias of spheres of 6 cm.
+    Kinematics are the ones that the authors publish; masses are invented, and inertias are of spheres of radius 6 cm.
     """
 
     xyz: str
@@ -302,7 +309,7 @@ LINK = """\
 
 
 def write_urdf(path: Path, links: Sequence[Link]) -> None:
-    """Write the URDF of an arm whose kinematics are published as a table."""
+    """Write the URDF of a serial arm from its links, for arms whose kinematics are published as a table only."""
     text = f'<?xml version="1.0"?>\n<robot name="{path.stem}">\n  <link name="base"/>\n'
     for k, link in enumerate(links, start=1):
         parent = f"link{k - 1}" if k > 1 else "base"
@@ -368,7 +375,10 @@ SOURCES = {
 
 
 def reader(repository: Repository, clones: Path) -> Read:
-    """Return a function that reads files of a repository at its commit; it is cloned if it is absent."""
+    """Return a function that reads a file of a repository by its path, at the repository's commit.
+
+    The repository is cloned into the folder `clones` if it is absent.
+    """
     clone = clones / repository.name
     if not clone.exists():
         command = [

@@ -23,9 +23,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from spelgen.logs.dynamics_samples import FREQUENCY
 
-LAGS = (0.02, 0.1, 0.2, 0.5, 1.0)  # [s]
-BANDS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # [Hz]: the torque is filtered at 8 Hz
-SEGMENT = 400  # samples of a periodogram: 4 s, so that a band of 0.5 Hz has two lines
+LAGS = (0.02, 0.1, 0.2, 0.5, 1.0)  # [s] lags of the autocorrelation
+# [Hz] edges of frequency bands, up to the cutoff of the torque's filter
+BANDS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+SEGMENT = 400  # samples of a periodogram (4 s), so that the band below 0.5 Hz contains two frequencies
 HEAD = (
     "residual / torque",
     *(f"r({lag:g} s)" for lag in LAGS),
@@ -35,9 +36,10 @@ HEAD = (
 
 @dataclass(frozen=True)
 class ResidualStatistics:
-    """Mean over joints. level: standard deviation of the residual divided by the one of the torque.
+    """Statistics of a torque residual, means over joints.
 
-    correlation: autocorrelation at `LAGS`. power: share of the residual power in each of the bands of `BANDS`.
+    level: standard deviation of the residual divided by the standard deviation of the torque.
+    correlation: autocorrelation at `LAGS`. power: share of the residual's power in each of the bands of `BANDS`.
     """
 
     level: float
@@ -51,7 +53,12 @@ class ResidualStatistics:
 def residual_statistics(
     residuals: Sequence[np.ndarray], torques: Sequence[np.ndarray]
 ) -> ResidualStatistics | None:
-    """Return the statistics of residuals (T, n) of trajectories at 100 Hz; None if all are shorter than 4 s."""
+    """Return the statistics of torque residuals of trajectories at 100 Hz; None if all are shorter than 4 s.
+
+    Args:
+        residuals: (T, n) [Nm, N] of each trajectory.
+        torques: (T, n) [Nm, N] of each trajectory.
+    """
     pairs = [(x, tau) for x, tau in zip(residuals, torques, strict=True) if len(x) >= SEGMENT]
     if not pairs:
         return None
@@ -68,7 +75,7 @@ def residual_statistics(
     frequency = np.fft.rfftfreq(SEGMENT, 1 / FREQUENCY)
     spectrum = sum(len(x) * welch(x, FREQUENCY, nperseg=SEGMENT, detrend=False, axis=0)[1] for x in residuals)
     cumulative = cumulative_trapezoid(spectrum, frequency, axis=0, initial=0.0)
-    # the remainder above 8 Hz, which the filter does not remove, belongs to the last band
+    # power above 8 Hz, which the filter does not remove completely, is counted in the last band
     edges = [*np.searchsorted(frequency, BANDS[:-1]), len(frequency) - 1]
     shares = np.diff(cumulative[edges], axis=0) / cumulative[-1]
     level = float(np.sqrt(power / torque_power)[varies].mean())
@@ -77,7 +84,7 @@ def residual_statistics(
 
 
 def of_recordings(folder: Path) -> dict[str, ResidualStatistics]:
-    """Return the statistics of each documented split of the recordings in a folder."""
+    """Return the statistics of the training residual per documented split, after least squares with bristle states."""
     from leaderboard import Problem, by_least_squares, folds
 
     found = {}
@@ -93,7 +100,7 @@ def of_recordings(folder: Path) -> dict[str, ResidualStatistics]:
 
 
 def table(rows: dict[str, Sequence[float]]) -> str:
-    """Return the statistics as text, one row each."""
+    """Return rows of statistics (`ResidualStatistics.columns`) by name as an aligned text table."""
     lines = [f"{'':34}" + "".join(f"{x:>{max(9, len(x) + 2)}}" for x in HEAD)]
     for name, columns in rows.items():
         cells = (f"{x:{max(9, len(head) + 2)}.2f}" for x, head in zip(columns, HEAD, strict=True))

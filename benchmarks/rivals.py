@@ -30,7 +30,7 @@ Torque = Callable[[DynamicsSamples], np.ndarray]
 
 
 class Prediction(NamedTuple):
-    """Torque of a fitted method, (T, n) [Nm, N], and its standard deviation, if the method has one."""
+    """Functions of samples of a fitted method: the torque, (T, n) [Nm, N], and its standard deviation or None."""
 
     torque: Torque
     std: Torque | None = None
@@ -38,21 +38,22 @@ class Prediction(NamedTuple):
 
 Method = Callable[["Problem"], Prediction]
 
-WIDTHS, DECAYS = (32, 128), (1e-4, 1e-1)  # settings of networks: units per hidden layer, weight decay
+WIDTHS, DECAYS = (32, 128), (1e-4, 1e-1)  # candidates for networks: units per hidden layer, weight decay
 EPOCHS, PATIENCE, BATCH = 400, 30, 512
-SMOOTHING = 0.02  # [rad/s] of Coulomb friction in networks and Gaussian processes
-SYSID_SAMPLES = 600  # evenly spread: MuJoCo computes inverse dynamics one sample at a time
-GP_SAMPLES, GP_TRAINING, GP_STEPS, GP_RATE = 1500, 300, 100, 0.05  # of predictions; of hyperparameters
+SMOOTHING = 0.02  # [rad/s] width of tanh(qd / width), the Coulomb friction of networks and Gaussian processes
+SYSID_SAMPLES = 600  # samples for MuJoCo's sysid: few, as it computes inverse dynamics one sample at a time
+# samples of the Gaussian process; samples, steps and learning rate of the fit of its hyperparameters
+GP_SAMPLES, GP_TRAINING, GP_STEPS, GP_RATE = 1500, 300, 100, 0.05
 
 
 def figaroh(problem: Problem) -> Prediction:
-    """Return figaroh's weighted least squares, see `figaroh_identification.py`."""
+    """Fit figaroh's weighted least squares (`figaroh_identification.py`); return its prediction."""
     dynamics = figaroh_dynamics(problem.arm.chain, problem.arm.settings, problem.samples)
     return Prediction(lambda x: dynamics.inverse_dynamics(*tensors(x)))
 
 
 def tensors(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
-    """Return q, qd and qdd, (T, n)."""
+    """Return q, qd and qdd of samples as tensors, (T, n) each."""
     q, qd, qdd = (torch.from_numpy(np.ascontiguousarray(column)) for column in (x.q, x.qd, x.qdd))
     return q, qd, qdd
 
@@ -65,10 +66,10 @@ def subset(samples: Sequence[DynamicsSamples], count: int) -> DynamicsSamples:
 
 
 def mujoco_sysid(problem: Problem) -> Prediction:
-    """Return MuJoCo's system identification: its pseudo-inertia, damping, friction loss, armature and torque offset.
+    """Fit inertias, damping, friction loss, armature and offset by MuJoCo's sysid; return the torque of its model.
 
-    The residual is the one of inverse dynamics, divided by the range of each joint's torque: the same samples and
-    errors as all other methods. The initial values are the ones of the URDF.
+    Inertias are pseudo-inertia matrices. The residual is the torque residual of inverse dynamics, divided by the
+    standard deviation of each joint's torque, on a subset of the samples. The initial values are the URDF's.
     """
     import mujoco
     from mujoco import sysid
@@ -99,7 +100,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         def set_drive(changed: Any, parameter: Any, name: str = name) -> None:
             joint = changed.joint(name)
             damping, joint.frictionloss, joint.armature = parameter.value
-            joint.damping = [damping, 0.0, 0.0]  # the coefficients of |qd| and qd^2 are zero
+            joint.damping = [damping, 0.0, 0.0]  # damping coefficients of qd, |qd| and qd^2
 
         parameters.add(
             sysid.Parameter(
@@ -109,7 +110,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     parameters.add(sysid.Parameter("offset", 0 * scale, -10 * scale, 10 * scale))
 
     def torque(x: DynamicsSamples, values: Any) -> np.ndarray:
-        """Return the torque of MuJoCo with these parameters, (T, n) [Nm]."""
+        """Return MuJoCo's inverse dynamics of samples with parameters `values`, plus the offset, (T, n) [Nm]."""
         changed = sysid.apply_param_modifiers(values, spec.copy())
         data, rows = mujoco.MjData(changed), []
         for q, qd, qdd in zip(x.q, x.qd, x.qdd, strict=True):
@@ -119,7 +120,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         return np.array(rows) + values["offset"].value
 
     def residual(x: np.ndarray, values: Any) -> tuple[list[np.ndarray], None, None]:
-        """Return the residuals (S, k) of k parameter vectors, the columns of x."""
+        """Return the scaled torque residuals (S, k) of k parameter vectors, the columns of x; S: samples x joints."""
         columns = []
         for vector in x.reshape(len(x), -1).T:
             values.update_from_vector(vector)
@@ -131,24 +132,25 @@ def mujoco_sysid(problem: Problem) -> Prediction:
 
 
 def _set_inertia(body: Any, parameters: np.ndarray) -> None:
-    """Set the inertial parameters (m, m c, I about the origin as 3 x 3) of a body of an MjSpec.
+    """Set the inertia of a body of an MjSpec from its parameters (13,): m, m c, and I about the origin, 3 x 3.
 
-    The modifier of sysid 4.0.0 sets the orientation to NaN, which MuJoCo 4.0.0 rejects.
+    It replaces sysid 4.0.0's own function, which sets the orientation to NaN; MuJoCo 4.0.0 rejects it.
     """
     mass, moment, inertia = parameters[0], parameters[1:4], parameters[4:].reshape(3, 3)
     center = moment / mass
     about_center = inertia - mass * (center @ center * np.eye(3) - np.outer(center, center))
     body.explicitinertial = True
     body.mass, body.ipos, body.iquat = mass, center, (1.0, 0.0, 0.0, 0.0)
-    body.inertia[:] = 0.0  # the full inertia replaces it
+    body.inertia[:] = 0.0  # MuJoCo requires that the diagonal inertia is zero if `fullinertia` is set
     body.fullinertia[:] = about_center[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].reshape(body.fullinertia.shape)
 
 
 class InverseDynamicsKernel(nn.Module):
     """Geometrically inspired polynomial kernel (Dalla Libera and Carli, IEEE RA-L 5:24, 2020), with friction.
 
+    It is the covariance of one joint's torque in two states:
     k = k1(a, a') prod_j k2(c_j, c_j') + k1(f, f'), with a = (qdd, qd qd^T), c_j = (cos q_j, sin q_j) or q_j, the
-    inhomogeneous polynomial kernels k1, k2 of degree one and two, and friction features f of one joint.
+    inhomogeneous polynomial kernels k1, k2 of degree one and two, and friction features f of the joint.
     """
 
     def __init__(self, revolute: Sequence[bool], joint: int) -> None:
@@ -156,13 +158,16 @@ class InverseDynamicsKernel(nn.Module):
         n = len(revolute)
         self.revolute, self.joint = revolute, joint
         self.motion = nn.Parameter(torch.zeros(1 + n + n * (n + 1) // 2).double())
-        # polynomials of low degree first: their product over all joints has degree 2 n
+        # small initial weights of cos q and sin q, as the product of the kernels over all joints has degree 2 n
         self.position = nn.Parameter(torch.tensor([0.0, -3.0, -3.0]).double().repeat(2, n, 1))
         self.friction = nn.Parameter(torch.full((3,), -2.0).double())
         self.noise = nn.Parameter(torch.tensor(-4.0).double())
 
     def features(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the features of motion (T, A), position (T, n, 3) and friction (T, 3)."""
+        """Return the features of a motion (T, n): a, (T, A), of positions c, (T, n, 3), and of friction f, (T, 3).
+
+        The symbols are the class's.
+        """
         row, column = torch.triu_indices(q.shape[1], q.shape[1])
         one = torch.ones_like(q[:, :1])
         motion = torch.cat([one, qdd, qd[:, row] * qd[:, column]], dim=1)
@@ -174,7 +179,7 @@ class InverseDynamicsKernel(nn.Module):
         return motion, position, torch.cat([one, own, torch.tanh(own / SMOOTHING)], dim=1)
 
     def forward(self, x: tuple[Tensor, ...], y: tuple[Tensor, ...]) -> Tensor:
-        """Return the covariance (S, T) of the torques with these features."""
+        """Return the covariance (S, T) between the torques at S and at T samples, from their features x and y."""
         covariance: Tensor = (x[0] * self.motion.exp()) @ y[0].mT
         for weights in self.position:
             covariance = covariance * torch.einsum("snk,nk,tnk->nst", x[1], weights.exp(), y[1]).prod(dim=0)
@@ -182,16 +187,16 @@ class InverseDynamicsKernel(nn.Module):
 
 
 def gaussian_process(problem: Problem) -> Prediction:
-    """Return one Gaussian process per joint; hyperparameters by maximum marginal likelihood on a subset."""
+    """Fit a Gaussian process per joint, hyperparameters by maximum marginal likelihood; return mean and deviation."""
     revolute = [kind == "revolute" for kind in problem.arm.chain.joint_types]
     training, fitted = subset(problem.samples, GP_SAMPLES), subset(problem.samples, GP_TRAINING)
     deviation = [np.maximum(getattr(training, k).std(axis=0), 1e-9) for k in ("qd", "qdd")]
     mean, scale = training.tau.mean(axis=0), np.maximum(training.tau.std(axis=0), 1e-9)
 
     def inputs(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions, scaled velocities and scaled accelerations, each (T, n)."""
+        """Return positions, scaled velocities and scaled accelerations of samples, each (T, n)."""
         q, qd, qdd = tensors(x)
-        # one scale per kind of motion: products of velocities have the unit of accelerations
+        # one scale of velocities and one of accelerations for all joints, as products of velocities mix joints
         return q, qd / float(deviation[0].max()), qdd / float(deviation[1].max())
 
     processes: list[tuple[InverseDynamicsKernel, tuple[Tensor, ...], Tensor, Tensor]] = []
@@ -210,7 +215,7 @@ def gaussian_process(problem: Problem) -> Prediction:
         processes.append((kernel, many, factor, weights))
 
     def moments(x: DynamicsSamples) -> np.ndarray:
-        """Return the mean and the standard deviation of the torque, (2, T, n)."""
+        """Return the mean and the standard deviation of the torque at samples, (2, T, n) [Nm, N]."""
         parts = [
             _moments(process, inputs(x[k : k + 2000]))
             for k in range(0, len(x.q), 2000)
@@ -243,7 +248,12 @@ def _negative_log_likelihood(kernel: InverseDynamicsKernel, x: tuple[Tensor, ...
 
 
 def _moments(process: tuple[Any, ...], inputs: tuple[Tensor, Tensor, Tensor]) -> np.ndarray:
-    """Return the mean and the standard deviation of a joint's torque with noise, (2, T)."""
+    """Return the mean and the standard deviation, noise included, of a joint's scaled torque, (2, T).
+
+    Args:
+        process: kernel, training features, Cholesky factor of the training covariance, and weights of the mean.
+        inputs: q, and scaled qd and qdd, (T, n) each.
+    """
     kernel, many, factor, weights = process
     with torch.no_grad():
         features = kernel.features(*inputs)
@@ -269,13 +279,16 @@ SETTINGS = tuple(NetworkSettings(width, decay) for width, decay in product(WIDTH
 
 
 def network(training: Sequence[DynamicsSamples], known: Torque | None = None) -> Torque:
-    """Return a network of q, qd and qdd, fitted to torques, or to the torque residual of another method."""
+    """Return the torque of a network of q, qd and qdd, fitted to torques, or to the torque residual of `known`.
+
+    known: torque function of another method, to which the network is added.
+    """
     inputs = np.concatenate([np.concatenate([x.q, x.qd, x.qdd], axis=1) for x in training])
     mean, scale = (torch.from_numpy(x) for x in (inputs.mean(axis=0), inputs.std(axis=0) + 1e-9))
     residuals = [x.tau if known is None else x.tau - known(x) for x in training]
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
-        """Return weights, and the function of q, qd and qdd (T, n) with scaled torques (T, n)."""
+        """Return a new network, and the function from q, qd and qdd (T, n) to scaled torques (T, n)."""
         layers = mlp(inputs.shape[1], residuals[0].shape[1], settings.width, nn.Tanh)
         return layers, lambda q, qd, qdd: layers((torch.cat([q, qd, qdd], dim=-1) - mean) / scale)
 
@@ -284,31 +297,32 @@ def network(training: Sequence[DynamicsSamples], known: Torque | None = None) ->
 
 
 class DeepLagrangian(nn.Module):
-    """Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019): a factor of M, and V, from cos q and sin q.
+    """Deep Lagrangian network (Lutter, Ritter and Peters, ICLR 2019), with viscous and Coulomb friction per joint.
 
-    Viscous and Coulomb friction of each joint are added.
+    One network gives the Cholesky factor of M, one the potential energy V; both depend on cos q and sin q.
     """
 
     def __init__(self, joints: int, width: int) -> None:
         super().__init__()
         rows, columns = torch.tril_indices(joints, joints)
         entries = torch.eye(joints * joints).double()[rows * joints + columns]
-        self.entries = entries.unflatten(-1, (joints, joints))  # of the factor of M
+        # (entries, n, n): matrix with a one at the place of each entry of the factor of M
+        self.entries = entries.unflatten(-1, (joints, joints))
         self.factor = mlp(2 * joints, joints * (joints + 1) // 2, width, nn.Softplus)
         self.potential = mlp(2 * joints, 1, width, nn.Softplus)
         self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))
 
     def mass(self, q: Tensor) -> Tensor:
-        """Return M, (..., n, n)."""
+        """Return the mass matrix at q (..., n), (..., n, n)."""
         entries = self.factor(torch.cat([q.cos(), q.sin()], dim=-1))
         lower = torch.tensordot(entries, self.entries, dims=1)
         return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
 
     def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the torque, (..., n)."""
+        """Return the scaled torque of a motion q, qd, qdd (..., n), (..., n)."""
 
         def lagrangian(x: Tensor) -> Tensor:
-            """Return the sum of the Lagrangians at positions x, (..., n)."""
+            """Return the Lagrangian T - V at positions x (..., n) and velocities qd, summed over the batch."""
             kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
             return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
 
@@ -319,10 +333,10 @@ class DeepLagrangian(nn.Module):
 
 
 def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
-    """Return a Deep Lagrangian network fitted to torques."""
+    """Return the torque of a Deep Lagrangian network that is fitted to the training torques."""
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
-        """Return weights, and the function of q, qd and qdd (T, n) with scaled torques (T, n)."""
+        """Return a new network, and the function from q, qd and qdd (T, n) to scaled torques (T, n)."""
         model = DeepLagrangian(training[0].q.shape[1], settings.width)
         return model, model
 
@@ -330,7 +344,7 @@ def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
 
 
 def mlp(inputs: int, outputs: int, width: int, activation: type[nn.Module]) -> nn.Sequential:
-    """Return a network with two hidden layers."""
+    """Return a network of double precision with two hidden layers of `width` units."""
     layers = [nn.Linear(inputs, width), activation(), nn.Linear(width, width), activation()]
     return nn.Sequential(*layers, nn.Linear(width, outputs)).double()
 
@@ -340,14 +354,17 @@ def best_of(
     training: Sequence[DynamicsSamples],
     torques: Sequence[np.ndarray],
 ) -> Torque:
-    """Return the network of `SETTINGS` with the smallest error in held-out blocks of time.
+    """Fit a network with each of `SETTINGS`; return the torque of the one with the smallest held-out error.
 
-    torques: (T, n) of each recording [Nm].
+    Args:
+        make: returns a new network with given settings, and its function of q, qd and qdd.
+        training: samples of each recording; two of ten blocks of time are held out.
+        torques: (T, n) [Nm, N] of each recording, to which the network is fitted.
     """
     states = [np.concatenate([getattr(x, k) for x in training]) for k in ("q", "qd", "qdd")]
     y = np.concatenate(torques)
     mean, scale = y.mean(axis=0), y.std(axis=0) + 1e-9
-    # every fifth of ten blocks of time: adjacent samples are correlated
+    # held out are blocks of time, not single samples, since adjacent samples are correlated
     out = np.arange(len(y)) * 10 // len(y) % 5 == 4
     seen, held = ([torch.from_numpy(x[rows]) for x in (*states, (y - mean) / scale)] for rows in (~out, out))
     best_loss, best = np.inf, None
@@ -362,7 +379,7 @@ def best_of(
     chosen = best
 
     def torque(x: DynamicsSamples) -> np.ndarray:
-        """Return the torque, (T, n) [Nm]."""
+        """Return the torque of the best network at samples, (T, n) [Nm, N]."""
         with torch.no_grad():
             return np.asarray(chosen(*tensors(x)).numpy() * scale + mean)
 
@@ -372,9 +389,16 @@ def best_of(
 def early_stopped(
     weights: nn.Module, model: Callable[..., Tensor], seen: list[Tensor], held: list[Tensor], decay: float
 ) -> float:
-    """Fit a network by AdamW with early stopping; return its smallest held-out error, with the weights at it.
+    """Fit a network by AdamW with early stopping; return its smallest mean squared error on held-out samples.
 
-    seen, held: q, qd, qdd and the scaled torque of training and held-out samples, each (T, n).
+    The network gets the weights that have this error.
+
+    Args:
+        weights: module with the parameters.
+        model: function from q, qd and qdd (T, n) to scaled torques (T, n).
+        seen: q, qd, qdd and the scaled torque of training samples, (T, n) each.
+        held: likewise, of held-out samples.
+        decay: weight decay of AdamW.
     """
     optimizer = torch.optim.AdamW(weights.parameters(), lr=1e-3, weight_decay=decay)
     best, kept, waits = np.inf, weights.state_dict(), 0

@@ -1,12 +1,12 @@
-"""How fits grow with joints, samples and windows.
+"""Time and memory of fits, and how they grow with joints, samples and windows.
 
     python benchmarks/scaling.py [--device cuda]
 
 Two tables, of chains of turning joints whose axes alternate, one thread. First fits of closed-form models to torques
 at 100 Hz: processor time and peak memory of a process of its own, for 10,000 and 1,000,000 samples and for 8 and 16
 joints. Then steps on windows of 5 samples, rk4 with one step from sample to sample, forward and backward in double
-precision: windows a second, memory of the gradient's graph, and the exponent with which the time of a window grows from
-the arm of half as many joints. Medians.
+precision: windows per second, memory of the gradient's graph, and the exponent with which the time per window grows
+from an arm with half the joints. Times are medians.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 JOINTS, BATCHES, SAMPLES, STEP = (2, 3, 4, 6, 8, 12), (16, 64, 256, 1024), 5, 0.01
 REPEATS = 5
-FREQUENCIES = (0.05, 0.5)  # [Hz] of the motion that torques are fitted on
+FREQUENCIES = (0.05, 0.5)  # [Hz] lowest and highest sine of the simulated motion
 LINK = """<link name="l{k}"><inertial><origin xyz="0.1 0.02 0.2"/><mass value="{mass}"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 JOINT = """<joint name="j{k}" type="revolute"><parent link="l{before}"/><child link="l{k}"/><origin xyz="0 0 0.3"/>
@@ -46,7 +46,7 @@ JOINT = """<joint name="j{k}" type="revolute"><parent link="l{before}"/><child l
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the table of fits to torques and the table of steps on windows; with --fit only the cost of one fit."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--presets", default="closed-form,phnode,spel")
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def compare_fits() -> None:
-    """Print time and memory of fits to torques, compared with the goals."""
+    """Print time and memory of fits to torques, and their growth with samples and joints compared with the goals."""
     costs = {}
     for joints, samples in ((6, 10_000), (6, 1_000_000), (8, 20_000), (16, 20_000)):
         command = [sys.executable, __file__, "--fit", str(joints), str(samples)]
@@ -77,9 +77,9 @@ def compare_fits() -> None:
 
 
 def measured_fit(joints: int, samples: int) -> tuple[str, str]:
-    """Return the processor time [s] of a fit, and the peak memory of this process [GB]."""
+    """Return the processor time [s] of a fit, and the peak memory of this process [GB], as text."""
     urdf = _urdf(joints)
-    # in another process, whose memory is not counted
+    # the log is simulated in another process, so that its memory does not count
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         log = pool.submit(_recorded, urdf, samples).result()
     since = time.process_time()
@@ -89,7 +89,7 @@ def measured_fit(joints: int, samples: int) -> tuple[str, str]:
 
 
 def _recorded(urdf: Path, samples: int) -> Trajectory:
-    """Return a smooth motion with the torques of an arm that differs from the URDF's, and noise."""
+    """Return a log of a smooth motion, with noisy torques of an arm whose parameters differ from the URDF's."""
     torch.set_num_threads(1)
     model, generator = build(urdf, "closed-form"), np.random.default_rng(0)
     with torch.no_grad():
@@ -112,7 +112,7 @@ def _recorded(urdf: Path, samples: int) -> Trajectory:
 
 
 def compare_steps(arguments: argparse.Namespace) -> None:
-    """Print a row for each preset and number of joints."""
+    """Print windows per second, memory per window and the exponent of growth, per preset and number of joints."""
     heads = "".join(f"{batch:>9}" for batch in BATCHES)
     print(f"{'windows/s at a batch of':24}{heads}  kB/window  exponent")
     for preset in arguments.presets.split(","):
@@ -128,7 +128,7 @@ def compare_steps(arguments: argparse.Namespace) -> None:
 
 
 def _urdf(joints: int) -> Path:
-    """A chain with alternating axes, as a file."""
+    """Write the URDF of a serial chain of turning joints with alternating axes; return its path."""
     parts = ['<link name="l0"/>']
     for k in range(1, joints + 1):
         axis = ("0 0 1", "0 1 0", "1 0 0")[k % 3]
@@ -153,9 +153,10 @@ def _step(model: ArmModel, windows: Windows) -> None:
 
 
 def _rate(model: ArmModel, batch: int) -> float:
-    """Windows a second."""
+    """Return the number of windows per second of a training step with `batch` windows, by the median time."""
     windows, times = _windows(model, batch), []
-    clock = time.perf_counter if windows.q.is_cuda else time.process_time  # others may use the processor
+    # processor time, which other processes do not affect; on a GPU wall time
+    clock = time.perf_counter if windows.q.is_cuda else time.process_time
     for _ in range(REPEATS + 1):
         since = clock()
         _step(model, windows)
@@ -164,13 +165,13 @@ def _rate(model: ArmModel, batch: int) -> float:
 
 
 def _memory(model: ArmModel) -> float:
-    """Return the bytes that one more window keeps for the gradient."""
+    """Return the memory per window of tensors that autograd keeps for the gradient of the loss [bytes]."""
     held = []
     for count in (64, 128):
         kept: dict[int, int] = {}
 
         def keep(x: torch.Tensor, kept: dict[int, int] = kept) -> torch.Tensor:
-            """Record the size of a saved tensor, (...,) of any shape."""
+            """Record the storage size of a tensor x, (...,), that autograd saves, and return it."""
             kept[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
             return x
 

@@ -1,9 +1,9 @@
-"""Processor time of the commands, as ratios to `identify --friction memory` in the same run: medians of five.
+"""Processor time of the commands, divided by the time of `identify --friction memory` in the same run: medians of five.
 
     python benchmarks/seconds.py [FOLDER] [--repeats 5]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings; the
-arm is its UR10e, 100 s of training logs and three tests.
+arm is its UR10e, with 100 s of training logs and three test logs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ GOALS = {"train closed-form": 2.0, "train hybrid": 4.0, "evaluate": 3.0, "report
 
 
 def main() -> None:
-    """Print each ratio and its goal."""
+    """Print the median time of each command, its ratio to `identify`, and the goal of the ratio."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("--repeats", type=int, default=5)
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def spelgen(*words: str | Path) -> float:
-    """Run a command; return its processor time [s]."""
+    """Run a spelgen command in a process; return its processor time [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "spelgen", *map(str, words)], check=True, capture_output=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -1,12 +1,13 @@
-"""How far joints creep that servos hold, as measured and as the fitted model replays the same commands.
+"""Creep of joints under constant servo commands: measured, and predicted by a fitted model from the same commands.
 
     python benchmarks/servo_creep.py ARM.urdf --train LOGS... --test LOGS... [--preset hybrid]
 
-A joint is held from two seconds after its command became constant, while others may move, if the measured one stays
-within a step of its encoder. It creeps by the farthest that it goes from there within a minute. Where others start and
-stop, a held joint gives way by a little, the measured one too. Of the model's last columns, the first is of the holds
-in which the measured joint does not move, the second by how much farther than it the model's goes. The model is fitted
-to the training logs and replays all logs whole.
+A hold begins two seconds after a joint's command became constant and lasts a minute at most; other joints may move.
+Holds in which the measured position moves by more than one encoder step are omitted. Creep is the largest displacement
+from the position at the beginning of the hold; motions of other joints cause a little of it, measured and predicted.
+`measured at rest`: the largest predicted creep over holds in which the measured joint does not move at all, and their
+number. `beyond measured`: the largest difference between predicted and measured creep. The model is fitted to the
+training logs and predicts each log, training and test, from its first state.
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ import spelgen
 from spelgen.evaluation.replay import ServoModel
 from spelgen.logs.trajectory import split_at_gaps
 
-AT_REST, MINUTE = 2.0, 60.0  # s: after which a joint should rest, and for how long it is watched
-SHORTEST = 5.0  # s
+# [s] from a constant command to the beginning of a hold; longest duration of a hold
+AT_REST, MINUTE = 2.0, 60.0
+SHORTEST = 5.0  # [s] shortest duration of a hold
 
 
 def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
-    """Yield the rows in which a joint should rest under a constant command, at most a minute each.
+    """Yield the rows of each hold of a joint: its command is constant since `AT_REST`; at most a minute.
 
     t: (T,) [s]. command: (T,) [rad].
     """
@@ -40,9 +42,11 @@ def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
 
 
 def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
-    """Return the joint, and the largest measured and predicted displacement [rad], of each hold.
+    """Return the joint and its largest measured and predicted displacement [rad] of each hold of a log.
 
-    q: (T, n) predicted positions [rad]. step: of the replay [s].
+    Holds with a measured displacement of more than an encoder step are omitted.
+
+    q: (T, n) predicted positions [rad]. step: of the encoder [rad].
     """
     assert log.u is not None
     found = []
@@ -55,7 +59,7 @@ def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int
 
 
 def main() -> None:
-    """Fit the model, replay every log, and print the creep per joint."""
+    """Fit the model, predict every log from its commands, and print the creep per joint."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

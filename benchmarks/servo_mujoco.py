@@ -4,9 +4,9 @@
 
 MuJoCo's position actuators are how such an arm is usually simulated. kp, kv, armature and frictionloss of each joint,
 an offset of its commands and the delay are fitted to windows of the training logs, starting from the parameters of the
-run's model, by `mujoco.minimize`, the least squares of `mujoco.sysid`. The bodies are the URDF's, and friction is as
-hard as MuJoCo allows, as `spelgen export --to mjcf` writes both. The actuators, the model and its other baselines then
-replay the test logs.
+run's model, by `mujoco.minimize`, the least squares of `mujoco.sysid`. The bodies are the URDF's, and dry friction has
+the stiffest constraint that MuJoCo allows, as `spelgen export --to mjcf` writes both. The actuators, the model and its
+other baselines then predict the positions of the test logs from their commands.
 """
 
 from __future__ import annotations
@@ -39,16 +39,18 @@ from spelgen.logs.trajectory import LogRows, delayed_commands, steps_between
 if TYPE_CHECKING:
     from spelgen.emission.assemble import ArmModel
 
-STEP = 5e-4  # [s] of the simulated robot
-HARD = [2e-3, 1.0]  # of constraints: a time constant [s], and no rebound
-SHARE, DAMPING = (
-    0.02,
-    2e-4,
-)  # of a joint of backlash: armature divided by the armature of its drive, damping relative to kp [s]
-FIT_STEP = 5e-3  # [s] at most, of fitted actuators; frictionloss is as hard as twice this allows
-WINDOWS, ITERATIONS = 60, 8  # half a minute of fitting
-DIFFERENCE = 1e-4  # finite-difference step of the unknowns
-LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4  # bounds: of logarithms; [rad, m]; [s]
+STEP = 5e-4  # [s] integration step of the simulated robot
+# solref of stiff constraints of the simulated robot: time constant [s] and damping ratio (no rebound)
+HARD = [2e-3, 1.0]
+# joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
+SHARE, DAMPING = 0.02, 2e-4
+# [s] largest integration step of fitted actuators; twice it is the time constant of frictionloss
+FIT_STEP = 5e-3
+# number of windows and of solver steps of the fit of actuators, which takes half a minute
+WINDOWS, ITERATIONS = 60, 8
+DIFFERENCE = 1e-4  # finite-difference step of the unknowns of the fit
+# bounds of the fit: change of log drives; offset [rad, m]; delay [s]
+LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4
 
 
 def arm_with_servos(
@@ -59,9 +61,15 @@ def arm_with_servos(
     limit: np.ndarray,
     backlash: float,
 ) -> mujoco.MjModel:
-    """Return the URDF's arm without shapes under position servos.
+    """Return MuJoCo's model of the URDF's arm, without visual and collision shapes, with position servos.
 
-    ratios: kd, armature and dry friction, each relative to kp. limit: (n,) torque [Nm]. backlash: half of it [rad].
+    Args:
+        urdf: file of the arm.
+        joints: names of the n driven joints.
+        kp: (n,) stiffness of the servos [Nm/rad].
+        ratios: "kd" [s], "armature" [s^2] and "dry" friction [rad], each relative to kp.
+        limit: (n,) largest torque [Nm]; infinite: unlimited.
+        backlash: half of the play of each joint's gears [rad]; 0: none.
     """
     text = re.sub(r"<(visual|collision)>.*?</\1>", "", urdf.read_text(), flags=re.DOTALL)
     spec = mujoco.MjSpec.from_string(text)
@@ -90,7 +98,15 @@ def arm_with_servos(
 
 
 def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float, delay: float) -> np.ndarray:
-    """Return positions (T, n) [rad] under commands (T, n), from rest at the first; encoders are behind the gears."""
+    """Simulate an arm with servos from rest at the first command; return the positions of its links, (T, n) [rad].
+
+    Args:
+        model: of `arm_with_servos`; its servos control motor positions, before the backlash of the gears.
+        joints: names of the n driven joints.
+        u: (T, n) commands [rad].
+        dt: time between commands and between positions [s].
+        delay: of the commands [s].
+    """
     data = mujoco.MjData(model)
     drive = [model.joint(x).qposadr[0] for x in joints]
     names = {model.joint(k).name for k in range(model.njnt)}
@@ -108,10 +124,10 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
 
 @dataclass(frozen=True, eq=False)
 class PositionActuators:
-    """An arm of n joints in MuJoCo, each of which moves one of the URDF's bodies, under position actuators.
+    """Predictor of positions from commands: MuJoCo's position actuators on an arm with n joints and n bodies.
 
-    untrained: a model of these bodies. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the command
-    of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+    untrained: model with the URDF's inertias. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the
+    command of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
     """
 
     arm: Chain
@@ -125,7 +141,13 @@ class PositionActuators:
     )
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return predicted positions (T, n) of each part, from q and qd (parts, n); see `CommandFollower`."""
+        """Return the predicted positions (T, n) [rad, m] after the first row of each part of a log.
+
+        Args:
+            parts: logs and the rows of each to predict, from their commands.
+            q: (parts, n) initial positions [rad, m].
+            qd: (parts, n) initial velocities [rad/s, m/s].
+        """
         model = self.model()
         positions: list[np.ndarray] = []
         for k, (log, rows) in enumerate(parts):
@@ -143,7 +165,7 @@ class PositionActuators:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         parents = [spec.worldbody]
         inertias = self.untrained.inertial_parameters.numpy()
-        # MuJoCo has zero where nothing limits
+        # MuJoCo's value for an unlimited torque is zero
         limits = np.nan_to_num(self.untrained.servo.limit.numpy(), posinf=0.0)
         for k, (body, coordinate) in enumerate(zip(self.arm.bodies, self.arm.coordinates, strict=True)):
             kp, kv, armature, frictionloss = self.drives[:, k]
@@ -154,7 +176,7 @@ class PositionActuators:
                 explicitinertial=True,
                 mass=mass,
                 ipos=center,
-                # MuJoCo has xx, yy, zz, xy, xz, yz
+                # MuJoCo's order: xx, yy, zz, xy, xz, yz
                 fullinertia=tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
             )
             parents.append(element)
@@ -168,7 +190,7 @@ class PositionActuators:
                 range=coordinate.limits or (0, 0),
                 armature=armature,
                 frictionloss=frictionloss,
-                # how soft frictionloss is goes by the inertia and by these
+                # with the joint's inertia, these determine the stiffness of the constraint of frictionloss
                 solref_friction=(2 * FIT_STEP, 1),
                 solimp_friction=EXPORT_TUNING.friction_impedance,
             )
@@ -181,20 +203,29 @@ class PositionActuators:
 
 
 def _positions(model: mujoco.MjModel, q: np.ndarray, qd: np.ndarray, commands: np.ndarray) -> np.ndarray:
-    """Return positions (W, K, n) after each interval, from q and qd (W, n), under commands (W, K, S, n)."""
+    """Return the positions (W, K, n) of W windows after each of K intervals of S integration steps.
+
+    Args:
+        model: with position actuators.
+        q, qd: (W, n) initial states.
+        commands: (W, K, S, n) command of each step.
+    """
     count, _, steps, n = commands.shape
-    state = np.hstack([np.zeros((count, 1)), q, qd])  # MuJoCo's has the time first
+    state = np.hstack([np.zeros((count, 1)), q, qd])  # MuJoCo's state: time, q, qd
     states, _ = rollout.rollout(model, mujoco.MjData(model), state, commands.reshape(count, -1, n))
     return np.asarray(states[:, steps - 1 :: steps, 1 : 1 + n])
 
 
 def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -> PositionActuators:
-    """Fit to windows, starting from the drives of a ``trained`` model of the arm. Exits if joints are coupled."""
+    """Fit position actuators to windows of logs, from the drives of a ``trained`` model as initial values.
+
+    Exits with a message if joints are coupled.
+    """
     n = len(arm.chain.coordinates)
     if len(arm.chain.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
-    # kv includes the damping of the joint: they differ only while the torque is limited
+    # kv includes the joint's viscous friction: separately they would differ only while the torque is limited
     rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
@@ -205,14 +236,14 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
     def actuators(x: np.ndarray) -> PositionActuators:
-        """Return actuators of the unknowns (5 n + 1,): logarithms of drives, offsets of commands, delay."""
+        """Return the actuators of unknowns (5 n + 1,): logarithms of 4 n drives, n command offsets, and the delay."""
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
         return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        """Return position errors after the burn-in of each window, (samples n,)."""
+        """Return the position errors of unknowns x (5 n + 1,) after the burn-in of each window, (samples n,)."""
         candidate = actuators(x)
         model = candidate.model()
         model.opt.timestep = 1 / windows.rate / steps
@@ -221,13 +252,13 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Return the errors (samples n, columns) of each column of x, (5 n + 1, columns)."""
+        """Return the position errors (samples n, C) of C vectors of unknowns, the columns of x (5 n + 1, C)."""
         return np.stack([errors(column) for column in x.T], axis=1)
 
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Return finite differences, (samples n, 5 n + 1).
+        """Return the derivative of the position errors by finite differences, (samples n, 5 n + 1).
 
-        One unknown is changed at all joints at once, since it affects other joints only slightly.
+        An unknown is changed at all joints at once and its effect at other joints neglected, which is small.
         """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):

@@ -23,14 +23,15 @@ import torch
 import spelgen
 from spelgen.logs.trajectory import Trajectory
 
-RATE, STEP, RECORDINGS = 50, 1e-3, 3  # Hz; s
-KP, LAG, ARMATURE, DRY, DELAY = 20.0, 0.06, 1.4e-3, 8e-3, 0.02  # Nm/rad; s, s^2, rad: ratios to kp; s
-SMALLEST = 0.4  # drives get smaller along the arm, down to this factor
+RATE, STEP, RECORDINGS = 50, 1e-3, 3  # sample rate of logs [Hz]; integration step [s]; recordings per seed
+# True servos: kp of joint 1 [Nm/rad]; kd [s], armature [s^2] and dry friction [rad] relative to kp; delay [s].
+KP, LAG, ARMATURE, DRY, DELAY = 20.0, 0.06, 1.4e-3, 8e-3, 0.02
+SMALLEST = 0.4  # [1] kp of the last joint relative to joint 1; linear between them
 ENCODER = 2 * np.pi / 4096
 
 
 def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
-    """(T, n): sines about levels that are held for a while and jump."""
+    """Return random commands at times t (T,) [s], (T, n) [rad]: sines about levels that jump every two seconds."""
     frequency, phase = (
         np.exp(random.uniform(np.log(0.05), np.log(1.2), (3, n))),
         random.uniform(0, 6.3, (3, n)),
@@ -41,7 +42,14 @@ def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 
 
 def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor) -> torch.Tensor:
-    """Positions (B, T, n) under commands (B, T, n), from rest at the first ones. limit: of torques, (n,) [Nm]."""
+    """Simulate an arm with servos from rest at the first command; return its positions, (B, T, n) [rad].
+
+    Args:
+        model: of the rigid bodies.
+        u: (B, T, n) commands [rad] of B motions.
+        dead_zone: position error below which servos give no torque [rad].
+        limit: (n,) largest torque [Nm].
+    """
     size = torch.linspace(1.0, SMALLEST, u.shape[-1]).double() * KP
     rotors = torch.diag(size * ARMATURE - model.armature)
     damping, most = torch.diag(STEP / 2 * size * LAG), STEP * size * DRY
@@ -56,7 +64,7 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
         inverse = torch.linalg.inv(model.mass_matrix(q) + rotors + damping)
         qd = qd + STEP * (inverse @ (pull - model.nonlinear_effects(q, qd)).unsqueeze(-1)).squeeze(-1)
         impulse = torch.zeros_like(qd)
-        for joint in 4 * [*range(len(size))]:  # projected Gauss-Seidel
+        for joint in 4 * [*range(len(size))]:  # dry friction: projected Gauss-Seidel on impulses, 4 sweeps
             wanted = impulse[:, joint] - qd[:, joint] / inverse[:, joint, joint]
             change = wanted.clamp(-most[joint], most[joint]) - impulse[:, joint]
             impulse[:, joint] += change
@@ -66,7 +74,7 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
 
 
 def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
-    """Of each seed, as encoders see them."""
+    """Yield per seed the logs of the simulated arm: commands, and positions rounded to encoder steps."""
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, asked.seconds, 1 / RATE)
     limit = torch.tensor([x.effort or float("inf") for x in arm.chain.coordinates]).double()
@@ -93,8 +101,16 @@ def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Tra
 def in_mujoco(
     urdf: Path, arm: spelgen.Arm, u: list[np.ndarray], limit: np.ndarray, backlash: float
 ) -> np.ndarray:
-    """Positions (B, T, n), as `simulated`."""
-    # MuJoCo is an extra
+    """Simulate the same servos in MuJoCo, with backlash of the gears; return positions, (B, T, n) [rad].
+
+    Args:
+        urdf: file of the arm.
+        arm: the arm of the file.
+        u: commands (T, n) [rad] of B motions.
+        limit: (n,) largest torque [Nm].
+        backlash: half of the play of the gears [rad].
+    """
+    # imported here, as MuJoCo is an optional dependency that --mujoco needs
     from servo_mujoco import arm_with_servos, positions
 
     joints = [x.name for x in arm.chain.coordinates]
@@ -105,7 +121,7 @@ def in_mujoco(
 
 
 def main() -> None:
-    """Simulate, fit, and print errors and coverage."""
+    """Simulate and fit recordings per seed; print the errors of the ratios and the coverage of their intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

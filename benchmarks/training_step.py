@@ -1,7 +1,8 @@
 """Times of a training step: every preset, compared with PHNODE and with only the networks of the preset.
 
-PHNODE has three rows: as published, with one automatic derivative of dM^-1/dt for each entry; with one jvp in place of
-these, as a user who knows torch would write it; and as `phnode`, with explicit derivatives.
+PHNODE has three rows: as published, with one automatic derivative of dM^-1/dt for each entry; with one jvp (a
+forward-mode derivative) in place of them, as a user who knows torch would write it; and as the preset `phnode`, with
+explicit derivatives.
 
 Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
 and backward (without the update of the weights). Medians of repeats, alternated in one run, on one thread. "bound" is
@@ -50,7 +51,7 @@ PARTS, REPEATS, SLOW_REPEATS = 4, 15, 3
 
 
 class Data:
-    """Random windows: q, qd (W, K, n), tau (W, K-1, n)."""
+    """Random training windows, W of K samples: q and qd, (W, K, n), and tau between samples, (W, K-1, n)."""
 
     def __init__(self, windows: int) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -62,7 +63,7 @@ class Data:
 
 
 def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return q and p one step later, and q' at the start, each (..., n)."""
+    """Return q and p after one step of rk4, and dq/dt at its start, (..., n) each; rate: gives dq/dt and dp/dt."""
     k1 = rate(q, p)
     k2 = rate(*(torch.add(x, k, alpha=STEP / 2) for x, k in zip((q, p), k1, strict=True)))
     k3 = rate(*(torch.add(x, k, alpha=STEP / 2) for x, k in zip((q, p), k2, strict=True)))
@@ -73,7 +74,7 @@ def rk4(rate: Callable[..., tuple[Tensor, Tensor]], q: Tensor, p: Tensor) -> tup
 
 
 def plain_mass(model: ArmModel) -> ArmModel | None:
-    """The model with M as it comes; None where nothing is done to it."""
+    """Return a copy of the model without the bound that keeps M positive definite; None if its M has no bound."""
     if not hasattr(getattr(model, "mass", None), "fraction"):
         return None
     plain = copy.deepcopy(model)
@@ -82,7 +83,7 @@ def plain_mass(model: ArmModel) -> ArmModel | None:
 
 
 def training_step(model: ArmModel, data: Data) -> None:
-    """Loss of the windows, and its gradient: geodesic distance and velocity, as in eq. 8 of the paper."""
+    """Compute the loss of windows and its gradient: geodesic position and velocity errors, PHNODE paper, eq. 8."""
     model.zero_grad()
     prepared = model.prepare()
     q, p = data.q[:, 0], model.momentum(model.at(data.q[:, 0], prepared=prepared), data.qd[:, 0])
@@ -98,7 +99,7 @@ def training_step(model: ArmModel, data: Data) -> None:
 
 
 def networks_alone(model: ArmModel, data: Data) -> None:
-    """The floor: each network forward and backward once for every evaluation in the step, and nothing else."""
+    """Evaluate the model's networks as often as a training step does, forward and backward, and nothing else."""
     model.zero_grad()
     dynamics, q, qd = model, data.q[:, 0], data.qd[:, 0]
     prepared = dynamics.prepare()
@@ -115,7 +116,7 @@ def networks_alone(model: ArmModel, data: Data) -> None:
 
 
 def published_step(model: Published, data: Data) -> None:
-    """The same windows for PHNODE as published: state (R, zeta) of all axes."""
+    """Compute the loss of windows and its gradient by PHNODE as published; its states are rotation R and twist zeta."""
     model.zero_grad()
     zero, one = torch.zeros_like(data.q), torch.ones_like(data.q)
     cos, sin = data.q.cos(), data.q.sin()
@@ -136,14 +137,14 @@ def published_step(model: Published, data: Data) -> None:
 
 
 def seconds(work: Callable[[], None]) -> float:
-    """Time of one call."""
+    """Return the wall time of one call of `work` [s]."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
 
 
 def sizes(model: ArmModel) -> str:
-    """Outputs of the networks of M, D, G and V, and inputs of the network of M."""
+    """Return the number of outputs of the networks of M, D, G and V, and of inputs of the network of M, as text."""
     if not hasattr(model, "mass"):
         return ""
     mass, friction = (getattr(part, "network", None) for part in (model.mass, model.friction))
@@ -158,12 +159,12 @@ def sizes(model: ArmModel) -> str:
 
 
 def median(times: list[float]) -> float:
-    """In seconds; nan where nothing was measured."""
+    """Return the median of times [s]; NaN if there are none."""
     return statistics.median(times or [math.nan])
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table of training steps: times of each preset and of PHNODE, and ratios."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = Data(WINDOWS)

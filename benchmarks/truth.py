@@ -10,10 +10,10 @@ preset, `hybrid`, least squares with Coulomb friction and with bristle states, a
 it is installed, are fitted to the same samples. Results are appended to a file of JSON lines; a run continues where it
 stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
 
-M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative error of a diagonal entry;
-g error: root mean square divided by the one of g*; base parameters: likewise, each multiplied by its root mean square
-torque along the test motion; friction error: likewise, without offsets; torque nMSE on another motion without noise,
-unfiltered and after a low-pass of 8 Hz.
+A star marks the true value. M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative
+error of a diagonal entry; g error: root mean square error divided by the root mean square of g*; error of the base
+parameters: likewise, each parameter multiplied by its root mean square torque along the test motion; friction error:
+likewise, without offsets; torque nMSE on another motion without noise, unfiltered and after a low-pass of 8 Hz.
 
 Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are the ones of
 the logged torques at the logged positions, and the true base parameters are the least-squares solution for the rigid
@@ -66,28 +66,28 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 
 ARMS = (
     Path(__file__).parents[2] / "shared" / "arms"
-)  # a folder of URDFs next to the checkout, if there is one
+)  # folder of URDFs next to the checkout; without it all arms are random chains
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
-FINE = 1000.0  # Hz: the grid on which truth is computed; logs take samples of it
-POSITION_NOISE = 1e-5  # rad, m: of an encoder of 18 bits
-SHARE = (0.03, 0.15)  # Coulomb friction by the deviation of the rigid torque, drawn log-uniformly
+FINE = 1000.0  # [Hz] rate of the simulation, of whose samples logs are a subset
+POSITION_NOISE = 1e-5  # [rad, m] standard deviation of encoder noise, as of an encoder with 18 bits
+SHARE = (0.03, 0.15)  # [1] Coulomb friction relative to the rigid torque's standard deviation, log-uniform
 TINY = 1e-9
 FIRST_REALISTIC = 10_000
-UNEXCITED = 1e-3  # squared length of a direction, relative to a base parameter's column
+UNEXCITED = 1e-3  # [1] ridge penalty of pseudo-true parameters, relative to their columns' squared length
 BRISTLES = np.geomspace(2e-4, 3e-2, 6)[
     :, None
-]  # [rad, m] break-away displacements: not the ones of fitted models
+]  # [rad, m] break-away displacements of the simulated bristles, which differ from the fitted model's
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 """q, qd and qdd, each (T, n)."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One arm and its logs, as drawn from its number."""
+    """One random case: an arm, the errors of its URDF, its friction and drives, and the conditions of its logs."""
 
     number: int
     arm: str
-    urdf_error: float  # standard deviation of inertials in the given URDF; infinite: placeholders
+    urdf_error: float  # [1] relative standard deviation of the given URDF's inertials; infinite: placeholders
     friction: str
     armature: bool
     offsets: bool
@@ -96,12 +96,12 @@ class Case:
     seconds: float
     sample_rate: float
     noise: float
-    delay: float  # s
+    delay: float  # [s] delay of the logged torques
     errors: RealErrors | None = None
 
 
 def draw_case(number: int, arms: Sequence[str]) -> Case:
-    """Draw the case of this number."""
+    """Return the random case with this number as seed; arms: names of URDFs that it may use."""
     rng = np.random.default_rng(number)
     random_arm = rng.random() < 0.2 or not arms
     case = Case(
@@ -124,7 +124,7 @@ def draw_case(number: int, arms: Sequence[str]) -> Case:
 
 
 class Truth:
-    """The simulated arm: rigid bodies of its URDF, and friction, drives, springs and errors of this benchmark."""
+    """The simulated arm of a case: the URDF's rigid bodies, and friction, drives, springs and errors of the case."""
 
     def __init__(self, case: Case, urdf: Path, rng: np.random.Generator) -> None:
         self.case = case
@@ -150,7 +150,7 @@ class Truth:
         self.spring = np.zeros(n)
         if case.springs:
             joint = rng.integers(n)
-            # Springs balance the load of their own joint.
+            # the spring's torque has the sign of gravity torque at the spring's own joint
             self.spring[joint] = 0.3 * size[joint]
         self.asymmetry = 0.3 * rng.normal(size=n) * (case.friction == "asymmetric")
         self.load = np.abs(gravity + self.spring * np.sin(middle.numpy())).mean(axis=0)
@@ -161,19 +161,19 @@ class Truth:
         return self.bodies.mass_matrix(q).detach().numpy() - np.diag(self.nominal)
 
     def _rigid_torque(self, motion: Motion) -> np.ndarray:
-        """Return the torque of the rigid bodies at the links, (T, n)."""
+        """Return the inverse dynamics of the rigid bodies along a motion of the links, (T, n) [Nm, N]."""
         q, qd, qdd = motion
         with torch.no_grad():
             bias = self.bodies.nonlinear_effects(torch.from_numpy(q), torch.from_numpy(qd)).numpy()
         return np.einsum("tij,tj->ti", self._rigid_mass(torch.from_numpy(q)), qdd) + bias
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return M, (T, n, n), with armature, of logged torques at logged positions."""
+        """Return M with armatures at logged positions q (T, n), in the unit of logged torques, (T, n, n)."""
         mass = self._rigid_mass(torch.from_numpy(q - self.process.zero)) + np.diag(self.armature)
         return self.process.gain[:, None] * mass
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return the logged torque of gravity and springs at logged positions, (T, n)."""
+        """Return the torque of gravity and springs at logged positions q (T, n), in units of logged torques, (T, n)."""
         return self.process.gain * self._gravity(q - self.process.zero)
 
     def _gravity(self, q: np.ndarray) -> np.ndarray:
@@ -181,13 +181,13 @@ class Truth:
         return own + self.spring * np.sin(q)
 
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Return friction along a motion of the motors, (T, n) on the fine grid."""
+        """Return the friction torque along a motion of the motors, (T, n) at the rate `FINE`."""
         if self.case.friction == "bristles":
             return self._friction(q, qd, play(q, BRISTLES))
         return self._friction(q, qd, np.tanh(qd / 1e-3))
 
     def _friction(self, q: np.ndarray, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return friction (T, n); direction: (T, n) in -1..1, of dry friction."""
+        """Return viscous plus dry friction at positions and velocities, (T, n); direction: of dry friction, -1..1."""
         dry = self.coulomb * direction * self.process.friction_factor(q)
         if self.case.friction == "stribeck":
             dry = dry * (1 + 0.6 * np.exp(-((qd / 0.1) ** 2)))
@@ -196,7 +196,7 @@ class Truth:
         return self.viscous * qd + dry * (1 + self.asymmetry * direction)
 
     def sliding_friction(self, sliding: SteadySliding) -> np.ndarray:
-        """Return the logged friction of steady sliding, (speeds, n): see `SteadySliding`."""
+        """Return the friction of steady sliding in the unit of logged torques, (speeds, n): see `SteadySliding`."""
         q = sliding.q - self.process.zero
         rows = []
         for speed in sliding.speeds:
@@ -208,16 +208,18 @@ class Truth:
     def sensed(
         self, motion: Motion, temperature: np.ndarray | float = 1.0
     ) -> tuple[Motion, np.ndarray, np.ndarray]:
-        """Return the motion, the torque and its friction (T, n) that ideal sensors show at the motors.
+        """Return the motion, the torque and its friction torque, (T, n) each, of the motors as ideal sensors show them.
+
+        Ideal sensors have the errors of units and zeros of the case, and no noise.
 
         Args:
-            motion: of the links, on the fine grid.
-            temperature: factor of friction.
+            motion: of the links, at the rate `FINE`.
+            temperature: factor on friction, (T, n) or one number.
         """
         q, qd, qdd = motion
         link = self._rigid_torque(motion) + self.spring * np.sin(q)
         if self.case.errors:
-            # motors move relative to the links; velocities and accelerations of this motion are differences
+            # motors move relative to the links: velocity and acceleration of the deflection are differences
             twist = self.process.deflection(link, self.inertia)
             rate = np.gradient(twist, 1 / FINE, axis=0)
             q, qd, qdd = q + twist, qd + rate, qdd + np.gradient(rate, 1 / FINE, axis=0)
@@ -227,20 +229,26 @@ class Truth:
         return (q + self.process.zero, qd, qdd), gain * torque, gain * friction
 
     def inertial_columns(self, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-        """Return the base parameters of bodies and armatures as combinations (r, K), and their columns (T, n, r)."""
+        """Return the regressor of base parameters along a motion, without friction and offsets.
+
+        Returns: (r, K) matrix from inertial parameters and armatures to base parameters, and columns (T, n, r).
+        """
         q, qd, qdd = motion
         base = base_parameters(self.arm, spelgen.FrictionModel())
         count = 10 * len(self.arm.bodies) + len(self.armature)
         columns = np.concatenate(
             [regressor(self.arm, q, qd, qdd), qdd[:, None] * np.eye(len(self.armature))], axis=2
         )
-        inertial = base.columns < count  # the ones of friction and offsets are omitted
+        inertial = base.columns < count  # base parameters of friction and offsets are omitted
         return base.combination[inertial, :count], columns[:, :, base.columns[inertial]]
 
     def base_parameters(self, motion: Motion, combination: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the true base parameters (r,); pseudo-true ones if units or zeros are wrong.
+        """Return the true base parameters (r,), or the pseudo-true ones (see the module) if units or zeros are wrong.
 
-        motion: of the links. combination, columns: `inertial_columns` of this motion, with the zeros of the sensors.
+        Args:
+            motion: of the links.
+            combination: (r, K) of `inertial_columns`, for this motion with the zeros of the sensors added.
+            columns: (T, n, r) likewise.
         """
         bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
         exact = combination @ np.concatenate([bodies, self.armature])
@@ -250,7 +258,7 @@ class Truth:
         scale = torque.std(axis=0) + TINY
         rows = (columns / scale[:, None]).reshape(-1, columns.shape[2])
         length = np.linalg.norm(rows, axis=0) + TINY
-        # directions that the test motion does not excite keep the exact values
+        # the ridge penalty keeps the exact values of parameters that the test motion does not excite
         rows = np.vstack([rows / length, np.sqrt(UNEXCITED) * np.eye(len(length))])
         residual = ((torque - columns @ exact) / scale).ravel()
         change = np.linalg.lstsq(rows, np.append(residual, np.zeros(len(length))), rcond=None)[0]
@@ -258,12 +266,12 @@ class Truth:
 
 
 def _limit(value: float | None, default: float) -> float:
-    """A joint's limit as far as a motion goes."""
+    """Return a limit of a joint's simulated motion: the URDF's, within +-2.5, or the default if it has none."""
     return default if value is None else float(np.clip(value, -2.5, 2.5))
 
 
 def fourier_motion(truth: Truth, seconds: float, rng: np.random.Generator) -> Motion:
-    """Return five harmonics per joint, within the ranges and speeds of the joints."""
+    """Return a random motion of the links at the rate `FINE`: five sines per joint, within its range and speed."""
     t = np.arange(0.0, seconds, 1.0 / FINE)[:, None, None]
     n = len(truth.lower)
     omega = 2 * np.pi * np.sort(rng.uniform(0.05, 0.6, (5, n)), axis=0)
@@ -278,7 +286,7 @@ def fourier_motion(truth: Truth, seconds: float, rng: np.random.Generator) -> Mo
 
 
 def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Motion:
-    """Return quintic motions between random positions, with pauses."""
+    """Return a motion of the links at the rate `FINE`: quintic polynomials between random positions, with pauses."""
     parts: list[tuple[np.ndarray, ...]] = []
     count, at = 0, rng.uniform(truth.lower, truth.upper)
     while count < seconds * FINE:
@@ -296,7 +304,7 @@ def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Mo
 
 
 def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelgen.Trajectory]:
-    """Return logs of two motions: noisy positions, their differences as velocities, noisy torques."""
+    """Simulate two motions of a case; return their logs: noisy positions, differences as velocities, noisy torques."""
     logs, own_rng, process = [], np.random.default_rng([case.number, 3]), truth.process
     for name in ("first", "second"):
         make = fourier_motion if case.motion == "excitation" else pick_and_place
@@ -315,7 +323,10 @@ def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelg
 
 
 def wrong_urdf(urdf: Path, error: float, rng: np.random.Generator) -> bytes:
-    """Return the URDF with random inertials of this relative standard deviation; infinite: placeholders."""
+    """Return the URDF with random errors of its inertials, as text.
+
+    error: relative standard deviation; infinite: all masses 1 kg and all inertias 0.01 kg m^2, as in a draft.
+    """
     parser = etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True)
     tree = etree.ElementTree(etree.fromstring(urdf.read_bytes(), parser))
     for name in ("visual", "collision", "dynamics"):
@@ -347,7 +358,7 @@ def wrong_urdf(urdf: Path, error: float, rng: np.random.Generator) -> bytes:
 
 
 def random_arm(rng: np.random.Generator) -> bytes:
-    """A chain of three to seven joints with random axes, offsets and solid bodies, as URDF."""
+    """Return the URDF of a random chain of three to seven turning joints, with box-shaped bodies, as text."""
     robot = etree.Element("robot", name="random")
     etree.SubElement(robot, "link", name="base")
     joints, parent = int(rng.integers(3, 8)), "base"
@@ -374,7 +385,7 @@ def random_arm(rng: np.random.Generator) -> bytes:
 
 
 def run_case(case: Case, folder: Path) -> dict[str, Any]:
-    """Fit everything to one case; errors by method."""
+    """Simulate a case, fit each method to its logs, and return the case and the errors by method."""
     rng = np.random.default_rng([case.number, 1])
     with tempfile.TemporaryDirectory() as temporary:
         given = Path(temporary) / "given.urdf"
@@ -386,7 +397,7 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
         given.write_bytes(wrong_urdf(urdf, case.urdf_error, rng))
         try:
             truth = Truth(case, urdf, rng)
-        except SpelgenError as error:  # two arms in one URDF, for one
+        except SpelgenError as error:  # the package rejects the URDF, for example one with two arms
             return asdict(case) | {"n": 0, "results": {name: {"error": str(error)} for name in METHODS}}
         logs = record_log(truth, case, rng)
         test = fourier_motion(truth, 10.0, rng)
@@ -407,7 +418,7 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
-    """Return the errors of fitted dynamics along a test motion of the links."""
+    """Return the errors of fitted dynamics along a test motion of the links, by name; see the module."""
     every, dynamics = round(FINE / 100.0), fitted.dynamics
     sensed, true_tau, true_friction = truth.sensed(motion)
     q, qd, qdd = (np.ascontiguousarray(x[::every]) for x in sensed)
@@ -454,10 +465,10 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Fitted dynamics, and their parameters.
+    """Dynamics that a method has fitted, and their parameters.
 
-    bodies: (B, 10) in the frames of the joints. armature: (n,). posterior: of the default preset.
-    residual: correlation and spectrum of the torque residual, of one method.
+    bodies: inertial parameters, (B, 10), in the frames of the joints. armature: (n,). posterior: of the default preset.
+    residual: statistics of the torque residual (`residual_of`), of least squares with bristle states.
     """
 
     dynamics: Any
@@ -468,14 +479,14 @@ class Fitted:
 
 
 def fit_hybrid(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Fit the default model to torques as `spelgen train` does."""
+    """Fit the preset `hybrid` to torques, as `spelgen train` does."""
     fit = spelgen.fit(spelgen.build(urdf, "hybrid"), logs, spelgen.TorqueFit(), arm=urdf)
     model = fit.model.requires_grad_(False)
     return Fitted(model, model.inertial_parameters.numpy(), model.armature.numpy(), fit.posterior)
 
 
 def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]], Fitted]:
-    """Return a function that identifies the arm by least squares."""
+    """Return a function that identifies an arm from logs by least squares; memory: with bristle states."""
 
     def fit(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
         method = spelgen.LeastSquares(friction=spelgen.FrictionModel(memory=memory))
@@ -489,7 +500,10 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
 
 
 def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) -> list[float] | None:
-    """Return the columns of `residual_statistics` of an identification with bristle states, in its own logs."""
+    """Return statistics of the torque residual of an identification on its own logs; None without bristle states.
+
+    They are `ResidualStatistics.columns`.
+    """
     if not result.method.friction.memory:
         return None
     samples = dynamics_samples(
@@ -522,7 +536,7 @@ if importlib.util.find_spec("figaroh"):
 
 
 def usable_arms(folder: Path) -> list[str]:
-    """Arms whose moving links all have inertials that bodies can have."""
+    """Return the names of URDFs in a folder whose moving links all have masses above 1 g, not all of them equal."""
     names = []
     for path in sorted(folder.glob("*.urdf")):
         tree = etree.parse(path)

@@ -1,4 +1,4 @@
-"""Tables of the results of `truth.py`: errors, the default relative to least squares, intervals, residuals."""
+"""Tables of the results of `truth.py`: errors, `hybrid` relative to least squares, intervals, residual statistics."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAUSES: dict[str, Callable[[Row], Any]] = {
 
 
 def summary(rows: Sequence[Row], methods: Sequence[str], recordings: Path | None = None) -> str:
-    """Return all tables of the cases without an error; recordings: folder to compare residuals with."""
+    """Return all tables as text, over the rows without a failed fit; recordings: folder to compare residuals with."""
     ours = (DEFAULT, *LEAST_SQUARES)
     good = [row for row in rows if not any("error" in row["results"][name] for name in ours)]
     if not good:
@@ -39,7 +39,7 @@ def summary(rows: Sequence[Row], methods: Sequence[str], recordings: Path | None
 
 
 def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
-    """Yield the median errors of each method."""
+    """Yield the lines of the table of median errors per method, over cases."""
     yield (
         f"{'':20}{'M':>10}{'g':>10}{'base':>10}{'friction':>10}"
         f"{'nMSE':>12}{'filtered':>12}{'worst Mjj':>11}{'s':>7}{'arms':>7}"
@@ -59,7 +59,7 @@ def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
 
 
 def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the default's errors divided by the ones of the better least squares: all cases, then by cause."""
+    """Yield lines on the default's error divided by the better least squares' error: all cases, then per cause."""
     for key, goal in (("mass", 1.2), ("nmse", 1.02)):
         ratio = np.array([by_better_least_squares(row, key) for row in rows])
         limits = sorted({1.0, 1.02, 1.2, 2.0})
@@ -76,22 +76,22 @@ def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def by_cause(rows: Sequence[Row], cause: str) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield the values of a cause, each with the mask (rows,) of its cases."""
+    """Yield each value of a cause of `CAUSES` that occurs, with the mask (rows,) of the cases that have it."""
     values = [CAUSES[cause](row) for row in rows]
     for value in sorted(set(values)):
         yield value, np.array([x == value for x in values])
 
 
 def by_better_least_squares(row: Row, key: str) -> float:
-    """Return an error of the default divided by the error of the better least squares."""
+    """Return one error of the default, named by `key`, divided by the smaller error of the two least squares."""
     errors = {name: row["results"][name][key] for name in (DEFAULT, *LEAST_SQUARES)}
     return float(errors[DEFAULT] / min(errors[name] for name in LEAST_SQUARES))
 
 
 def interval_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the share of true values within the default's 95 % intervals, and the width of the intervals.
+    """Yield lines on the share of true values within the default's 95 % intervals, and the width of the intervals.
 
-    width: median half width divided by the 95 % quantile of the error, both relative to the half width: 1 is right.
+    width: 1 / (95 % quantile of error / half width); 1 is right, more is too wide.
     """
     rows = [row for row in rows if "intervals" in row["results"][DEFAULT]]
     if not rows:
@@ -112,7 +112,7 @@ def interval_lines(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def residual_rows(rows: Sequence[Row], recordings: Path | None) -> Iterator[tuple[str, Sequence[float]]]:
-    """Yield the statistics of residuals: recordings, then the median and the spread of simulated arms."""
+    """Yield rows of residual statistics: of recordings and their median, then quantiles over simulated arms."""
     if recordings is not None:
         found = {name: x.columns() for name, x in of_recordings(recordings).items()}
         yield from found.items()

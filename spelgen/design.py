@@ -65,7 +65,7 @@ CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in ge
 
 
 def load_design(preset: str | Path | Design) -> Design:
-    """Return the design of a preset of spelgen, or of a YAML file. Raises SettingsError."""
+    """Return the design with the name of a preset of spelgen, or in a YAML file. Raises SettingsError."""
     if isinstance(preset, Design):
         return preset
     # The name of a preset takes precedence over a file of the same name without a suffix.
@@ -109,7 +109,7 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
                 f"one of {', '.join(choices)}",
             )
             errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
-    # Errors of single values are raised first: the rules for pairs of values require that each value is valid.
+    # Errors of single values are raised before conflicts: the rules for pairs of values require valid values.
     collect(errors)
     for first, second, do in _conflicts(values):
         got = f"{first}: {values[first]} with {second}: {values[second]}"
@@ -119,21 +119,21 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
 
 def _conflicts(values: Mapping[str, object]) -> Iterator[tuple[str, str, str]]:
     """Yield (key, other key, advice) for each pair of keys whose values contradict each other."""
-    # The rules have the order of the keys in a file, so that errors appear in the order of the file's lines.
+    # The rules below have the order of the keys in a design file, so that errors have the order of its lines.
     rigid = values["mass"] == "closed-form"
     if rigid != (values["potential"] == "closed-form"):
         yield "mass", "potential", "rigid bodies give both: name closed-form for both or for neither"
     if rigid != (values["dissipation"] == "constants"):
-        yield "mass", "dissipation", "dissipation: constants goes with mass: closed-form, and with it alone"
+        yield "mass", "dissipation", "dissipation: constants and mass: closed-form require each other"
     if values["memory"] == "bristles" and not rigid:
-        yield "memory", "dissipation", "bristles go with dissipation: constants"
+        yield "memory", "dissipation", "bristles require dissipation: constants"
     if values["net"] == "none" and not rigid:
-        yield "mass", "net", "net: none goes with mass: closed-form alone"
+        yield "mass", "net", "net: none requires mass: closed-form"
     if (values["net"] == "none") != (values["encoding"] == "none"):
         yield "net", "encoding", "encoding is the input of networks: none for a model without networks"
     if rigid and values["net"] == "kan":
         yield "mass", "net", "residual networks in addition to rigid bodies need net: mlp"
     if rigid and values["encoding"] == "lie-group":
-        yield "mass", "encoding", "residual terms beside rigid bodies need encoding: joint"
+        yield "mass", "encoding", "residual terms of rigid bodies need encoding: joint"
     if rigid and values["input"] != "derived":
-        yield "mass", "input", "input: derived goes with mass: closed-form"
+        yield "mass", "input", "mass: closed-form requires input: derived"

@@ -34,14 +34,14 @@ class SpelgenError(Exception):
         self.file = None if self.file is None else str(self.file)
 
     def __str__(self) -> str:
-        statement = _in_short(self.got)
+        statement = _truncated(self.got)
         if self.expected is not None:
-            statement = f"got {statement}, expected {_in_short(self.expected)}"
+            statement = f"got {statement}, expected {_truncated(self.expected)}"
         # Compilers print FILE:LINE in this form, and editors open the file at that line.
         location = ":".join(str(x) for x in (self.file, self.line) if x is not None)
-        message = ": ".join(x for x in (_in_short(location), _in_short(self.element or ""), statement) if x)
+        message = ": ".join(x for x in (_truncated(location), _truncated(self.element or ""), statement) if x)
         if self.do is not None:
-            message += f"; {_in_short(self.do)}"
+            message += f"; {_truncated(self.do)}"
         return message
 
 
@@ -58,7 +58,7 @@ class SettingsError(SpelgenError):
 
 
 class OptionError(SettingsError):
-    """An option that has no effect here; ``belongs`` names the command or setting that the option belongs to."""
+    """An option that the chosen command, objective or model does not have; ``belongs`` states where it applies."""
 
     def __init__(self, option: str, belongs: str) -> None:
         super().__init__(belongs, element=option)
@@ -91,20 +91,20 @@ class SpelgenErrors(SpelgenError):
         for error in self.errors:
             key = (error.line, error.element, error.got, error.expected, error.do)
             groups.setdefault(key, []).append(error)
-        lines = [_once(group) for group in list(groups.values())[:MAX_ERRORS]]
+        lines = [_joined(group) for group in list(groups.values())[:MAX_ERRORS]]
         if len(groups) > MAX_ERRORS:
             lines.append(f"and {len(groups) - MAX_ERRORS} more like these")
         return "\n".join(lines)
 
 
-def _once(errors: Sequence[SpelgenError]) -> str:
-    """Return a text for errors that differ only in their files: the first error, then the other files."""
+def _joined(errors: Sequence[SpelgenError]) -> str:
+    """Return one text for equal errors in several files: the first error, followed by the names of the other files."""
     first = errors[0]
     files = dict.fromkeys(error.file for error in errors if error.file and error.file != first.file)
     return f"{first}\n  the same: {shortened(list(map(str, files)), 5)}" if files else str(first)
 
 
-def _in_short(text: str) -> str:
+def _truncated(text: str) -> str:
     """Return a text, shortened to its start and end if it is long: a name in a file may have a million characters."""
     if len(text) <= MAX_TEXT:
         return text
@@ -113,7 +113,7 @@ def _in_short(text: str) -> str:
 
 
 def in_one_line(error: BaseException) -> str:
-    """Return the type of an exception and its message."""
+    """Return the type and message of an exception as one line, for an error message."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
@@ -137,7 +137,7 @@ def suggestion(name: str, names: Iterable[str]) -> str:
 
 
 def shortened(names: Sequence[str], limit: int) -> str:
-    """Return the names, or the first ``limit`` of them and the number of the others."""
+    """Return names as text for a message: all of them, or the first ``limit`` of them and the number of the others."""
     omitted = len(names) - limit
     # If only one name would be omitted, it is printed: most names are shorter than `and 1 more`.
     if omitted <= 1:
@@ -147,7 +147,7 @@ def shortened(names: Sequence[str], limit: int) -> str:
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """A remark or warning for users; ``code`` is kebab-case and stable."""
+    """A remark or warning for users about a file, a robot or a log; ``code``, such as ``gap``, names its kind."""
 
     severity: Severity
     code: str
@@ -159,5 +159,5 @@ class Diagnostic:
         return f"{self.severity}: {self.where}: {self.message}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the five fields as a JSON object; their order is part of the public interface."""
+        """Return the five fields of the diagnostic as a JSON object; their order is part of the public interface."""
         return asdict(self)

@@ -54,7 +54,7 @@ def read_bytes(
             return path.read_bytes()
     except FileNotFoundError:
         raise error("no such file", file=path) from None
-    except (OSError, ValueError) as problem:  # `stat` raises ValueError for a null character
+    except (OSError, ValueError) as problem:  # `stat` raises ValueError for a path with a null character
         reason = problem.strerror if isinstance(problem, OSError) else None
         raise error(f"cannot be read ({reason or problem})", file=path) from None
     raise error(f"a file of {size} bytes", file=path, expected=f"at most {largest}", do=do)
@@ -74,10 +74,10 @@ def read_json(path: Path, error: type[SpelgenError]) -> dict[str, Any]:
 
 @contextmanager
 def limited_memory(size: int) -> Iterator[None]:
-    """Limit the additional memory of the process to ``size`` bytes; a larger allocation raises MemoryError.
+    """Context manager that limits the additional memory of the process to ``size`` bytes.
 
-    File readers of third-party packages allocate the size that a file states, without checking it. The limit has an
-    effect on Linux only.
+    A larger allocation raises MemoryError. File readers of third-party packages allocate the size that a file states,
+    without checking it. The limit has an effect on Linux only.
     """
     try:
         import resource
@@ -100,7 +100,7 @@ def limited_memory(size: int) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
-    """Yield a hidden file in the folder of `path`; at the end it replaces `path` atomically, even if power fails.
+    """Context manager that yields a hidden file, which at the end replaces `path` atomically, even if power fails.
 
     An absent folder is created. If `path` is in the local copy of an address, the file is also uploaded. An interrupted
     or failed write does not change `path`. Raises OSError with the path if the file cannot be written, for instance on
@@ -108,9 +108,9 @@ def replacing(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     with naming(path):
-        # An absent folder is created: otherwise a command would fail after minutes of work.
+        # An absent output folder is created: otherwise a command would fail after minutes of work.
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The hidden file is in the same folder, because renaming is atomic only within one file system.
+        # The hidden file is in the folder of `path`, because renaming is atomic only within one file system.
         unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             yield unfinished
@@ -131,7 +131,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager that adds the file name `path` to an OSError without one (a full disk), or of its hidden file."""
+    """Context manager in which an OSError gets the file name `path`, unless it names another file.
+
+    An error on a full disk names no file; an error in `replacing` names the hidden file.
+    """
     try:
         yield
     except OSError as error:
@@ -148,17 +151,17 @@ def write_bytes(path: Path | str, content: bytes) -> Path:
 
 
 def write_text(path: Path | str, text: str) -> Path:
-    """Write `text` to `path` as UTF-8, all or nothing; return the path."""
+    """Write `text` to `path` as UTF-8, all or nothing (see `replacing`); return the path."""
     return write_bytes(path, text.encode())
 
 
 def write_json(path: Path | str, content: Mapping[str, object]) -> Path:
-    """Write indented JSON, all or nothing; return the path."""
+    """Write `content` to `path` as indented JSON, all or nothing (see `replacing`); return the path."""
     return write_text(path, json.dumps(content, indent=2) + "\n")
 
 
-# One slash is accepted, because `Path` reduces two slashes to one. A scheme has at least two letters, because `C:/`
-# is a drive of Windows.
+# One slash is accepted after the scheme of an address, because `Path` reduces two slashes to one. A scheme has at least
+# two letters, because `C:/` is a drive of Windows.
 ADDRESS = re.compile(r"^([a-z][a-z0-9+.-]+):/+(?=[^/])")
 
 _copies: dict[str, Path] = {}  # {address: path of its local copy}
@@ -174,7 +177,7 @@ def local(path: Path | str) -> Path:
     match = ADDRESS.match(str(path))
     if match is None or Path(path).exists():
         return Path(path)
-    if match[1] == "file":  # `Path` changes file:///x to file:/x
+    if match[1] == "file":  # `Path` changes file:///x to file:/x, so any number of slashes is accepted
         return Path("/" + str(path)[match.end() :])
     address = f"{match[1]}://{str(path)[match.end() :]}".rstrip("/")
     if address not in _copies:
@@ -209,7 +212,7 @@ def address_of(path: Path) -> str | None:
 
 
 def with_addresses(text: str) -> str:
-    """Return a text with addresses in place of their local copies."""
+    """Return a message in which paths of local copies are replaced by the addresses that the user has typed."""
     for address, copy in _copies.items():
         text = text.replace(str(copy), address)
     return text
@@ -217,7 +220,7 @@ def with_addresses(text: str) -> str:
 
 @contextmanager
 def reached(address: str) -> Iterator[tuple[Any, str]]:
-    """Yield the fsspec file system of an address, and the path on it.
+    """Context manager that yields the fsspec file system of an address, and the path on this file system.
 
     Every exception in the block becomes a SpelgenError with the address: file systems raise their own types.
     """
@@ -235,7 +238,7 @@ def reached(address: str) -> Iterator[tuple[Any, str]]:
 def _fetch(address: str) -> Path:
     """Copy the file or folder at an address into a new temporary folder; return the path of the copy."""
     folder = Path(tempfile.mkdtemp(prefix="spelgen-"))
-    # Copies are removed at the end of the process; written results were sent to the address before.
+    # Local copies are removed at the end of the process: written results are uploaded immediately.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     # The local copy of a remote file has the same name, because the suffix of the name selects the reader.
     copy = _inside(folder, address.rpartition("/")[2], address)
@@ -252,11 +255,11 @@ def _fetch(address: str) -> Path:
 
 
 def _inside(folder: Path, name: str, address: str) -> Path:
-    """Return the path of a name in a folder. Raises SpelgenError if the path is outside the folder.
+    """Return the path of the key `name` in a folder. Raises SpelgenError if the path is outside the folder.
 
     Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """
     path = folder / name
     if folder.resolve() not in path.resolve().parents:
-        raise SpelgenError(f"the key {name!r}", file=address, expected="keys inside the address alone")
+        raise SpelgenError(f"the key {name!r}", file=address, expected="only keys inside the address")
     return path

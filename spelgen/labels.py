@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 
 # Names of predictors in results, charts and tables.
-MODEL = "model"  # the trained model
+MODEL = "model"  # name of the trained model in tables and charts
 CONSTANT_VELOCITY = "velocity stays constant"
 URDF, URDF_WITH_DRIVES = "URDF", "URDF and drives"
 LEAST_SQUARES = "least squares"
@@ -52,18 +52,21 @@ def base_name(first: str, terms: int) -> str:
 
 @dataclass(frozen=True)
 class NamedJoint:
-    """The name of a joint and its units."""
+    """The name of a joint and the units of its quantities, for charts and tables."""
 
     name: str
     units: Units
 
     def axis(self, quantity: str, label: str = "") -> str:
-        """Return ``label [rad]``, with the joint's unit of the quantity ``position``, ``velocity`` or ``torque``."""
+        """Return the label of a chart's axis with the joint's unit: ``label [rad]`` for the quantity ``position``.
+
+        quantity: ``position``, ``velocity``, ``torque`` or ``inertia``; it is also the label if ``label`` is empty.
+        """
         return f"{label or quantity} [{asdict(self.units)[quantity]}]"
 
 
 def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[NamedJoint]:
-    """Return the named joints, each with the units of its joint type."""
+    """Return the joints of a chart or table, each with its name and the units of its joint type."""
     return [NamedJoint(name, UNITS[x]) for name, x in zip(names, joint_types, strict=True)]
 
 
@@ -73,9 +76,9 @@ def torque_units(joint_types: Iterable[str]) -> str:
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:
-    """Return joint numbers (from 1) as text; three or more consecutive numbers form a range: ``2-6`` or ``2,4``."""
+    """Return joint indices (from 0) as numbers (from 1) in ranges: ``2-4,6`` for (1, 2, 3, 5), ``2,3`` for (1, 2)."""
     texts = []
-    # Joint number minus position in the list is constant over consecutive joints.
+    # Joint index minus position in the list is constant over consecutive joints, which therefore form one group.
     for _, indices in groupby(range(len(joints)), key=lambda index: joints[index] - index):
         run = [str(joints[index] + 1) for index in indices]
         texts += [f"{run[0]}-{run[-1]}"] if len(run) > 2 else run
@@ -83,7 +86,7 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
 
 
 def joints_in_ranges(joints: tuple[int, ...]) -> str:
-    """Return ``joint 2``, or ``joints 2-4,6``."""
+    """Return joint indices (from 0) as text with ranges: ``joint 2`` for (1,), ``joints 2-4,6`` for (1, 2, 3, 5)."""
     return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"
 
 
@@ -95,33 +98,34 @@ def entry_name(row: int, column: int) -> str:
 
 
 def joints_in_words(joints: Sequence[int]) -> str:
-    """Return ``joint 2``, or ``joints 2, 3 and 5``."""
+    """Return joint indices (from 0) in words: ``joint 2`` for (1,), ``joints 2, 3 and 5`` for (1, 2, 4)."""
     return f"joint{'s' * (len(joints) > 1)} {listed([str(joint + 1) for joint in sorted(joints)])}"
 
 
 def axes_in_words(joints: Sequence[int]) -> str:
-    """Return ``the axis of joint 2``, or ``the axes of joints 2 and 3``."""
+    """Return the axes of joint indices (from 0) in words: ``the axis of joint 2``, ``the axes of joints 2 and 3``."""
     return f"the {'axes' if len(joints) > 1 else 'axis'} of {joints_in_words(joints)}"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return ``a``, or ``a, b and c``."""
+    """Return names as an enumeration: ``a``, or ``a, b and c``."""
     *preceding, last = names
     return f"{', '.join(preceding)} and {last}" if preceding else last
 
 
 def counted(count: int, noun: str) -> str:
-    """Return ``1 joint`` or ``2 joints``, ``1 trajectory`` or ``2 trajectories``."""
+    """Return a count with the noun in singular or plural: ``1 joint`` or ``2 joints``, ``2 trajectories``."""
     plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
     return f"{count} {noun if count == 1 else plural}"
 
 
 def share(fraction: float, reference: str = "") -> str:
     """Return a fraction of ``reference`` as text, such as ``5 % of the motion`` or ``13.6 times the motion``."""
-    # Above 1 a factor is easier to understand than a percentage: 2.5 times the motion, not 250 %.
+    # A fraction above 1 is written as a factor, which is easier to understand than a percentage: 2.5 times the motion,
+    # not 250 %.
     if fraction > 1:
         return f"{fraction:.3g} times {reference}".rstrip()
-    # Four digits close to 100 %, so that 99.96 % is not rounded to 100 %.
+    # Percentages close to 100 % have four digits, so that 99.96 % is not rounded to 100 %.
     digits = 4 if 0.99 <= fraction < 1 else 3
     percent = f"{100 * fraction:.{digits}g} %"
     return f"{percent} of {reference}" if reference else percent
@@ -148,10 +152,10 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of a predictor with an observer, which adds the disturbance torque of a momentum observer."""
+    """Return the name of a predictor whose predictions include the disturbance that a momentum observer estimates."""
     return f"{predictor} + observer"
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor. A predictor with an observer is shown only if it is the trained model."""
+    """Return True if charts show a predictor: of the predictors with a disturbance observer, only the trained model."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

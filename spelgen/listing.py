@@ -12,7 +12,7 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # places at which a name may be wrapped
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # where a long name may be wrapped
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Listing:
     left: tuple[int, ...] = (0,)
 
     def text(self) -> str:
-        """Return the table for a terminal or a file, without a line end."""
+        """Return the table as text for a terminal or a file, without a final line end."""
         columns = list(map(list, zip(self.head, *self.rows, strict=True)))
         tables = "\n\n".join(self._layout(columns, group) for group in _groups(_fitted(columns)))
         # The note below a table is indented like the rows, so that titles, which are not indented, are easy to find.
@@ -39,7 +39,7 @@ class Listing:
         return "\n".join([*textwrap.wrap(self.title, WIDTH), tables, *note])
 
     def html(self) -> str:
-        """Return the table for a notebook."""
+        """Return the table as HTML for a notebook."""
         title = f"<p><b>{escape(self.title)}</b></p>" if self.title else ""
         note = f"<p>{escape(self.note)}</p>" if self.note else ""
         rows = "".join(self._html_row(row, "td") for row in self.rows)
@@ -72,10 +72,10 @@ class Listing:
 
 
 def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
-    """Return the columns, with wrapped heads if the table is too wide."""
+    """Return the columns of a table, each a list of its head and cells; heads are wrapped if the table is too wide."""
     if sum(2 + _width(column) for column in columns) <= WIDTH:
         return list(columns)
-    # Heads are wrapped to at least 14 characters: in narrower heads most words would be cut.
+    # Heads of columns are wrapped to at least 14 characters: in narrower heads most words would be cut.
     return [columns[0], *([_folded(head, max(14, _width(cells))), *cells] for head, *cells in columns[1:])]
 
 
@@ -86,7 +86,7 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
     room = WIDTH - 2 - max(MIN_NAME, _width(words))
     groups: list[list[int]] = [[]]
     used = 0
-    # Greedy filling keeps the order of the columns, and only the last table may be narrow.
+    # Columns are assigned greedily to tables: their order is preserved, and only the last table may be narrow.
     for column in range(1, len(columns)):
         width = 2 + _width(columns[column])
         if used and used + width > room:
@@ -99,13 +99,13 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
 def _width(texts: Iterable[str]) -> int:
     """Return the width of the widest line in characters of a terminal."""
-    from rich.cells import cell_len  # a slow import
+    from rich.cells import cell_len  # rich is imported here: its import is slow
 
     return max((cell_len(line) for text in texts for line in text.split("\n")), default=0)
 
 
 def _folded(name: str, width: int) -> str:
-    """Return the name with line breaks after separators if it is longer than the width."""
+    """Return a name with line breaks after separators if it is longer than `width` characters."""
     lines = [""]
     for word in SEPARATOR.split(name):
         if lines[-1] and len(lines[-1]) + len(word) > width:
@@ -133,8 +133,8 @@ def number(value: float | None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time such as `40 s`, `2.5 min` or `3.5 h`."""
-    # Times have at most three digits: the duration of a training that is repeated differs by more than the rounding.
+    """Return a duration, given in seconds, as text such as `40 s`, `2.5 min` or `3.5 h`."""
+    # Times have at most three digits: durations of repeated trainings differ by more than the rounding.
     if seconds < 100:
         return f"{seconds:.0f} s"
     minutes = seconds / 60

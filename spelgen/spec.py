@@ -19,7 +19,8 @@ Triple = tuple[float, float, float]
 Entries = tuple[tuple[int, int, float], ...]
 """Lower triangle of a sparse symmetric matrix: (row, column, value) of each entry, with indices from 0."""
 
-# Version of the format. It changes when specifications or weights of an earlier version of spelgen become unusable.
+# Version of the JSON format of a ModelSpec. It changes when specifications or weights of an earlier version of spelgen
+# become unusable.
 SPEC_FORMAT = 9
 
 
@@ -140,7 +141,7 @@ class InputSpec:
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Specification of a model; indices are from 0.
+    """Specification of a model, from which its PyTorch module is written; indices are from 0.
 
     Raises ModuleError if an index is out of range, a name occurs twice, or a tuple has a wrong length.
     """
@@ -201,24 +202,24 @@ class ModelSpec:
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
-        """``revolute`` or ``prismatic``, for each joint."""
+        """Type of each joint, ``revolute`` or ``prismatic``."""
         return tuple(joint.joint_type for joint in self.joints)
 
     def to_json(self) -> str:
-        """Return the canonical JSON, in one line of ASCII."""
+        """Return the canonical JSON of the specification, in one line of ASCII."""
         # Keys are sorted and blanks omitted, so that equal specifications have equal digests.
         plain = {"format": SPEC_FORMAT, **asdict(self)}
         return json.dumps(plain, sort_keys=True, ensure_ascii=True, separators=(",", ":"))
 
     @cached_property
     def sha256(self) -> str:
-        """Digest of the canonical JSON."""
+        """SHA-256 digest of the canonical JSON in hexadecimal, which identifies the specification."""
         return hashlib.sha256(self.to_json().encode()).hexdigest()
 
 
 def spec_from_json(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a JSON text. Raises ModuleError, which names ``file``."""
-    from pydantic import TypeAdapter, ValidationError  # slow to import
+    """Return the ModelSpec in a JSON text (see `ModelSpec.to_json`). Raises ModuleError, which names ``file``."""
+    from pydantic import TypeAdapter, ValidationError  # pydantic is imported here: its import is slow
 
     try:
         content = json.loads(text, parse_constant=_no_number)

@@ -20,7 +20,7 @@ Result = TypeVar("Result")
 
 def default_jobs() -> int:
     """Return the number of cores that this process may use if Ray is installed, else 1."""
-    # The CPU affinity is counted, because a container or a scheduled job may have fewer cores than the machine.
+    # Cores are counted by the CPU affinity, because a container or a scheduled job may have fewer than the machine.
     return 1 if find_spec("ray") is None else len(os.sched_getaffinity(0))
 
 
@@ -63,19 +63,19 @@ def run_tasks(
 
 @contextmanager
 def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
-    """Start Ray on this machine, or connect to a cluster, within a context. Yield the module `ray`."""
+    """Context manager that starts Ray on this machine, or connects to a cluster, and yields the module `ray`."""
     if find_spec("ray") is None:
         do = "pip install 'spelgen[parallel]', or --jobs 1"
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)
     # Ray must not send usage statistics.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # The value "0" avoids a warning of Ray about a changed default of this variable.
+    # RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO=0 avoids a warning of Ray about a changed default of this variable.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
 
     cluster: dict[str, Any] = {"address": address}
     if address is None:
-        # The dashboard would open a port. Tasks exchange only paths and a few numbers, for which 100 MB suffice.
+        # Ray's dashboard would open a port. The object store needs at most 100 MB: tasks exchange paths and numbers.
         cluster = {"num_cpus": jobs, "include_dashboard": False, "object_store_memory": 100_000_000}
     try:
         ray.init(**cluster, log_to_driver=False, logging_level=logging.ERROR)
@@ -93,7 +93,7 @@ def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
 
 
 def _work_or_die(work: Callable[[Task], Result], task: Task) -> Result:
-    """Do a task in a worker. A worker that is interrupted dies at once, so that Ray runs its task again."""
+    """Return work(task) in a worker of Ray. A worker that is interrupted dies at once: Ray then runs its task again."""
     try:
         return work(task)
     except KeyboardInterrupt:
@@ -110,6 +110,6 @@ def _outcome(reference: Any) -> Any:
     except RayTaskError as error:
         return error.cause if isinstance(error.cause, Exception) else error
     except RayError as error:
-        # In all attempts the worker of the task or a process of Ray died.
+        # A RayError means that the worker of the task, or a process of Ray, died in all attempts.
         got = f"a worker that died {RETRIES + 1} times ({type(error).__name__})"
         return RunError(got, do="the same command runs the remaining tasks")

@@ -23,7 +23,8 @@ _FOLDER = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1] / "te
 def _environment(autoescape: bool) -> Environment:
     return Environment(
         loader=FileSystemLoader(_FOLDER),
-        # A misspelt name raises an error; by default it would be an empty text in a page or in generated code.
+        # A misspelt name in a template raises an error; by default it would be an empty text in a page or in generated
+        # code.
         undefined=StrictUndefined,
         autoescape=autoescape,
         trim_blocks=True,
@@ -41,7 +42,7 @@ def render(template: str, **context: object) -> str:
 
 
 def read(name: str) -> str:
-    """Return the text of a file in the folder of templates that is no template, for example a style sheet."""
+    """Return the unchanged text of a file in the folder of templates, such as a style sheet or a script."""
     return (_FOLDER / name).read_text(encoding="utf-8")
 
 
@@ -54,7 +55,7 @@ def render_page(template: str, **context: object) -> str:
     The Content-Security-Policy of the page admits its own style sheet and scripts by their digests and nothing else:
     the page loads no file or address, and text from a user's file cannot run as a script.
     """
-    # Style sheet and scripts are inline, so that a page is a single file, which can be sent by mail.
+    # Style sheet and scripts are inline in a page, so that a page is a single file, which can be sent by mail.
     style, *scripts = _assets()
     return render(
         template,
@@ -68,7 +69,7 @@ def render_page(template: str, **context: object) -> str:
 
 
 def json_data(data: object) -> Markup:
-    """Return JSON for a <script> element; characters that could end the element are escaped."""
+    """Return `data` as JSON for a <script> element; characters that could end the element are escaped."""
     # NaN is not valid JSON. It raises an error here; otherwise the script would fail in the browser.
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))

@@ -1,4 +1,4 @@
-// The arm: plays measured and predicted motion, is rotated by the pointer or the arrow keys, highlights joints.
+// Drawing of the arm: measured and predicted motion, rotation by the pointer or the arrow keys, highlighted joints.
 "use strict";
 const arm = (() => {
   const canvas = document.querySelector("canvas.arm");
@@ -61,7 +61,7 @@ const arm = (() => {
   const view = (motion) => {
     const eye = camera(), low = [0, 0, 0], high = [0, 0, 0];
     let ground = 0;
-    // a dozen poses approximate the extent of a motion
+    // the extent of a motion is approximated by a dozen poses
     const stride = Math.max(1, Math.floor(motion.q.length / 12));
     for (let row = 0; row < motion.q.length; row += stride) frames(motion.q[row]).forEach(({ R, p }, index) => {
       ground = Math.min(ground, p[2]);
@@ -74,7 +74,7 @@ const arm = (() => {
       }
     });
     const scale = 860 * Math.min(640 / (high[0] - low[0] || 1), 420 / (high[1] - low[1] || 1));
-    // the centre of the projected picture, not of the arm's box, so that an oblique arm fills the frame
+    // the view is centred on the projected picture, not on the arm's box, so that an oblique arm fills the frame
     const [x, y, z] = low.map((least, k) => (least + high[k]) / 2);
     return { middle: [0, 1, 2].map((k) => eye[k] * x + eye[3 + k] * y + eye[6 + k] * z), scale, ground };
   };
@@ -103,7 +103,7 @@ const arm = (() => {
         const u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]], w = [c[0] - b[0], c[1] - b[1], c[2] - b[2]];
         const n = [u[1] * w[2] - u[2] * w[1], u[2] * w[0] - u[0] * w[2], u[0] * w[1] - u[1] * w[0]];
         const norm = Math.hypot(...n);
-        // back faces are drawn for open or inverted meshes, but would be visible through the translucent predicted arm
+        // back faces are drawn for open or inverted meshes; not for the translucent predicted arm, where they would show
         if (norm === 0 || (moving && n[2] <= 0)) continue;
         const front = n[2] < 0 ? -1 : 1;
         const shade = Math.max(0, front * (n[0] * LIGHT[0] + n[1] * LIGHT[1] + n[2] * LIGHT[2]) / norm);

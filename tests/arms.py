@@ -1,4 +1,4 @@
-"""Small serial arms with exact rational geometry, and the reference arms with their known structure."""
+"""Small serial arms with exact rational geometry, and the arms of the reference data with their known structure."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3
 def chain(
     links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)
 ) -> Chain:
-    """A serial arm from the (type, rotation, translation) of each joint, without inertials."""
+    """Return a serial arm without inertials, from each joint's type, and rotation and translation in its parent."""
     bodies = tuple(
         Body(
             f"j{i + 1}",
@@ -49,12 +49,12 @@ def chain(
 
 
 def planar(joints: int) -> Chain:
-    """Parallel vertical axes, half a metre apart."""
+    """Return a planar arm: turning joints with parallel vertical axes, half a metre apart."""
     return chain([("revolute", STRAIGHT, (0.5 * (i > 0), 0, 0)) for i in range(joints)])
 
 
 def random_arm(joints: int, seed: int) -> Chain:
-    """Revolute joints with random rational poses."""
+    """Return an arm of turning joints with random poses of rational numbers, which has no special geometry."""
     rng = np.random.default_rng(seed)
     return chain(
         [
@@ -65,7 +65,7 @@ def random_arm(joints: int, seed: int) -> Chain:
 
 
 def random_rotation(rng: np.random.Generator) -> Rows:
-    """An exactly orthogonal rational matrix."""
+    """Return a random rotation matrix (3, 3) of fractions, exactly orthogonal."""
     w, x, y, z = (Fraction(int(a), 1000) for a in rng.integers(-1000, 1000, 4))
     n = w * w + x * x + y * y + z * z
     rows = (
@@ -77,7 +77,10 @@ def random_rotation(rng: np.random.Generator) -> Rows:
 
 
 def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Chain, Structure]]:
-    """The arms of the reference data with their known structure, derived once for all tests."""
+    """Yield each arm of the reference data: name, known structure, chain and derived structure.
+
+    A structure is derived once per process. assume: "kinematics" or "inertials".
+    """
     for name, known in json.loads((shared / "arms" / "expected.json").read_text()).items():
         if known[assume] is not None:
             joints = known["joints"] and tuple(known["joints"])

@@ -12,16 +12,19 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-PATIENCE = 60.0  # s
+PATIENCE = 60.0  # [s] after which a page or an answer counts as lost
 
 
 def executable() -> str | None:
-    """The browser's path, None where there is none."""
+    """Return the path of an installed Chromium, None if there is none."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
 class Chromium:
-    """One browser with one page. problems: messages of console and log. requests: requested addresses."""
+    """A headless browser with one page.
+
+    problems: messages of the page's console and log. requests: addresses that the page requested.
+    """
 
     def __init__(self, profile: Path) -> None:
         to_browser, from_browser = os.pipe(), os.pipe()
@@ -50,7 +53,10 @@ class Chromium:
     def open(
         self, page: Path, *, width: int = 1400, dark: bool = False, script: bool = True, media: str = "screen"
     ) -> None:
-        """Load a file and clear the problems and requests of the previous one."""
+        """Load an HTML file, and clear the problems and requests of the previous page.
+
+        width: of the window [px]. dark: dark colour scheme. script: whether scripts run. media: "screen" or "print".
+        """
         self.problems, self.requests, self.loaded = [], [], False
         self.ask(
             "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False
@@ -65,19 +71,19 @@ class Chromium:
             self._take(self._message())
 
     def run(self, expression: str) -> Any:
-        """The value of a JavaScript expression on the page."""
+        """Return the value of a JavaScript expression that is evaluated on the page."""
         found = self.ask("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
     def press(self, key: str, code: int = 0, text: str = "") -> None:
-        """A key, down and up."""
+        """Press and release a key."""
         known = {"key": key, "code": key, "windowsVirtualKeyCode": code}
         self.ask("Input.dispatchKeyEvent", type="keyDown", **known, **({"text": text} if text else {}))
         self.ask("Input.dispatchKeyEvent", type="keyUp", **known)
 
     def picture(self, path: Path, *, top: int = 0, height: int | None = None) -> None:
-        """Return an image of the page or of a part of it."""
+        """Write an image of the page, or of `height` pixels from `top` on, as PNG to a path."""
         width, whole = self.run(
             "[document.documentElement.clientWidth, document.documentElement.scrollHeight]"
         )
@@ -86,12 +92,12 @@ class Chromium:
         path.write_bytes(base64.b64decode(found["data"]))
 
     def paper(self, path: Path) -> None:
-        """The page as a PDF."""
+        """Write the page as a PDF to a path."""
         found = self.ask("Page.printToPDF", printBackground=True, preferCSSPageSize=True)
         path.write_bytes(base64.b64decode(found["data"]))
 
     def close(self) -> None:
-        """End the browser."""
+        """End the browser process."""
         try:
             self.session = None
             self.ask("Browser.close")
@@ -102,7 +108,7 @@ class Chromium:
         os.close(self._in)
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """A command's result."""
+        """Send a command of the DevTools protocol; return its result."""
         self._count += 1
         message = {"id": self._count, "method": method, "params": parameters}
         if self.session:

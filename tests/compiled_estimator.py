@@ -1,4 +1,4 @@
-"""The exported C estimator, compiled and run along a log."""
+"""The exported C estimator of payload, friction drift and contacts, compiled and run along logs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,14 @@ from spelgen.live.payload import Status
 def nominal_levels(
     effort: np.ndarray, speed: np.ndarray, coulomb: np.ndarray, noise_ratio: float = 2e-3
 ) -> NoiseLevels:
-    """Return noise levels of an arm with these limits, (n,), and a ratio of noise to torque limits."""
+    """Return plausible noise levels of an estimator that was not fitted to logs.
+
+    Args:
+        effort: (n,) torque limits [Nm, N].
+        speed: (n,) velocity limits [rad/s, m/s].
+        coulomb: (n,) Coulomb friction [Nm, N].
+        noise_ratio: standard deviation of the torque noise relative to the torque limits.
+    """
     ones = np.ones(len(effort))
     white = noise_ratio * effort
     noise = BlockNoise(white=white, disturbance=1.5 * white, time_constant=0.7 * ones)
@@ -107,7 +114,7 @@ void run(NAME_estimator *e, size_t count, const double *t, const real *q, const 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Results along a log, (T,) or (T, ...)."""
+    """Outputs of the estimator at each sample of a log, (T,) or (T, ...)."""
 
     external_torque: np.ndarray
     threshold: np.ndarray
@@ -130,9 +137,9 @@ class Columns:
 
 
 def differences(found: Columns, states: Sequence[EstimatorState]) -> dict[str, float]:
-    """Return the largest differences from the Python estimator, relative to the largest value of each quantity.
+    """Return the largest differences between the C and the Python estimator, relative to each quantity's largest value.
 
-    Quantities without a scale (status, refusal, change of load) differ by 1 if any sample differs.
+    Quantities without a magnitude (status, refusal, change of load) differ by 1 if any sample differs.
     """
     result = {}
     for name in ("external_torque", "threshold", "force", "friction_scale", "disturbance"):
@@ -152,7 +159,7 @@ def differences(found: Columns, states: Sequence[EstimatorState]) -> dict[str, f
 
 
 class CompiledEstimator:
-    """An estimator in C, in a temporary folder."""
+    """The C estimator of a model, exported to a temporary folder, compiled and called by ctypes."""
 
     def __init__(self, trained: ArmModel, arm: Arm, levels: NoiseLevels, *flags: str) -> None:
         model = describe(trained, arm)
@@ -172,12 +179,12 @@ class CompiledEstimator:
         self.start()
 
     def start(self) -> None:
-        """Begin with a new estimator."""
+        """Restart the estimator, without any history."""
         self.state = ctypes.create_string_buffer(self.library.size())
         self.library[f"{self.name}_estimator_init"](self.state)
 
     def run(self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Columns:
-        """Use samples, (T,) and (T, n)."""
+        """Run the estimator along times (T,) and positions, velocities and torques (T, n); return its outputs."""
         out = np.zeros((len(t), 4 * self.n + 33))
         arrays = [
             np.ascontiguousarray(t, float),
@@ -192,23 +199,23 @@ class CompiledEstimator:
         return Columns(*(x[:, 0] if size == 1 else x for x, size in zip(parts, sizes, strict=True)))
 
     def refused(self) -> dict[str, int]:
-        """Return the counts of samples by reason."""
+        """Return the number of samples that the estimator refused, by reason."""
         counts = np.zeros(len(REFUSALS))
         self.library.refusals(self.state, counts.ctypes.data_as(ctypes.c_void_p))
         return dict(zip(REFUSALS, counts.astype(int).tolist(), strict=True))
 
     def saved(self) -> ctypes.Array[ctypes.c_char]:
-        """Return the saved state."""
+        """Return the estimator's state in the saved form of the C interface."""
         state = ctypes.create_string_buffer(self.library.saved_size())
         self.library[f"{self.name}_estimator_save"](self.state, state)
         return state
 
     def restore(self, state: ctypes.Array[ctypes.c_char]) -> bool:
-        """Read a saved state; return False if it is none."""
+        """Load a state that `saved` returned; return False if the estimator refuses its bytes."""
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:
-        """Return the torques that give qdd, (n,)."""
+        """Return the joint torques (n,) of the model at a state, for the acceleration qdd (n,)."""
         tau = np.zeros(self.n, self.dtype)
         arrays = [np.ascontiguousarray(x, self.dtype) for x in (q, qd, qdd)]
         q_, qd_, qdd_, tau_ = (x.ctypes.data_as(ctypes.c_void_p) for x in (*arrays, tau))

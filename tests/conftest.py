@@ -1,4 +1,4 @@
-"""Shared by all tests: one thread for tiny matrices, the order of files, common fixtures."""
+"""Settings and fixtures of all tests: one thread for tiny matrices, the order of test files, folders, short fits."""
 
 import gc
 import os
@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by torch and numpy when they are first imported
+# torch and numpy read the number of threads when they are first imported
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Byte code is cached even if the environment disables the cache: otherwise each of the processes that tests start would
 # compile all imported packages, which takes as long as the imports (pip installs them without byte code).
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-gc.disable()  # until all tests are imported, see `pytest_collection_finish`: a fifth of the time of the imports
+# no garbage collection until all tests are imported (see `pytest_collection_finish`): a fifth of the import time
+gc.disable()
 
 ROOT = Path(__file__).parents[1]
 
@@ -54,7 +56,8 @@ LONGEST_FILES = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the longest files first, so that none of them runs at the end while the other workers are idle."""
     order = {name: index for index, name in enumerate(LONGEST_FILES)}
-    items.sort(key=lambda item: order.get(item.path.stem, len(order)))  # stable: others keep their order
+    # the sort is stable: files that are not listed keep their order
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 def pytest_collection_finish() -> None:
@@ -67,13 +70,13 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session")
 def robots() -> Path:
-    """The folder of the project's own robots."""
+    """Return the folder of the project's own robots."""
     return ROOT / "robots"
 
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference data next to the checkout; tests that read it skip if it is absent."""
+    """Return the folder of reference data next to the checkout; tests that read it skip if it is absent."""
     folder = ROOT.parent / "shared"
     if not folder.is_dir():
         pytest.skip("the reference data (../shared) is not on this machine")
@@ -82,7 +85,7 @@ def shared() -> Path:
 
 @pytest.fixture
 def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs of few windows take four steps, for tests of files, commands and messages of a fit."""
+    """Limit epochs to four steps, for tests of the files, commands and messages of a fit on windows."""
     from spelgen.fitting.tuning import FittingTuning
 
     monkeypatch.setattr("spelgen.fitting.momentum_objective.TUNING", FittingTuning(epoch_steps=4))
@@ -90,7 +93,7 @@ def short_epochs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def coarse_validation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rollouts of the validation have at most two steps per sample, for tests that do not look at its loss.
+    """Limit rollouts of the validation to two integration steps per sample, for tests that do not assert its loss.
 
     Steep friction would otherwise be integrated with 1, 2, 4, ... 32 steps, which takes longer than a torque fit.
     """
@@ -101,7 +104,7 @@ def coarse_validation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch, coarse_validation: None) -> None:
-    """Torque fits take two steps in few outer iterations, for tests of files, commands and messages."""
+    """Limit torque fits to a few outer iterations of two steps, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
     tuning = TorqueTuning(iterations=1, initial_steps=2, iteration_steps=2)

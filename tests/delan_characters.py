@@ -1,4 +1,4 @@
-"""The arm and the recordings of the DeLaN characters data set, read from its files."""
+"""The arm and the recordings of the characters data set of Deep Lagrangian Networks (DeLaN), read from its files."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
-# the data fix a gravity of 3 m/s^2 for links of 1 m, and nothing else of it
+# the data determine a gravity of 3 m/s^2 for links of 1 m, and nothing else: masses and inertias are assumed
 URDF = """<robot name="planar">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
@@ -21,7 +21,7 @@ TESTS = "eqv"
 
 
 def write_arm(folder: Path) -> Path:
-    """The URDF and its settings; the path of the former."""
+    """Write the URDF of the planar arm and its settings; return the path of the URDF."""
     urdf = folder / "planar.urdf"
     urdf.write_text(URDF, encoding="utf-8")
     urdf.with_suffix(".yaml").write_text("gravity: [0, -3, 0]\n", encoding="utf-8")
@@ -29,7 +29,7 @@ def write_arm(folder: Path) -> Path:
 
 
 def read_characters(folder: Path) -> tuple[list[DynamicsSamples], list[np.ndarray]]:
-    """Samples named by their label, and the Coriolis torques of each."""
+    """Return the torque samples of each character, named by its label, and its Coriolis torques, (T, 2)."""
     data = np.load(folder / "character_data.npz", allow_pickle=True)
     labels = [str(x) for x in data["labels"]]
     samples = [

@@ -66,7 +66,8 @@ def import_source(source: str, path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # where torch.compile looks for it
+    # torch.compile finds the module in sys.modules
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
@@ -83,7 +84,7 @@ def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleT
 
 
 def printed_without_structure(code: str, path: Path) -> str:
-    """Return the output of `code`, with `path` as argument, if nothing that derives structure can be imported."""
+    """Run Python code with `path` as argument, in a process that cannot import the derivation; return its output."""
     blocked = ("sympy", "flint", "spelgen.structure", "spelgen.emission.plan", "spelgen.arm.arm")
     program = f"import sys\nfor name in {blocked}:\n    sys.modules[name] = None\n{code}"
     run = subprocess.run(
@@ -102,7 +103,7 @@ def built(
     *,
     standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Return the source of a module, and the structure, of one of the robots that come with spelgen."""
+    """Derive one of the project's robots; return the text of its emitted module, and its structure."""
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
     return module_text(spec, standalone=standalone), derive(arm.chain, assume)
@@ -122,7 +123,7 @@ def random_model(
     preset: str = "hybrid",
     design: Design | None = None,
 ) -> nn.Module:
-    """The robot's model with random weights, as ``randomise`` draws them."""
+    """Return the emitted model of one of the project's robots, with random parameters by ``randomise``."""
     source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)
@@ -130,7 +131,7 @@ def random_model(
 
 
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
-    """Randomise every parameter: with this standard deviation, or with the inverse root of a layer's inputs."""
+    """Set every parameter to normal numbers with this standard deviation; None: scales at which all terms matter."""
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
@@ -141,20 +142,20 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
         elif "residuals.raw" in name:
             parameter.data = 0.3 * draw
         elif "network" in name or "potential." in name or "residuals.mass." in name:
-            # a Kolmogorov-Arnold network has a grid of weights for each input
+            # a Kolmogorov-Arnold network has a grid of parameters per input: both count as inputs in the scale
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
 
 
 def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """The inputs of the networks of a model, (..., encoded)."""
+    """Return the inputs of a model's networks at q (..., n): the encoding of positions, (..., encoded)."""
     owner = getattr(model, "residuals", model)
     encoded: torch.Tensor = owner.encoding(q)
     return encoded
 
 
 def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
-    """A network's outputs y, (..., outputs), before a model scales and combines them."""
+    """Return a network's outputs, (..., outputs), without the scales and sums that the model applies to them."""
     count = len(network.biases[-1])
     layers = network.prepare(torch.eye(count, dtype=encoded.dtype), encoded.new_zeros(count))
     y: torch.Tensor = network(encoded, layers)[0]
@@ -162,19 +163,19 @@ def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
 
 
 def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """Where, (...), M would not be positive definite by itself."""
+    """Return at which states q (..., n) the model's bound changes M to keep it positive definite, (...,) boolean."""
     part: torch.Tensor = model.at(q).intermediates[1]
     return part < 1
 
 
 def frictionless(model: nn.Module) -> nn.Module:
-    """The model without dissipation."""
+    """Set the friction of a model to zero; return the model."""
     model.friction.nominal.zero_()
     return model
 
 
 class ExactFunctions(nn.Module):
-    """Replaces a network: y = (polynomial - mean) / scale, with exact derivatives."""
+    """Exact functions in place of a network of an emitted model: y = (polynomial - mean) / scale, with derivatives."""
 
     def __init__(
         self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module
@@ -198,7 +199,8 @@ class ExactFunctions(nn.Module):
         output_map, offset = layers
         first, second = encoded.split(self.n, dim=-1)
         q = first * self.reach + self.encoding.center
-        variables = torch.stack([first, second, q], dim=-1).flatten(-2)  # (..., 3 n): c1, s1, q1, c2, ...
+        # variables of the polynomials, (..., 3 n): c1, s1, q1, c2, ...
+        variables = torch.stack([first, second, q], dim=-1).flatten(-2)
         y = torch.stack([_evaluated(f, variables) for f in self.values], dim=-1)
         slopes = torch.stack(
             [torch.stack([_evaluated(d, variables) for d in row], dim=-1) for row in self.slopes], dim=-2
@@ -216,8 +218,9 @@ class ExactFunctions(nn.Module):
 
 
 def exact_model(robot: str, folder: Path) -> nn.Module:
-    """The robot's emitted model with the URDF's true values: exact functions for networks, exact constants,
-    no friction.
+    """Return the robot's emitted model with the URDF's true dynamics and no friction.
+
+    Exact polynomials replace the networks, and constants have their exact values.
     """
     source, structure = built(robot, design=NETWORKS)
     module = import_source(source, folder / f"{robot}_exact.py")

@@ -1,4 +1,4 @@
-"""Models and run folders for export tests; their parameters are random, so that no term is zero."""
+"""Models and run folders for export tests; all parameters are random, so that no term of the model is zero."""
 
 import contextlib
 import re
@@ -38,7 +38,7 @@ joints: {shoulder: {gear: 50}, slide: {gear: 20, gain: trained}, wrist: {actuate
 
 
 def moved_model(robot, preset, size=0.2):
-    """A model of one of the project's robots with all weights moved by normal numbers of this size."""
+    """Return a model of one of the project's robots, with normal numbers of this deviation added to its parameters."""
     model = build(ROBOTS / f"{robot}.urdf", preset)
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -48,12 +48,12 @@ def moved_model(robot, preset, size=0.2):
 
 
 def arm_of(robot):
-    """The arm of one of the project's robots."""
+    """Return one of the project's robots as an arm."""
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
 def readme_results(files, folder: Path):
-    """The variables after the lines of a README have run in a folder with the exported files, with inputs of one."""
+    """Run the Python example of an exported README with inputs of one instead of zero; return its variables by name."""
     for name, content in files.items():
         (folder / name).write_bytes(content)
     (code,) = re.findall(r"```python\n(.*?)```", files["README.md"].decode(), re.DOTALL)
@@ -66,7 +66,7 @@ def readme_results(files, folder: Path):
 
 
 def saved_run(model, urdf, folder: Path) -> RunFolder:
-    """A run folder of this model, with the files that `spelgen train` writes."""
+    """Write the run folder of a model, with the files of `spelgen train` but no training."""
     record = {"robot": urdf.stem, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
     record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
     record |= {"training": [], "validation": []}
@@ -79,5 +79,5 @@ def saved_run(model, urdf, folder: Path) -> RunFolder:
 
 
 def run_folder(robot, preset, folder: Path) -> RunFolder:
-    """A run folder of a moved model."""
+    """Write the run folder of one of the project's robots with changed parameters (`moved_model`)."""
     return saved_run(moved_model(robot, preset), ROBOTS / f"{robot}.urdf", folder)

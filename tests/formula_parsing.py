@@ -1,4 +1,4 @@
-"""Closed forms parsed from the written text and compared with Pinocchio."""
+"""Parsers of written closed forms (text, LaTeX), and their comparison with Pinocchio."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ CLOSE = 1e-10
 
 
 def assert_equal_to_pinocchio(arm: Chain, rows: dict[str, str], tolerance: float = CLOSE) -> None:
-    """Every expression at random positions, with the base parameters of ``arm``."""
+    """Check that each closed form, M_ij and V, equals Pinocchio at random positions.
+
+    Args:
+        arm: with the values of the base parameters that occur in the expressions.
+        rows: Python expressions by name (M11, ..., V).
+        tolerance: largest error, relative to the diagonal of M, or to V.
+    """
     engine = arm_dynamics(arm, Settings())
     n = len(arm.coordinates)
     names = {"cos": np.cos, "sin": np.sin}
@@ -47,7 +53,7 @@ def assert_close(found, true) -> None:
 
 
 def read_back(told: str) -> dict[str, str]:
-    """The expressions of the text, by name; their lines go on where they are indented."""
+    """Return the expressions of a text of closed forms by name (M11, ..., V); indented lines continue an expression."""
     found: dict[str, str] = {}
     for line in told.partition("\nBase parameters")[0].splitlines():
         name, is_row, expression = line.partition(" = ")
@@ -59,7 +65,7 @@ def read_back(told: str) -> dict[str, str]:
 
 
 def without_latex(told: str) -> dict[str, str]:
-    """The same of the first ``align*``."""
+    """Return the expressions of the first ``align*`` of LaTeX closed forms as Python, by name (M11, ..., V)."""
     body = told.partition(r"\begin{align*}")[2].partition(r"\end{align*}")[0]
     for pattern, plain in (
         (r"\\\\\n\s*&\\quad", " "),

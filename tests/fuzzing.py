@@ -22,15 +22,18 @@ from spelgen.errors import SpelgenError
 
 MINUTES = float(
     os.environ.get("FUZZ_MINUTES", "0")
-)  # for all tests together; 0: the same examples in each run
-TESTS = 7  # tests that share these minutes
-FEW = 12  # examples of a test in `make test`
+)  # minutes of `make fuzz` for all fuzz tests together; 0: the same examples in each run
+TESTS = 7  # number of fuzz tests, which share MINUTES equally
+FEW = 12  # largest number of examples per test in `make test`
 SECONDS = 10
-MEMORY = 1_000_000  # kB in addition to the memory before the example
+MEMORY = 1_000_000  # [kB] by which the examples of a test may increase the memory of this process
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
-    """Call ``use`` with examples of a strategy: ``examples`` at a time in `make fuzz`, at most FEW otherwise."""
+    """Call ``use`` with random examples of a strategy: at most FEW in `make test`, until time is up in `make fuzz`.
+
+    examples: number of examples per seed in `make fuzz`.
+    """
     count = examples if MINUTES else min(examples, FEW)
     kept = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
@@ -56,12 +59,13 @@ def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> N
 
 
 def answered(use: Callable[[], Any]) -> bool:
-    """True if ``use`` returns a result; else check that it raises an error with a text."""
+    """Return True if ``use`` returns, False if it raises a SpelgenError with a text; any other exception is raised."""
     for each in (signal.SIGALRM, signal.SIGPROF):
         signal.signal(each, _late)
     seconds = SECONDS * _slowness()
-    signal.setitimer(signal.ITIMER_PROF, seconds)  # of its own time: others may use the machine
-    signal.alarm(int(10 * seconds))  # a process that waits uses none
+    # processor time of this process, which other processes do not affect
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.alarm(int(10 * seconds))  # wall time as well, as a process that waits uses no processor time
     try:
         use()
         return True

@@ -6,11 +6,11 @@ from pathlib import Path
 from spelgen.arm.arm import Body, Chain, Coordinate
 
 UPRIGHT = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z along the parent's x
+SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z axis is the parent's x axis
 
 
 def coordinate(name="a", kind="revolute", **changes):
-    """A joint with limits of +-1 and no friction."""
+    """Return a coordinate with limits of +-1 and no friction; keywords replace its fields."""
     known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
     return Coordinate(
         name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes)
@@ -18,7 +18,7 @@ def coordinate(name="a", kind="revolute", **changes):
 
 
 def body(name="a", kind="revolute", **changes):
-    """A point of mass 1 in the origin of its joint, on the root."""
+    """Return a body on the root: a point mass of 1 kg at the origin of its joint; keywords replace its fields."""
     known = {
         "parent": -1,
         "coordinate": 0,
@@ -32,7 +32,7 @@ def body(name="a", kind="revolute", **changes):
 
 
 def point(mass, x=0.0):
-    """The ten inertial parameters of a point mass on the x axis."""
+    """Return the ten inertial parameters of a point mass [kg] at x [m] on the x axis."""
     return (mass, mass * x, 0, 0, 0, 0, 0, mass * x * x, 0, mass * x * x)
 
 
@@ -41,13 +41,13 @@ def arm(coordinates, bodies, gravity=(0, 0, 0)):
 
 
 def slider(mass=2.0, **changes):
-    """A mass on a rail, without gravity."""
+    """Return an arm with one prismatic joint: a mass [kg] on a horizontal rail, without gravity."""
     rail = body(kind="prismatic", rotation=SIDEWAYS, inertia=point(mass))
     return arm([coordinate(kind="prismatic", **changes)], [rail])
 
 
 def pendulum(mass=1.5, length=0.7):
-    """A point mass on a rod, at angle q from the horizontal."""
+    """Return an arm with one turning joint: a point mass [kg] on a rod [m], with q its angle from the horizontal."""
     return arm([coordinate(continuous=True)], [body(inertia=point(mass, length))], gravity=(0, -9.81, 0))
 
 
@@ -58,7 +58,7 @@ JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child li
 
 
 def coupled_urdf(path: Path) -> Path:
-    """Two revolute joints, the second of which follows the first: 0.5 q - 0.1."""
+    """Write the URDF of two turning joints a and b, where b mimics a: b = 0.5 a - 0.1; return its path."""
     parts = [
         '<robot name="coupled"><link name="base"/>',
         LINK.format(name="upper", mass=2),

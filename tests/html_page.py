@@ -1,4 +1,4 @@
-"""An HTML page as parsed: elements, text, links."""
+"""Parser of HTML pages for tests: elements, text, links."""
 
 from html.parser import HTMLParser
 
@@ -9,7 +9,7 @@ VOID = {"meta", "br", "link", "input"}
 
 
 class Page(HTMLParser):
-    """Checks nesting, and gathers elements, text and links."""
+    """Elements, text and links of an HTML page; asserts that tags are nested and all scripts are the package's own."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -18,7 +18,8 @@ class Page(HTMLParser):
         self.links, self.scripts = [], []
         self.feed(text)
         assert not self.open
-        assert set(self.scripts) <= OWN  # nothing else can run; data cannot
+        # scripts are the package's own, so that no other code runs; embedded JSON data are no scripts
+        assert set(self.scripts) <= OWN
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)

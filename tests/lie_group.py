@@ -1,8 +1,7 @@
-"""The paper's equations on SO(3)^k x R^3^l: rotation matrices in, rates of all three axes of each joint out.
+"""The port-Hamiltonian equations of the paper on SO(3)^k x R^3^l, with three axes per joint.
 
-The emitted module integrates one number for each joint. This file has the equations of the paper
-(Wang, Chen, Ding, Sci Rep 15:33179, 2025), to compare with models that are trained so and to show that nothing
-is lost.
+The emitted module integrates one coordinate per joint. This file has the equations of the paper (Wang, Chen, Ding,
+Sci Rep 15:33179, 2025), from rotation matrices to rates, to show that both are equal.
 """
 
 from __future__ import annotations
@@ -14,7 +13,10 @@ import torch
 
 
 def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
-    """Return, per joint, R in SO(3), (..., 3, 3), or r in R^3, (..., 3) [m], if prismatic, of q, (..., n)."""
+    """Convert q (..., n) to positions on the group, one per joint.
+
+    They are R in SO(3), (..., 3, 3), for a turning joint, and r in R^3, (..., 3) [m], for a sliding one.
+    """
     zero, one = torch.zeros_like(q), torch.ones_like(q)
     rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
     rotations = torch.stack(rows, dim=-1).reshape(*q.shape, 3, 3)
@@ -27,7 +29,7 @@ def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
 
 
 def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Return q, (..., n), with angles in [-pi, pi]; the inverse of ``to_group``."""
+    """Return q, (..., n), with angles in [-pi, pi], from the positions of `to_group`."""
     values = []
     for kind, element in zip(joint_types, elements, strict=True):
         if kind == "revolute":
@@ -38,7 +40,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """The methods of an emitted module that the equations need; see its docstrings for shapes."""
+    """Methods of an emitted module that the equations on SO(3)^k x R^3^l use; its docstrings state the shapes."""
 
     joint_types: tuple[str, ...]
 
@@ -90,7 +92,8 @@ def group_rates(
     moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
     rates, forces = [], []
     for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):
-        turning = part.dim() == p.dim()  # one axis more than a position has
+        # a turning joint has a rotation (..., 3, 3), a sliding joint a position (..., 3)
+        turning = part.dim() == p.dim()
         rate, force = (_turning if turning else _sliding)(part, slope, p[..., i, :], velocity[..., i, :])
         rates.append(rate)
         forces.append(force + torch.nn.functional.pad(moving[..., i, :], (2, 0)))
@@ -100,7 +103,7 @@ def group_rates(
 def _turning(
     rotation: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """R' and the torque that H makes."""
+    """Return dR/dt, (..., 3, 3), and the torque of H on a turning joint, (..., 3); see `group_rates`."""
     rate = torch.linalg.cross(rotation, velocity.unsqueeze(-2).expand_as(rotation), dim=-1)
     torque = torch.linalg.cross(p, velocity, dim=-1) + torch.linalg.cross(rotation, slope, dim=-1).sum(dim=-2)
     return rate, torque
@@ -109,5 +112,5 @@ def _turning(
 def _sliding(
     position: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """r' and the force that H makes."""
+    """Return dr/dt and the force of H on a sliding joint, (..., 3) each; see `group_rates`."""
     return velocity, -slope

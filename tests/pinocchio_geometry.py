@@ -11,12 +11,12 @@ from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.settings.settings import Settings
 
-NOTHING = 1e-9  # of a size of 1
+NOTHING = 1e-9  # [1] magnitude below which a quantity of order 1 counts as zero
 
 
 @dataclass
 class Seen:
-    """An arm as Pinocchio sees it at a few random configurations; joints count from 1, as in the sentences."""
+    """The axes and masses of an arm at random configurations, by Pinocchio; joints are numbered from 1."""
 
     arm: Chain
 
@@ -29,7 +29,8 @@ class Seen:
         self.axes = np.array([[place.rotation[:, 2] for place in places] for places in self.places])
         self.points = np.array([[place.translation for place in places] for places in self.places])
         mass = self.engine.model.inertias[self.n]
-        self.lever, self.inertia = mass.lever, mass.inertia  # about the centre of mass
+        # centre of mass of the last body, and its inertia about this centre
+        self.lever, self.inertia = mass.lever, mass.inertia
 
     def _places(self, q: np.ndarray) -> list:
         pin.forwardKinematics(self.engine.model, self.engine.data, q)
@@ -60,11 +61,12 @@ class Seen:
         return np.abs(axis @ down if self.slides(joint) else np.cross(axis, down)).max() < NOTHING
 
     def commute(self, mover: int, others: list[int]) -> bool:
-        """Whether moving one joint takes the others' axes, as lines or as directions, to themselves."""
+        """Return True if the motion of joint `mover` changes no axis of `others`: lines, or directions if sliding."""
         for q in self.configurations:
             moved = q + 0.7 * np.eye(self.n)[mover - 1]
             before, after = self._places(q), self._places(moved)
-            step = after[-1] * before[-1].inverse()  # nothing behind the mover has moved in itself
+            # displacement of all bodies after the moved joint, which is rigid
+            step = after[-1] * before[-1].inverse()
             for other in others:
                 place = before[other - 1]
                 axis, point = place.rotation[:, 2], place.translation
@@ -74,7 +76,10 @@ class Seen:
         return True
 
     def carried(self, joint: int, turner: int) -> np.ndarray:
-        """Distance of the mass moved by ``joint`` from the plane through the turner's axis along the slide."""
+        """Return the distance of the mass moved by the sliding ``joint`` from a plane, per configuration.
+
+        The plane contains the axis of joint ``turner`` and the direction of the slide.
+        """
         found = []
         for q, axes, points in zip(self.configurations, self.axes, self.points, strict=True):
             pin.centerOfMass(self.engine.model, self.engine.data, q, True)

@@ -27,7 +27,7 @@ URDF = "".join(
 
 
 def write_module(folder: Path, name: str = "module.py") -> Path:
-    """Write the module with the smallest networks for this arm; without its URDF, which only some tests need."""
+    """Write the emitted module of the planar arm, with the smallest networks, and delete its URDF; return the path."""
     urdf = folder / "planar.urdf"
     urdf.write_text(URDF, encoding="utf-8")
     (folder / name).write_text(generate(urdf, "minimal", width=4, depth=1), encoding="utf-8")
@@ -36,14 +36,14 @@ def write_module(folder: Path, name: str = "module.py") -> Path:
 
 
 class Configuration(NamedTuple):
-    """q and M."""
+    """Configuration cache of the model: q (..., 2) and M (..., 2, 2)."""
 
     q: torch.Tensor
     mass: torch.Tensor
 
 
 class Damping(nn.Module):
-    """Logarithms of viscous friction."""
+    """Viscous friction of both joints; its parameters are the logarithms of the coefficients."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,22 +52,23 @@ class Damping(nn.Module):
 
 
 class Model(PortHamiltonian):
-    """M = [[a + 2 b cos q2, d + b cos q2], [d + b cos q2, d]], two hanging weights, viscous friction.
+    """A user's own model of a planar arm: 7 parameters, no specification.
 
-    A user's own model: of 7 parameters, without a specification. a = d + b^2 / d + e keeps M positive definite.
+    M = [[a + 2 b cos q2, d + b cos q2], [d + b cos q2, d]], gravity of both links, and viscous friction.
+    a = d + b^2 / d + e keeps M positive definite.
     """
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__([Joint(name, "revolute", -3.0, 3.0, 5.0, 1.0, 0.0) for name in JOINTS])
         generator = torch.Generator().manual_seed(seed)
         noise = 0.01 * torch.randn(5, generator=generator, dtype=torch.float64)
-        # b, log d, log e
+        # initial b, log d and log e, the parameters of M
         self.inertia = nn.Parameter(torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) + noise[:3])
         self.weight = nn.Parameter(noise[3:].clone())
         self.friction = Damping()
 
     def prepare(self) -> None:
-        """Return no parameter cache."""
+        """Return an empty parameter cache: nothing can be precomputed."""
 
     def configuration(self, q: torch.Tensor, prepared: None) -> Configuration:
         b, d = self.inertia[0], self.inertia[1].exp()
@@ -101,7 +102,7 @@ class Model(PortHamiltonian):
 
 
 def true_model() -> Model:
-    """Return the hand-written model with other parameters than the initial ones."""
+    """Return the model of the arm that makes the logs, whose parameters differ from the initial ones."""
     model = Model()
     with torch.no_grad():
         model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))

@@ -1,8 +1,8 @@
 """Exact polynomials of M(q) and V(q) in cosines and sines of angles and in sliding distances.
 
-The same recursion as everywhere, over the rational polynomials. The structure does not need them
-(``structure`` works with values only): they are its independent proof. Closed forms are expanded one
-parameter at a time (``expansion``).
+The recursion over bodies is the package's, evaluated in polynomials with rational coefficients. The derivation of
+structure does not use polynomials (``structure`` evaluates M and V at points only), so they prove it independently.
+Closed forms are expanded one parameter at a time (``expansion``).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from spelgen.structure.recursion import Position, energies
 
 @dataclass(frozen=True)
 class Polynomials:
-    """The lower triangle of M(q), by (row, column), and V(q), over the variables ``names``.
+    """The lower triangle of M(q), by (row, column), and V(q), as polynomials over the variables ``names``.
 
-    c1, s1 are the cosine and sine of coordinate 1 (of its base angle, where a mimic joint turns by a
-    fraction of it), q1 its value where something slides; m1, hx1, ... Izz1 the inertial parameters of body
-    1 about its joint, where they are kept as variables.
+    c1, s1 are the cosine and sine of coordinate 1, q1 its value if it slides; if a mimic joint turns by a fraction of
+    coordinate 1, c1 and s1 belong to the angle of which both are multiples. m1, hx1, ... Izz1 are the inertial
+    parameters of body 1 about its joint, if inertial parameters are variables.
     """
 
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class Polynomials:
     potential: fmpq_mpoly
 
     def combination(self, weights: Weights) -> fmpq_mpoly:
-        """The weighted sum of entries of M."""
+        """Return the sum of entries of M, weighted by (row, column, weight)."""
         total = 0 * self.potential
         for row, column, value in weights:
             total += _rational(value) * self.mass[row, column]
@@ -41,8 +41,9 @@ class Polynomials:
 
 
 def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
-    """The exact polynomials of ``arm``, with its inertial parameters as variables or, under ``inertials``,
-    the URDF's values.
+    """Return the exact polynomials of M and V of ``arm``.
+
+    inertials: the URDF's inertial values are inserted; otherwise inertial parameters are variables.
     """
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
@@ -69,7 +70,7 @@ def _rational(number: Fraction) -> fmpq:
 
 
 def _reduced(polynomial: fmpq_mpoly, n: int) -> fmpq_mpoly:
-    """The same function with s^2 = 1 - c^2 applied until the power of every sine is at most one.
+    """Return an equal polynomial in which each sine has at most the power one, by s^2 = 1 - c^2.
 
     Only arms with mimic joints need it: two bodies then turn with the same angle.
     """

@@ -5,7 +5,10 @@ from collections.abc import Callable
 
 
 def killed(training: Callable[[], object], write: int, *, before: bool) -> bool:
-    """Whether a training that dies at its so-manieth write, before or after it, did so before its end."""
+    """Run a training in a fork that dies at its n-th write of a file; return True if it died before its end.
+
+    write: number n of the write, from 1. before: die just before the write, otherwise just after it.
+    """
     child = os.fork()
     if child == 0:  # pragma: no cover
         replace, left = os.replace, [write]

@@ -25,7 +25,7 @@ def _mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
 
 
 class _Cholesky(nn.Module):
-    """L L^T + eps I, where a network gives the lower triangle L."""
+    """Positive definite matrix L L^T + eps I, with the lower triangle L from a network."""
 
     def __init__(self, inputs: int, width: int, size: int, epsilon: float) -> None:
         super().__init__()
@@ -41,9 +41,10 @@ class _Cholesky(nn.Module):
 
 
 class Published(nn.Module):
-    """The rate of (R, zeta), (..., 12 n), of n turning joints: eq. 18 of the paper, over all axes.
+    """Rates of the states (R, zeta), (..., 12 n), of n turning joints by PHNODE: eq. 18 of the paper, over all axes.
 
-    Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry at a time.
+    R: rotation matrix, zeta: twist. Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry
+    at a time.
     """
 
     def __init__(self, joints: int, width: int, potential_width: int) -> None:
@@ -58,7 +59,7 @@ class Published(nn.Module):
         state = state if state.requires_grad else state.requires_grad_()
         rotation, zeta = state.split((9 * self.n, 3 * self.n), dim=-1)
         p = torch.linalg.solve(self.inverse_mass(rotation), zeta.unsqueeze(-1)).squeeze(-1)
-        # from here on R and p are independent, so that H is differentiated in each with the other held
+        # from here on R and p are independent variables, so that each partial derivative of H keeps the other constant
         rotation, p = torch.cat([rotation, p], dim=-1).split((9 * self.n, 3 * self.n), dim=-1)
         inverse = self.inverse_mass(rotation)
         kinetic = 0.5 * (p * (inverse @ p.unsqueeze(-1)).squeeze(-1)).sum(dim=-1)
@@ -86,7 +87,7 @@ class Published(nn.Module):
 
 
 class ByJvp(Published):
-    """The same rate as a user who knows torch writes it: dM^-1/dt is one derivative along the motion."""
+    """PHNODE with one change by a user who knows torch: dM^-1/dt is one derivative along the motion."""
 
     def _rate(self, inverse: Tensor, rotation: Tensor, rotation_rate: Tensor) -> Tensor:
         rate: Tensor = jvp(self.inverse_mass, (rotation,), (rotation_rate,))[1]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 RIGHT = tuple(repr(k * pi / 2) for k in (0, 0, 1, -1, 2))
 HALF = tuple(repr(k * pi / 4) for k in (1, -1, 3))
-# far enough from every multiple of pi/2 that zeros are recognised by magnitude
+# angles that differ by at least 0.05 rad from multiples of pi/2, so that zeros are recognised by magnitude
 GENERAL = tuple(
     f"{k / 100:g}" for k in range(-310, 311) if abs((k / 100 + pi / 4) % (pi / 2) - pi / 4) > 0.05
 )
@@ -23,7 +23,7 @@ TYPES = ("revolute", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class Follower:
-    """q = multiplier * q_leader + offset, of the joint ``name``."""
+    """A mimic joint ``name``: q = multiplier * q_leader + offset."""
 
     name: str
     leader: str
@@ -33,7 +33,7 @@ class Follower:
 
 @dataclass(frozen=True)
 class DrawnArm:
-    """The text of a URDF, the joints of its chain, root first, and its mimic joints."""
+    """A random URDF: its text, the joints of its chain from the root, and its mimic joints."""
 
     text: str
     joints: tuple[str, ...]
@@ -42,10 +42,10 @@ class DrawnArm:
 
 @dataclass(frozen=True)
 class _Style:
-    """Distribution of the numbers of one arm.
+    """Choice of numbers for the URDF of one arm: angles, offsets and axes of joints.
 
-    Right angles go with straight sliding axes: several skew ones have relations, such as 60 degrees, that
-    no rational rotation has, and that spelgen keeps to 1e-11 only.
+    Right angles go with straight sliding axes: several skew axes have relations, such as 60 degrees, that no rational
+    rotation has, and that spelgen keeps to 1e-11 only.
     """
 
     angles: tuple[str, ...]
@@ -65,9 +65,9 @@ STYLES = {
 
 @st.composite
 def arms(draw: Any) -> DrawnArm:
-    """An arm of 2 to 6 joints; at times a plate is fixed between, something branches off, a joint follows.
+    """Draw an arm of 2 to 6 joints, some with fixed plates between, a side branch, or a mimic joint.
 
-    Hypothesis draws the kind of the arm, and the seed of its numbers.
+    Hypothesis draws the joint types and such options, and the seed of the numbers.
     """
     style = STYLES[draw(st.sampled_from(tuple(STYLES)))]
     kinds = draw(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6))
@@ -100,13 +100,13 @@ def _drawn(write: _Writer, kinds: list[str], plates: set[int], follows: str, sid
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writes elements of a URDF with random numbers in a style."""
+    """Writer of URDF elements with random numbers of a style."""
 
     style: _Style
     random: Random
 
     def joint(self, name: str, kind: str, parent: str, child: str, follower: Follower | None = None) -> str:
-        """A joint, and its child link."""
+        """Return the elements of a joint with random origin and axis, and of its child link."""
         lines = [f'<parent link="{parent}"/>', f'<child link="{child}"/>', self.origin()]
         if kind != "fixed":
             axes = STRAIGHT_AXES if kind == "prismatic" and self.style.angles is RIGHT else self.style.axes
@@ -119,7 +119,7 @@ class _Writer:
         return _element(f'joint name="{name}" type="{kind}"', lines) + self.link(child)
 
     def link(self, name: str) -> str:
-        """A link with the inertia of a box somewhere in it."""
+        """Return the element of a link with the inertia of a box at a random place."""
         # second moments of mass [1e-3 kg m2]; sums of two of them are the principal moments of a body
         a, b, c = (self.random.randint(2, 60) for _ in range(3))
         tensor = f'ixx="{(b + c) / 1000:g}" iyy="{(a + c) / 1000:g}" izz="{(a + b) / 1000:g}"'
@@ -128,13 +128,13 @@ class _Writer:
         return f'<link name="{name}">\n{_element("inertial", lines)}</link>\n'
 
     def origin(self) -> str:
-        """An origin, as the style has it."""
+        """Return an <origin> with offsets and angles of the style."""
         xyz = " ".join(self.random.choice(self.style.offsets) for _ in range(3))
         rpy = " ".join(self.random.choice(self.style.angles) for _ in range(3))
         return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
 
     def follower(self, leaders: tuple[str, ...]) -> Follower:
-        """A joint that follows one of the leaders."""
+        """Return a mimic joint of one of the leaders, with a random multiplier and offset."""
         multiplier = self.random.choice((1.0, -1.0, 2.0, 0.5, -1.5))
         offset = self.random.choice((0.0, 0.0, pi / 2, 0.3))
         return Follower("follower", self.random.choice(leaders), multiplier, offset)

@@ -16,13 +16,13 @@ TEXT = ctypes.c_char_p
 
 
 def array(values):
-    """Numbers as an argument of the library."""
+    """Return an array as a pointer for the C library, and the array itself, which must stay alive during the call."""
     values = np.ascontiguousarray(values, dtype=float)
     return values.ctypes.data_as(ctypes.c_void_p), values
 
 
 def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
-    """The controller of an exported package and its harness as a library; no warning is accepted."""
+    """Compile the exported controller with the harness that calls it; any compiler warning fails the test."""
     (name,) = (path.stem for path in (package / "src").glob("*.c") if not path.stem.endswith("_estimator"))
     include, library = [f"-I{STUBS}", f"-I{package / 'src'}"], folder / "controller.so"
     warnings = ["-O1", "-fPIC", "-Wall", "-Wextra", "-Werror"]
@@ -46,7 +46,10 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
 
 
 class Controller:
-    """A controller with n joints; ``parameters`` are read as from a file. An error of the start is raised."""
+    """The exported controller with n joints, run by the harness; ``parameters`` are its ROS parameters.
+
+    Raises ValueError if the controller refuses to start.
+    """
 
     def __init__(self, library, n, **parameters):
         self.library, self.n = library, n
@@ -70,7 +73,7 @@ class Controller:
         return getattr(self.library, f"harness_{name}")(self.handle, *arguments)
 
     def update(self, q, qd, effort=None, period=PERIOD, available=True):
-        """Return the commanded torques of a cycle."""
+        """Run a control cycle at a state; return the commanded torques (n,)."""
         self.time += period
         states = [q, qd] if effort is None else [q, qd, effort]
         pointer, _states = array(np.concatenate([np.asarray(x, float) for x in states]))
@@ -82,7 +85,7 @@ class Controller:
         return self.commands
 
     def reference(self, q, qd=(), qdd=()):
-        """Publish a reference."""
+        """Publish a reference on the controller's topic: positions, velocities, accelerations, (n,) or empty each."""
         arguments = []
         for values in (q, qd, qdd):
             pointer, kept = array(values)
@@ -90,12 +93,12 @@ class Controller:
         self.call("reference", *arguments)
 
     def write(self, *values):
-        """Write positions, then velocities, then accelerations of the reference interfaces."""
+        """Write the reference interfaces of the controller: positions, then velocities, then accelerations, (n,)."""
         for index, value in enumerate(np.concatenate(values)):
             self.call("write", index, ctypes.c_double(value))
 
     def set(self, name, value):
-        """Set a parameter; return the reason of a refusal, or None."""
+        """Set a ROS parameter of the controller; return the reason if it is refused, None otherwise."""
         if isinstance(value, str):
             reason = self.call("set_text", name.encode(), value.encode())
         else:
@@ -104,11 +107,11 @@ class Controller:
         return None if reason is None else reason.decode()
 
     def text(self, name):
-        """The result of a function without arguments: state, interfaces, ranges or log."""
+        """Return the text of a harness function without arguments, such as "state", "interfaces", "ranges" or "log"."""
         return self.call(name).decode()
 
     def joint_state(self, topic):
-        """Return the efforts of the last message of a topic, joint name to effort."""
+        """Return the effort of each joint name in the last JointState message of a topic."""
         self.text("state")
         pointer, efforts = array(np.zeros(self.n))
         return dict(
@@ -116,20 +119,23 @@ class Controller:
         )
 
     def wrench(self):
-        """Frame and values of the last tip wrench, (6,)."""
+        """Return frame and values (6,) of the last message of the external wrench at the tip."""
         self.text("state")
         pointer, values = array(np.zeros(6))
         return self.call("wrench", pointer).decode(), values
 
     def payload(self):
-        """Frame and values of the last payload: mass, centre, inertia, interval of the mass; None without one."""
+        """Return frame and values of the last payload message, or None if there was none.
+
+        Values: mass, centre (3), inertia (6), interval of the mass (2).
+        """
         self.text("state")
         pointer, values = array(np.zeros(12))
         frame = self.call("payload", pointer)
         return None if frame is None else (frame.decode(), values)
 
     def deactivate(self):
-        """Deactivate the controller; return the last commands."""
+        """Deactivate the controller; return its last commands, (n,)."""
         pointer, commands = array(np.full(self.n, np.nan))
         assert self.call("deactivate", pointer)
         return commands
@@ -140,7 +146,7 @@ class Controller:
 
 
 class SimulatedArm:
-    """An arm simulated with the C export of a model; semi-implicit Euler, torques are constant over a period."""
+    """An arm simulated by the exported C of a model: semi-implicit Euler, torques constant over a control period."""
 
     def __init__(self, model, arm, folder: Path):
         names = ["forward_dynamics", "friction_step", "friction_memory"]
@@ -154,18 +160,18 @@ class SimulatedArm:
         self.call = called_by_c(compile_library(source, program), functions)
 
     def evaluate(self, name, **inputs):
-        """The first output of a function."""
+        """Return the first output of an exported function at inputs without batch dimension."""
         (value,) = self.call(name, {"q": np.zeros((1, 1))} | {k: x[None] for k, x in inputs.items()}).values()
         return value[0]
 
     def start(self, q, qd=None):
-        """Set the state, with friction states of joints that have moved at qd."""
+        """Set the initial state of the arm; friction states are the ones of joints that slide at qd."""
         self.q = np.array(q, dtype=float)
         self.qd = np.zeros_like(self.q) if qd is None else np.array(qd, dtype=float)
         self.z = self.evaluate("friction_memory", qd=self.qd)
 
     def step(self, tau, period=PERIOD, substeps=4):
-        """Apply torques for a period."""
+        """Integrate the arm over one control period under torques (n,)."""
         for _ in range(substeps):
             qdd = self.evaluate("forward_dynamics", q=self.q, qd=self.qd, tau=tau, z=self.z)
             self.qd = self.qd + period / substeps * qdd
@@ -173,7 +179,10 @@ class SimulatedArm:
             self.q, self.z = self.q + moved, self.evaluate("friction_step", z=self.z, dq=moved)
 
     def run(self, controller, seconds, at_each=None, period=PERIOD):
-        """Control the arm; return positions, velocities and torques, (T, n) each. at_each: called before each cycle."""
+        """Run the controller on the arm; return positions, velocities and torques, (T, n) each.
+
+        at_each: function of the time [s] that is called before each control cycle.
+        """
         rows = []
         for cycle in range(round(seconds / period)):
             if at_each is not None:

@@ -20,8 +20,10 @@ GRAVITY, STEP, STRIBECK_VELOCITY = 9.81, 5e-4, 0.2
 
 @dataclass(frozen=True)
 class Servos:
-    """True parameters of both joints: kp, kd, armature, Coulomb friction, additional friction at rest that falls as
-    exp(-qd^2 / STRIBECK_VELOCITY^2), half the dead zone; and the delay [s].
+    """True servos of both joints of the simulated arm.
+
+    kp [Nm/rad], kd [Nm s/rad], armature [kg m^2], Coulomb friction [Nm]; stribeck [Nm]: additional friction at rest,
+    which falls as exp(-qd^2 / STRIBECK_VELOCITY^2); dead_zone: half of it [rad]; delay of the commands [s].
     """
 
     kp: tuple[float, float] = (14.0, 9.0)
@@ -34,7 +36,7 @@ class Servos:
 
 
 def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
-    """Write the URDF with its settings file."""
+    """Write the URDF of the two-link arm and its settings file; return the path of the URDF."""
     links = [
         LINK.format(name=name, com=com, mass=mass, inertia=inertia)
         for name, com, mass, inertia in zip(("upper", "lower"), COM, MASS, INERTIA, strict=True)
@@ -52,7 +54,7 @@ def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
 def servo_logs(
     count: int, seconds: float, servos: Servos = Servos(), seed: int = 0, swing: float = 1.0
 ) -> list[Trajectory]:
-    """Recordings at 50 Hz of commands that swing, hold and jump; positions come in steps of an encoder's 4096."""
+    """Simulate logs at 50 Hz under commands that swing, hold and jump; the encoders have 4096 steps per revolution."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.02)
     u = np.stack([_commands(rng, t, swing) for _ in range(count)])
@@ -66,7 +68,7 @@ def servo_logs(
 
 
 def _commands(rng: np.random.Generator, t: np.ndarray, swing: float) -> np.ndarray:
-    """(T, 2)"""
+    """Return random commands at times t (T,) [s], (T, 2) [rad]: sines of amplitude `swing` about levels that jump."""
     waves = sum(
         rng.uniform(0.05, 0.3)
         * np.sin(2 * np.pi * rng.uniform(0.05, 1.2, 2) * t[:, None] + rng.uniform(0, 6, 2))
@@ -77,9 +79,10 @@ def _commands(rng: np.random.Generator, t: np.ndarray, swing: float) -> np.ndarr
 
 
 def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
-    """Positions (T, 2): semi-implicit Euler, dry friction as the impulse that stops a joint or is at its limit.
+    """Return the positions (T, 2) [rad] of the arm under commands u (T, 2) [rad], from rest at the first command.
 
-    Number by number: for two joints that is faster than arrays.
+    Semi-implicit Euler, with dry friction as the impulse that stops a joint, limited to the friction torque. All
+    numbers are scalars: for two joints that is faster than arrays.
     """
     (kp1, kp2), (kd1, kd2) = servos.kp, servos.kd
     (dry1, dry2), (slow1, slow2), (zone1, zone2) = servos.coulomb, servos.stribeck, servos.dead_zone
@@ -102,7 +105,7 @@ def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
         most2 = STEP * (dry2 + slow2 * exp(-((v2 / STRIBECK_VELOCITY) ** 2)))
         force1 = kp1 * wrong1 - kd1 * v1 - weight1 * sin(q1) - both + sway * (2 * v1 * v2 + v2 * v2)
         force2 = kp2 * wrong2 - kd2 * v2 - both - sway * v1 * v1
-        # damping at a step's middle
+        # damping acts on the mean velocity of a step: half of it is implicit, in M
         m11, m12, m22 = base1 + 2 * c + STEP / 2 * kd1, own2 + c, base2 + STEP / 2 * kd2
         determinant = m11 * m22 - m12 * m12
         i11, i12, i22 = m22 / determinant, -m12 / determinant, m11 / determinant

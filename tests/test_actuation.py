@@ -1,4 +1,4 @@
-"""The input matrix G from transmissions, gears and couplings, in report, simulation, module and training."""
+"""The input matrix G from transmissions, gears and couplings is right in report, simulation, module and training."""
 
 from dataclasses import replace
 
@@ -26,7 +26,10 @@ WRIST = (("j1", (("m1", 100.0),), "Simple"), ("pitch roll", (("m2", 60.0), ("m3"
 
 
 def urdf(folder, *transmissions, sidecar=""):
-    """A shoulder and a wrist, three turning joints, with these <transmission>s."""
+    """Write the URDF of an arm with three turning joints (shoulder, wrist pitch, wrist roll) and these <transmission>s.
+
+    sidecar: text of the settings file. Returns the path of the URDF.
+    """
     inertial = (
         '<inertial><origin xyz="0.2 0 0"/><mass value="2"/>'
         '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -56,7 +59,7 @@ def urdf(folder, *transmissions, sidecar=""):
 
 
 def inputs(path):
-    """The entries of G that are not zero: (row, column) -> (kind, value)."""
+    """Return the entries of G that are not always zero, by (row, column): kind and value."""
     found = inspect(path).to_dict()["input_matrix"]["entries"]
     assert len(found) == 9
     return {(x["row"], x["col"]): (x["kind"], x["value"]) for x in found if x["kind"] != "zero"}
@@ -69,7 +72,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
 @pytest.mark.parametrize(
     ("transmissions", "sidecar", "expected"),
     [
-        # joint torques know no gears
+        # torques at the joints: gears have no effect, and G is the identity
         (WRIST, "", {(i, i): ("fixed", 1.0) for i in (1, 2, 3)}),
         (WRIST, "joints: {roll: {actuated: false}}", {(i, i): ("fixed", 1.0) for i in (1, 2)}),
         (
@@ -83,7 +86,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
                 (3, 3): ("coupled", -60.0),
             },
         ),
-        # the settings file precedes the URDF, and values that neither states are trained
+        # the settings file has precedence over the URDF; gains that neither states are trained
         (
             WRIST[1:],
             COUPLED,
@@ -154,7 +157,7 @@ def test_a_coupling_of_a_locked_joint_is_refused(tmp_path):
 
 @pytest.fixture
 def coupled(tmp_path):
-    """A built module of the arm with a known gear, a trained one among couplings, and its URDF."""
+    """Return the URDF and the emitted model of an arm with a known gear, a trained gain and couplings of motors."""
     path = urdf(tmp_path, sidecar=COUPLED + "joints: {j1: {gear: 80, gain: trained}}")
     model = import_source(generate(path), tmp_path / "arm_spel.py").Model(seed=1)
     randomise(model, 1)
@@ -201,7 +204,7 @@ class TestModule:
 
 
 def test_the_simulation_moves_joints_by_motors(coupled):
-    """The logged torques, times G, are the torques on the rigid bodies."""
+    """Logged torques are motor torques: G times the logged torque moves the rigid bodies."""
     loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(
@@ -215,7 +218,7 @@ def test_the_simulation_moves_joints_by_motors(coupled):
         make_friction(loaded.chain, settings, drives.speeds),
     )
     q, qd = log.q[0], log.qd[0]
-    for _ in range(5000):  # explicit Euler over the first interval, 10 us a step
+    for _ in range(5000):  # explicit Euler over the first sampling interval, in steps of 10 us
         qdd = engine.forward_dynamics(q, qd, G.numpy() @ log.tau[0] - friction(qd))
         q, qd = q + 1e-5 * qd, qd + 1e-5 * qdd
     assert np.abs(q - log.q[1]).max() < 1e-2 * np.abs(log.q[1] - log.q[0]).max()
@@ -228,7 +231,8 @@ def test_the_urdfs_dynamics_have_the_same_motors(coupled):
     qdd = baseline.forward_dynamics(q, qd, tau)
     assert torch.allclose(baseline.inverse_dynamics(q, qd, qdd), tau, rtol=0, atol=1e-9)
     loaded = load_arm(coupled[0])
-    engine = arm_dynamics(loaded.chain, loaded.settings)  # the URDF gives no friction
+    # rigid bodies without friction, as the URDF states none
+    engine = arm_dynamics(loaded.chain, loaded.settings)
     wanted = [
         engine.forward_dynamics(q[i].numpy(), qd[i].numpy(), G.numpy() @ tau[i].numpy())
         for i in range(len(q))
@@ -237,7 +241,7 @@ def test_the_urdfs_dynamics_have_the_same_motors(coupled):
 
 
 def test_a_gain_is_recovered(coupled):
-    """From motion under a gear of 100 that is thought to be 80, all else known."""
+    """A trained gain of initially 80 becomes the true 100 in a fit in which all other parameters are known."""
     model = coupled[1]
     model.inputs.raw_gains.data.fill_(np.log(1.25))
     start, speed, tau, _ = states(200)

@@ -1,4 +1,4 @@
-"""The lines that messages about logs advise are written into the settings, and the log is then read and right.
+"""A log with a fault is right after the lines that the message about it advises are written into the settings.
 
 Lines for jumps, dropouts, held samples, geometry, clipped torques, couplings, calibrations and times in another unit
 are applied in the tests of these checks.
@@ -30,7 +30,10 @@ def arm(request, robots, tmp_path):
 
 
 def logged(arm, trajectory, columns=None, **scaled):
-    """Write a log as CSV: of only these columns if given, others multiplied by factors of their quantity."""
+    """Write a log as CSV with quantities multiplied by factors; return its path.
+
+    columns: function of the names of all columns that returns the names to keep.
+    """
     path = arm.robot.path.with_name("log.csv")
     changed = replace(trajectory, **{name: getattr(trajectory, name) * x for name, x in scaled.items()})
     write_logs(path, [changed], arm)
@@ -40,7 +43,7 @@ def logged(arm, trajectory, columns=None, **scaled):
 
 
 def message_of(arm, path) -> str:
-    """Return the errors about a log, and else its warnings, as text; "" without any."""
+    """Return the errors about a log as text, or its warnings if it has no errors; "" if it has neither."""
     try:
         report = check_logs(read_logs([path], arm), arm)
     except SpelgenError as error:
@@ -49,7 +52,7 @@ def message_of(arm, path) -> str:
 
 
 def obeyed(arm, message: str):
-    """Return the arm with all lines that a message advises in its settings, once each."""
+    """Return the arm with all lines that a message advises written into its settings."""
     lines = re.findall(
         r"write '(.*?)' (?:or a 'gain' )?((?:under 'logs' )?)in", message.replace("into", "in")
     )
@@ -85,7 +88,7 @@ def test_gain_of_torques_in_another_unit(arm, factor):
 
 @pytest.mark.parametrize("arm", ["rpr", "ur10e"], indirect=True)
 def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
-    """The log is right after the first line, or after that line and the next message's."""
+    """The advised line corrects the sense of the torques; if their unit is still wrong, the next message does."""
     path = logged(arm, recorded(arm, 6), tau=-0.02)
     message = message_of(arm, path)
     assert "of the opposite sense" in message
@@ -100,7 +103,7 @@ def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("turn", [2 * np.pi, -2 * np.pi])
 def test_offset_of_angles_of_another_turn(arm, turn):
-    """A driver that logs 0 to 360 degrees, of a joint that never crosses 0: its positions are beyond the limits."""
+    """Angles that are logged one turn beyond the limits of a joint are right after the advised offset."""
 
     def within_limits(arm, rng):
         t, q = pick_and_place(arm, rng)
@@ -115,7 +118,7 @@ def test_offset_of_angles_of_another_turn(arm, turn):
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_angles_beyond_both_limits_are_of_no_other_turn(arm):
-    """The joint moves by more than its range, which no offset corrects."""
+    """If a joint moves by more than its range, no offset corrects it, and the message advises none."""
 
     def wide(arm, rng):
         t, q = pick_and_place(arm, rng)
@@ -156,7 +159,7 @@ def test_commands_of_position_servos(arm):
 
 
 def test_gain_of_motor_currents(arm):
-    """A draft states the gain 1 for currents; the gains of a fit (gain: trained) need none."""
+    """Currents with a gain of 1 in the settings are reported; other gains and gains that a fit trains are not."""
     names, path = arm.chain.joint_names, logged(arm, recorded(arm, 11), tau=0.5)
     settings = arm.robot.path.with_suffix(".yaml")
 
@@ -190,7 +193,7 @@ UNITS = {
     indirect=["arm"],
 )  # fmt: skip
 def test_units_of_positions_and_velocities(arm, units, single):
-    """Of all revolute joints, or of one; only the torques show positions and velocities in revolutions."""
+    """Positions and velocities in another unit, of all revolute joints or of one, get a line that corrects them."""
     log, turning = recorded(arm, 12), [x.joint_type == "revolute" for x in arm.chain.coordinates]
     changed = np.flatnonzero(turning)[-2:-1] if single else np.array(turning)
     q, qd = (1 / SCALES.get(unit, 1.0) for unit in UNITS[units])
@@ -295,7 +298,7 @@ def test_column_of_commands_that_another_joint_follows(tmp_path):
     ],
 )
 def test_unit_of_torques_beyond_the_drive(robots, tmp_path, line, factor):
-    """Of a planar arm without gravity: only the drive's limit shows the unit. Each form of the advice is applied."""
+    """Without gravity, torques in another unit are found by the effort limit, and each advised line corrects them."""
     text = (robots / "scara.urdf").read_text()
     (tmp_path / "arm.urdf").write_text(re.sub(r'effort="[^"]*"', 'effort="100"', text))
     arm = load_arm(tmp_path / "arm.urdf", joints=load_arm(robots / "scara.urdf").chain.joint_names[:2])

@@ -40,7 +40,7 @@ def joint(name, parent, child, kind="revolute", xyz="0 0 0.3", rpy="0 0 0", axis
 
 @pytest.fixture
 def robot(tmp_path):
-    """Make a robot from joint elements: its links, each with an inertial, are those the joints name."""
+    """Return a function that makes a robot from joint elements; it adds their links, without inertials if in `bare`."""
 
     def make(*joints, bare=()):
         text = "".join(joints)
@@ -58,7 +58,7 @@ def names(arm):
 
 
 def exact(body):
-    """A body's rotation as an array of fractions."""
+    """Return the rotation of a body as a (3, 3) array of fractions."""
     return np.array(body.rotation)
 
 
@@ -88,7 +88,7 @@ class TestChain:
         assert names(make_arm(robot(joint("a", "0", "1"), *jaws))) == ["a"]
 
     def test_a_last_joint_that_may_open_a_gripper_is_stated_with_the_tip_that_leaves_it_out(self, robot):
-        """Only its link has the name of a gripper; no joint with such a name was left out."""
+        """If only the last link is named as a gripper, the remark `ambiguous-chain` states the --tip before it."""
         arm = robot(joint("a", "0", "1"), joint("b", "1", "gripper_moving_part"))
         assert names(make_arm(arm)) == ["a", "b"]
         (remark,) = [x for x in make_arm(arm).diagnostics if x.code == "ambiguous-chain"]
@@ -119,7 +119,7 @@ class TestChain:
         assert names(arm) == ["a", "b"]
         assert ("ambiguous-chain" in codes(arm)) == (travel < 0.1)
 
-    def test_a_joint_of_effort_zero_decides_a_draw(self, robot):
+    def test_a_joint_of_effort_zero_decides_between_equal_chains(self, robot):
         spring = joint("spring", "1", "s").replace('effort="3"', 'effort="0"')
         arm = make_arm(robot(joint("a", "0", "1"), spring, joint("b", "1", "2")))
         assert names(arm) == ["a", "b"]
@@ -150,7 +150,7 @@ class TestChain:
             (
                 {"joints": ["m"]},
                 "FILE:1: joint 'm': got a mimic joint, expected its leader; name 'a' instead: "
-                "what follows it moves with it",
+                "its mimic joints move with it",
             ),
             ({"joints": ["a", "a"]}, "FILE: got the joint 'a' twice, expected each joint once"),
             (
@@ -158,9 +158,12 @@ class TestChain:
                 "FILE:1: got the joints 'b' and 'a', which lie on different branches, "
                 "expected joints on one path from the root",
             ),
-            ({"joints": []}, "FILE: got no joint that moves by itself, expected a serial chain of joints"),
+            (
+                {"joints": []},
+                "FILE: got no joint that moves independently, expected a serial chain of joints",
+            ),
             ({"tip": "9"}, "FILE: no link is named '9'; known are '0', '1', '2', '3', '4'"),
-            ({"tip": "0"}, "FILE: got no joint that moves by itself, expected a serial chain of joints"),
+            ({"tip": "0"}, "FILE: got no joint that moves independently, expected a serial chain of joints"),
             ({"tip": "1", "joints": ["a"]}, "FILE: got both joints and a tip, expected one of the two"),
             (
                 {"tip": "1", "angle_tolerance": -1},
@@ -324,7 +327,7 @@ class TestExactness:
                 joint("b", "3", "4", xyz="0 0 1"),
             )
         )
-        # "b" is one metre along the z axis of joint "a", seen from the tilted slider
+        # joint "b" is one metre along the z axis of joint "a", in the frame of the tilted slider
         slider, last = arm.bodies[1:]
         assert last.translation == slider.rotation[2]
         assert (exact(slider) @ exact(last) == IDENTITY).all()
@@ -340,14 +343,14 @@ class TestExactness:
         st.floats(-pi, pi),
     )
     @settings(max_examples=200, deadline=None)
-    def test_any_rotation_is_met_within_1e_11(self, axis, angle):
+    def test_any_rotation_is_approximated_to_1e_11(self, axis, angle):
         rotation = rotation_about(np.array(axis) / np.linalg.norm(axis), angle)
         found = exact_rotation(rotation)
         assert (found @ found.T == IDENTITY).all()
         assert np.abs(np.array(found, dtype=float) - rotation).max() < 1e-11
 
     def test_without_rounding_angles_are_those_of_the_file(self, robot):
-        """Many URDFs have eleven decimals of pi/2: other readers of the file place the tip by these."""
+        """With an angle tolerance of zero the rotation is the file's 1.57079632679 rad, not rounded to pi/2."""
         made = robot(joint("a", "0", "1", rpy="0.3 1.57079632679 0", axis="0 0 1"))
         (body,) = make_arm(made, angle_tolerance=0.0).bodies
         expected = rotation_from_rpy((0.3, 1.57079632679, 0.0))
@@ -369,7 +372,7 @@ class TestExactness:
         mass, hx, hy, hz, xx, xy, *_ = make_arm(read_urdf(made.path)).bodies[0].inertia
         x, y, z = Fraction(1, 10), Fraction(2, 100), Fraction(3, 100)
         assert (mass, hx, hy, hz) == (2, 2 * x, 2 * y, 2 * z)
-        # turned by a quarter about z: ixx and iyy change places, ixy its sign
+        # the inertial frame is rotated by a quarter turn about z: ixx and iyy are exchanged, ixy changes its sign
         assert xx == Fraction(4, 100) + 2 * (y * y + z * z)
         assert xy == -Fraction(1, 1000) - 2 * x * y
 
@@ -403,7 +406,7 @@ class TestLumping:
 
 
 class TestAgainstPinocchio:
-    """The bodies of an arm against Pinocchio's own reading of the file, at random configurations."""
+    """Poses, M and V of an arm equal Pinocchio's own reading of the URDF at random configurations."""
 
     def test_all_reference_arms_move_and_weigh_the_same(self, shared):
         rng = np.random.default_rng(0)
@@ -414,7 +417,7 @@ class TestAgainstPinocchio:
             try:
                 theirs = Theirs(path, arm)
             except ValueError:
-                continue  # Pinocchio refuses a few files: limits without effort, negative friction
+                continue  # Pinocchio rejects a few files, for limits without effort or negative friction
             ours = Ours(arm)
             for _ in range(3):
                 q = rng.uniform(-2, 2, len(arm.coordinates))
@@ -433,7 +436,7 @@ def assert_close(ours, theirs, name):
 
 
 class Ours:
-    """A Pinocchio model assembled from nothing but an arm's bodies."""
+    """A Pinocchio model that is built from the bodies of an arm only."""
 
     def __init__(self, arm):
         self.model = pin.Model()
@@ -474,7 +477,7 @@ class Ours:
 
 
 class Theirs:
-    """Pinocchio's reading of the whole file, with every joint in it, projected on the arm's coordinates."""
+    """Pinocchio's reading of the whole URDF, all joints included, as a function of the arm's coordinates."""
 
     def __init__(self, path, arm):
         text = re.sub(r"<\?xml[^>]*\?>", "", path.read_text(encoding="utf-8"), count=1)
@@ -555,8 +558,10 @@ class TestReferenceArms:
             assert arm.inertials_complete == (expected["inertials"] is not None)
 
     def test_the_default_chain_is_the_expected_one(self, shared):
-        """All but three of 189: two robots with two equal arms, and one jaw that no name tells from a "
-        "wrist."""
+        """The default chain is the stated one for all but three of 189 arms.
+
+        Two of these robots have two equal arms, and one has a jaw whose name does not distinguish it from a wrist.
+        """
         others = {}
         for name, expected in expectations(shared).items():
             try:

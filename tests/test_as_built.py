@@ -1,4 +1,4 @@
-"""Arms as built: physically consistent, different from their URDF, and exact in the logs that they give."""
+"""Simulated arms as built are physically consistent, differ from their URDF, and agree exactly with their own logs."""
 
 import json
 import re
@@ -31,7 +31,7 @@ ROBOTS = ("two_link", "rpr", "scara", "six_dof", "panda", "ur10e")
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_here_has_an_arm_as_built(name, robots, tmp_path):
-    """Bodies are physically consistent and about 30 % off; drives have friction and armature that the URDF lacks."""
+    """Masses and inertias are physically consistent and differ by about 30 %; drives have friction and armature."""
     given = spelgen.load_arm(robots / f"{name}.urdf")
     true = spelgen.as_built(given, 3, tmp_path / "as_built.urdf")
     assert true.chain.joint_names == given.chain.joint_names
@@ -49,7 +49,7 @@ def test_every_robot_here_has_an_arm_as_built(name, robots, tmp_path):
 
 
 def is_consistent(inertia):
-    """Whether the pseudo-inertia of ten parameters about the joint is positive semidefinite."""
+    """Return True if the pseudo-inertia matrix of ten inertial parameters about the joint is positive semidefinite."""
     m, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = inertia
     tensor = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     pseudo = np.zeros((4, 4))
@@ -72,7 +72,7 @@ def test_the_seed_decides_everything(robots, tmp_path):
 
 
 def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
-    """Without noise, encoders and friction the logged torque is Pinocchio's own of the URDF that is kept."""
+    """Without noise, encoder steps and friction, logged torques are the inverse dynamics of the as-built URDF."""
     true = spelgen.as_built(spelgen.load_arm(robots / "scara.urdf"), 5, tmp_path / "as_built.urdf")
     sidecar = tmp_path / "as_built.yaml"
     settings = yaml.safe_load(sidecar.read_text())
@@ -85,7 +85,7 @@ def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
     model = pin.buildModelFromUrdf(str(tmp_path / "as_built.urdf"))
     model.armature = np.array([true.settings.joint(name).armature for name in true.chain.joint_names])
     data, qdd = model.createData(), np.gradient(log.qd, log.t, axis=0)
-    # away from the ends, where the low-pass and differences are coarse
+    # the ends of the log are omitted, at which the low-pass filter and differences are inaccurate
     rows = range(50, len(log) - 50)
     tau = np.array([pin.rnea(model, data, log.q[k], log.qd[k], qdd[k]) for k in rows])
     np.testing.assert_allclose(log.tau[50:-50], tau, atol=2e-3 * np.abs(tau).max())
@@ -156,7 +156,7 @@ class TestHysteresis:
         np.testing.assert_allclose(tau[0.1 * t > self.PRESLIDING], 2.0, atol=1e-12)
 
     def test_a_cycle_dissipates_and_closes(self):
-        """The work over closed cycles is positive and, from the second on, the same."""
+        """Over closed cycles hysteretic friction does positive work, equal from the second cycle on."""
         t = np.linspace(0, 3, 6001)
         q = 0.05 * np.sin(2 * np.pi * t)
         tau = self.torque(q, t)
@@ -164,7 +164,7 @@ class TestHysteresis:
         second, third = work[4000] - work[2000], work[6000] - work[4000]
         assert second > 0
         assert third == pytest.approx(second, rel=1e-6)
-        # at most the torque of friction without presliding: 0.1 m up against 2 and down against 1
+        # at most the work of friction without presliding: 0.1 m up against 2 N and 0.1 m down against 1 N
         assert second < 0.1 * (2.0 + 1.0)
 
     def test_sliding_joints_build_up_over_a_tenth(self):
@@ -219,7 +219,7 @@ class TestMotionFile:
         path.write_text("\n".join(lines) + "\n")
         return path
 
-    def test_what_excite_writes_is_read_back(self, robots, tmp_path):
+    def test_files_of_excite_are_read_back(self, robots, tmp_path):
         found = spelgen.excite(spelgen.load_arm(robots / "two_link.urdf"), duration=2.0, trials=2)
         (tmp_path / "m.csv").write_text(found.csv())
         motion = read_motion(tmp_path / "m.csv", found.arm.joint_names)
@@ -236,13 +236,13 @@ class TestMotionFile:
             ({"t": [*range(20), 19]}, "a step of 0 s"),
         ],
     )
-    def test_what_is_no_motion_is_refused(self, change, message, tmp_path):
+    def test_files_that_are_no_motion_are_refused(self, change, message, tmp_path):
         path = self.write(tmp_path / "m.csv", **change)
         with pytest.raises(LogError, match=message) as caught:
             read_motion(path, ["a"])
         assert str(path) in str(caught.value)
 
-    def test_what_is_no_table_is_refused(self, tmp_path):
+    def test_files_that_are_no_table_are_refused(self, tmp_path):
         (tmp_path / "m.csv").write_bytes(b"t,q_a,qd_a,qdd_a\nx,y,z,w\n" * 30)
         with pytest.raises(LogError, match=r"unreadable|no finite"):
             read_motion(tmp_path / "m.csv", ["a"])
@@ -252,7 +252,7 @@ class TestMotionFile:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
-    """The folder and the output of the commands of `make demo`, as the Makefile states them."""
+    """Run the commands of `make demo` as the Makefile states them; return their folder and output."""
     folder, output = tmp_path_factory.mktemp("demo"), {}
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8").replace("\\\n\t", "")
     for line in re.findall(r"^\t\$\(BIN\)/spelgen (.*\$\(DEMO\).*|inspect .*)$", makefile, re.MULTILINE):
@@ -271,7 +271,7 @@ class TestDemo:
         assert max(len(line) for line in output["evaluate"].splitlines()) <= 80
 
     def test_evaluate_states_the_error_of_m(self, demo):
-        """By the truth's own M, computed here by Pinocchio, at the positions of the test log."""
+        """The reported error of M equals the error against M of the as-built URDF, which Pinocchio computes."""
         folder, _ = demo
         found = json.loads((folder / "run" / "evaluation.json").read_text())["mass_errors"]
         assert {"model", "URDF", "least squares"} <= found.keys()

@@ -1,4 +1,4 @@
-"""A model assembled in memory, its thin module and its standalone module are the same to the bit."""
+"""A model assembled in memory, its thin module and its standalone module are bitwise equal."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,7 +26,7 @@ def spec_of(robot: str, preset: str) -> ModelSpec:
 
 @each_case
 def test_three_forms_of_a_model_are_equal_to_the_bit(robot, preset, tmp_path):
-    """Initial weights, and inverse and forward dynamics with random parameters."""
+    """Initial parameters are equal, and so are inverse and forward dynamics with random parameters."""
     spec = spec_of(robot, preset)
     models = {"assembled": assemble(spec, seed=3)}
     for standalone in (False, True):
@@ -71,7 +71,7 @@ def test_the_seed_draws_the_weights_of_networks():
 
 
 def test_a_specification_of_no_model_is_refused():
-    """Well-formed numbers that no arm has: one error, no traceback of the runtime."""
+    """A specification whose numbers no arm can have, such as a negative mass, is refused by one line of error."""
     spec = spec_of("rpr", "closed-form")
     link = spec.links[1]
     for change in ({"mass": -1.0}, {"inertia": (1.0, 0.0, 0.0, 1.0, 0.0, 3.0)}):

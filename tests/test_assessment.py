@@ -1,4 +1,4 @@
-"""Each word of the assessment in a report follows from the figures."""
+"""Each sentence of the assessment in a report agrees with the figures of the evaluation."""
 
 from dataclasses import replace
 
@@ -18,7 +18,10 @@ def errors(relative, tip=None):
 
 
 def evaluation(relative=0.05, nmse=0.004, traces=None, seen=False, **others):
-    """Return an evaluation with two horizons; others: errors of other predictors at both."""
+    """Return an evaluation with two horizons.
+
+    relative: relative error of the model at 1 s. nmse: of its torque. others: relative errors of other predictors.
+    """
     horizons = []
     for k, (name, factor) in enumerate((("1 step", 0.5), ("1 s", 1.0))):
         by_predictor = {"model": errors(relative * factor)} | {who: errors(x) for who, x in others.items()}
@@ -45,7 +48,7 @@ def results(horizons, torque, traces=None, seen=False):
 
 
 def torques(slow, fast):
-    """Traces whose residual at the second joint has one size below and another above a tenth of its speed."""
+    """Return traces whose torque residual at joint 2 is `slow` below a tenth of its maximum speed, and `fast` above."""
     qd = [[1.0, 0.001 * k] for k in range(-100, 101)]
     residual = [[0.0, slow if abs(x) < 0.01 else fast] for _, x in qd]
     measured = [[float(k % 7), 10 * x[1] + r[1]] for k, (x, r) in enumerate(zip(qd, residual, strict=True))]

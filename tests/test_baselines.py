@@ -1,4 +1,4 @@
-"""Baselines: integrated with steps of their own, and identified from the same logs."""
+"""Baselines are integrated with steps of their own, identified from the same logs, and kept with a run."""
 
 import hashlib
 import json
@@ -32,7 +32,7 @@ MOTION = (
 
 
 class Slider:
-    """A mass with damping, pushed: qdd = (tau - d qd) / m."""
+    """A mass under a force, with viscous damping d: qdd = (tau - d qd) / m."""
 
     n = 1
 
@@ -50,7 +50,7 @@ class Slider:
 
 
 class Bristled(Slider):
-    """The slider with hysteretic friction, stiff at standstill: 2000 N/m on 1 g, and damping of 5000 1/s."""
+    """A slider with hysteretic friction whose stiffness at rest is 2000 N/m on 1 g, and a damping rate of 5000 1/s."""
 
     elements, reach, force = 1, torch.tensor([[1e-3]], dtype=torch.float64), 2.0
 
@@ -82,18 +82,20 @@ def exact(slider, windows):
 
 
 def test_damping_far_beyond_an_explicit_step_is_integrated():
-    stiff, windows = Slider(1e-3, 5.0), pushed()  # rate 5000 1/s: RK4 at 0.05 s multiplies by 1e7 a step
+    # the damping rate is 5000 1/s: a step of RK4 of 0.05 s would multiply the velocity by 1e7
+    stiff, windows = Slider(1e-3, 5.0), pushed()
     qd = roll_out_stiff(stiff, windows, 1)[1]
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
 
 
 def test_stiff_friction_with_a_state_is_integrated():
-    stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)  # less than the 2 N that make it slide
+    # less than the 2 N of friction, so that the slider does not slide
+    stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)
     q, qd = roll_out_stiff(stiff, windows, 8)
-    held = 1e-3 / 2  # z / reach = 1 / 2 at rest
+    held = 1e-3 / 2  # at rest the bristle holds 1 N of 2 N: z / reach = 1 / 2
     torch.testing.assert_close(q[0, -1], torch.tensor([held], dtype=torch.float64), atol=1e-7, rtol=0)
     assert qd[0, -1].abs() < 1e-5
-    fast = pushed(push=6.0)  # 6 - 2 = 4 N against 5 N s/m
+    fast = pushed(push=6.0)  # 6 N of force less 2 N of friction, against 5 N s/m of damping
     assert (roll_out_stiff(stiff, fast, 8)[1][:2, -1] - 0.8).abs().max() < 1e-6
 
 
@@ -149,7 +151,7 @@ def test_the_urdf_is_a_baseline_without_and_with_drives(robots):
 
 
 def test_a_resumed_run_fits_baselines_only_if_they_are_missing(robots, tmp_path, monkeypatch):
-    """A resumed run keeps its baselines, as its logs are the same."""
+    """A resumed run keeps its baselines, as its logs are the same, and fits only baselines that its folder lacks."""
     arm = load_arm(robots / "two_link.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.zeros(2), lambda qd, _: 0.5 * qd)
     t = np.arange(300) / 100
@@ -174,7 +176,7 @@ def test_a_resumed_run_fits_baselines_only_if_they_are_missing(robots, tmp_path,
 
 
 def noisy(tau):
-    """Torques (T, n) with 0.2 % of noise, without which a fit takes many more iterations."""
+    """Return torques (T, n) with noise of 0.2 %; without noise a fit would take many more iterations."""
     return tau + 0.002 * tau.std(axis=0) * np.random.default_rng(2).standard_normal(tau.shape)
 
 
@@ -193,7 +195,7 @@ def digests(folder):
 
 
 def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
-    """End to end on the command line: torques of the URDF's own bodies are explained by both, the model and it."""
+    """On logs of the URDF's own bodies, trained model and stored least squares both have negligible torque errors."""
     arm = load_arm(robots / "rpr.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
     names = [coordinate.name for coordinate in arm.chain.coordinates]
@@ -209,7 +211,7 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     module, folder = tmp_path / "rpr.py", tmp_path / "run"
     module.write_text(generate(robots / "rpr.urdf", "closed-form"), encoding="utf-8")
     logs = ["--data", str(tmp_path / "logs")]
-    # whoever sets a limit in time need not know that these logs are fitted in seconds
+    # a time limit that the fit does not reach
     quick = ["--set", "progress=false", "--set", "max_minutes=5"]
     run_command("train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), *quick)
     trained = digests(folder)
@@ -236,7 +238,8 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     assert found["horizons"][-1]["errors"]["least squares"]["mean_relative_rms"] < 0.05
     (trace,) = found["traces"]["torques"]
     parts = sum(np.array(part) for part in trace["parts"].values())
-    np.testing.assert_allclose(parts, trace["predicted"]["model"], atol=0.05)  # but for the offset
+    # the parts sum to the prediction, except the torque offset, which is not listed
+    np.testing.assert_allclose(parts, trace["predicted"]["model"], atol=0.05)
     energy = {name: np.array(x) for name, x in trace["energy"].items()}
     left = energy["work of the drives"] - energy["stored"] - energy["friction"] - energy["not explained"]
     assert np.abs(left).max() < 1e-3

@@ -1,4 +1,4 @@
-"""Benchmarks: folds without overlap, tables, errors of known size and correlation."""
+"""Benchmarks: folds do not overlap, tables are right, and simulated errors have their level and correlation."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_folds_use_every_recording_and_never_test_a_motion_that_was_trained(shar
         trained.setdefault(arm, set()).update(log.name for log in fold.training)
         for log in fold.training:
             for test in tests:
-                if log.name == test.name:  # two parts of one recording
+                if log.name == test.name:  # training and test are parts of one recording
                     assert log.t[-1] < test.t[0] or test.t[-1] < log.t[0], fold.name
                 else:
                     assert leaderboard.motion_of(log.name) != leaderboard.motion_of(test.name), fold.name
@@ -51,7 +51,7 @@ def test_the_default_is_compared_with_the_best_reference(tmp_path):
     assert summary[-1].split() == ["above", "1.25:", "1.30", "a/split,", "3,", "rest"]
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- leaderboard -->\nstale\n<!-- end of leaderboard -->\nafter\n")
-    for _ in range(2):  # the same page a second time
+    for _ in range(2):  # the second time the page already has the tables
         leaderboard_tables.write_page(page, results, cells, ["URDF", "ridge", "hybrid", "GP", "DeLaN"])
         text = page.read_text()
         assert text.startswith("before\n") and text.endswith("\nafter\n") and "stale" not in text
@@ -66,7 +66,7 @@ def test_changes_are_ratios_of_the_same_cells():
 
 
 def test_noise_has_its_level_correlation_and_spectrum():
-    """AR(1) noise: autocorrelation exp(-lag / time), independent of the code that is tested."""
+    """The noise of `ErrorProcess` has the given level, autocorrelation exp(-lag / time) and an AR(1) spectrum."""
     errors = real_errors.RealErrors(slow_noise=0.1, slow_correlation=0.5)
     process = real_errors.ErrorProcess(errors, np.ones(3), np.random.default_rng(0))
     torque = np.random.default_rng(1).normal(size=(400_000, 3))
@@ -77,9 +77,9 @@ def test_noise_has_its_level_correlation_and_spectrum():
     np.testing.assert_allclose(found.correlation, expected, atol=0.05)
     assert found.level == pytest.approx(0.1, rel=0.05)
     assert sum(found.power) == pytest.approx(1.0)
-    # the spectrum of this noise: share 2 / pi arctan(2 pi f time) below f
+    # spectrum of AR(1) noise: a share of 2 / pi arctan(2 pi f time) of its power is below the frequency f
     below = 2 / np.pi * np.arctan(np.pi * np.array(residual_statistics.BANDS[1:-1]))
-    # the window of 4 s smooths it
+    # within the resolution of a periodogram of 4 s
     np.testing.assert_allclose(np.cumsum(found.power)[:-1], below, atol=0.09)
 
 
@@ -104,7 +104,8 @@ def test_errors_that_are_absent_change_nothing():
 def test_elastic_joints_resonate_and_teeth_change_flanks():
     errors = real_errors.RealErrors(resonance=10.0)
     process = real_errors.ErrorProcess(errors, np.ones(1), np.random.default_rng(0))
-    stiffness = 2.0 * (2 * np.pi * 10.0) ** 2  # of an inertia of 2 kg m^2
+    # stiffness of a joint with a resonance of 10 Hz and a link inertia of 2 kg m^2
+    stiffness = 2.0 * (2 * np.pi * 10.0) ** 2
     torque = np.linspace(-3.0, 3.0, 1001)[:, None]
     np.testing.assert_allclose(process.deflection(torque, np.array([2.0])), torque / stiffness)
     loose = real_errors.ErrorProcess(
@@ -115,7 +116,7 @@ def test_elastic_joints_resonate_and_teeth_change_flanks():
 
 
 def test_play_sticks_and_slips():
-    """A triangle beyond the reach: the state saturates, and reverses within twice the reach."""
+    """Along a triangle of positions the state saturates at +-1; it reverses within two break-away displacements."""
     q = np.concatenate([np.arange(0, 101), np.arange(99, -1, -1)])[:, None] * 0.01
     z = real_errors.play(q, np.array([0.1]))[:, 0]
     np.testing.assert_allclose(z[:11], np.linspace(0, 1, 11), atol=1e-9)

@@ -33,7 +33,7 @@ from spelgen.settings.log_mapping import LogMapping
 
 @pytest.fixture(scope="module")
 def loaded(robots):
-    """Revolute, prismatic, revolute; gravity loads the last one most."""
+    """Return the arm rpr with a revolute, a prismatic and a revolute joint; gravity loads joint 3 most."""
     return load_arm(robots / "rpr.urdf")
 
 
@@ -44,7 +44,7 @@ def arm(loaded):
 
 @pytest.fixture(scope="module")
 def log(arm) -> Trajectory:
-    """20 s at 100 Hz of smooth motion within the limits, with the torques of the URDF and friction."""
+    """Return a log of 20 s of smooth motion at 100 Hz within the limits, with the URDF's torques and friction."""
     random = np.random.default_rng(0)
     t = np.cumsum(0.01 * (1 + 0.1 * random.uniform(-1, 1, 2000)))
     middle, width, speed = np.array([0.0, 0.8, 0.2]), np.array([0.5, 0.2, 0.8]), np.array([0.5, 0.7, 1.1])
@@ -55,7 +55,7 @@ def log(arm) -> Trajectory:
 
 
 class Geared:
-    """An arm's actuation with one gear at every joint."""
+    """Actuation of an arm that has the same gear at each joint."""
 
     def __init__(self, gear):
         self.gear = gear
@@ -67,7 +67,7 @@ class Geared:
         return Drives(self.matrix(), np.eye(3))
 
 
-def test_a_sound_log_is_measured_and_not_doubted(loaded, arm, log):
+def test_a_sound_log_has_its_figures_and_no_findings(loaded, arm, log):
     result = check_logs([log, replace(log, name="again", t=log.t + 3)], loaded)
     assert (result.samples, result.findings, result.errors) == (4000, (), ())
     assert result.duration == pytest.approx(40, rel=0.01)
@@ -98,7 +98,7 @@ def loaded_joint(loaded, log) -> int:
 
 
 @pytest.mark.parametrize("code", ["torque-without-gravity", "torque-scale"])
-def test_a_torque_that_is_none_is_found(loaded, arm, log, code):
+def test_torques_without_gravity_or_of_another_scale_are_found(loaded, arm, log, code):
     joint, tau = loaded_joint(loaded, log), log.tau.copy()
     still = np.zeros_like(log.q)
     gravity = regressor(arm, log.q, still, still) @ urdf_parameters(arm)
@@ -140,7 +140,7 @@ def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(l
 
 
 def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
-    """Where gravity says nothing: of a joint with an effort limit and torques of noise."""
+    """Torques of noise far beyond the effort limits are an error, although they contain no gravity torque."""
     random = np.random.default_rng(0)
     coordinates = tuple(each._replace(effort=10.0) for each in arm.coordinates)
     weak = replace(loaded, chain=replace(arm, coordinates=coordinates))
@@ -151,7 +151,7 @@ def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
         require_sound_logs([wrong], weak)
 
 
-def test_limits_overrun_are_said(loaded, arm, log):
+def test_positions_beyond_the_limits_are_reported(loaded, arm, log):
     upper = arm.coordinates[1].upper
     over = log.q.copy()
     over[:, 1] += upper + 0.01 - over[:, 1].max()
@@ -168,7 +168,7 @@ def test_noise_at_the_velocity_limit_is_no_finding(loaded, arm, log, over, codes
     assert {x.code for x in check_logs([log], slower).findings if "velocity" in x.code} == codes
 
 
-def test_noise_and_steps_are_those_put_in(log):
+def test_noise_and_encoder_steps_are_estimated(log):
     random = np.random.default_rng(2)
     noisy = replace(log, q=log.q + 1e-3 * random.standard_normal(log.q.shape))
     np.testing.assert_allclose(statistics(noisy).signals["q"][2], 1e-3, rtol=0.1)
@@ -180,7 +180,7 @@ def test_noise_and_steps_are_those_put_in(log):
     assert np.isnan(statistics(log[::4]).signals["q"][2]).all()
 
 
-def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):
+def test_logs_that_cannot_be_trained_on_are_errors_of_a_report(loaded, arm, log):
     frozen = log.qd.copy()
     frozen[:, 0] = 0
     result = check_logs(
@@ -190,7 +190,7 @@ def test_what_cannot_be_trained_on_is_an_error_not_the_end(loaded, arm, log):
     assert any("qd always 0 while q goes" in str(error) for error in result.errors)
 
 
-def test_the_page_tells_what_the_text_tells_and_draws_every_joint(loaded, arm, log):
+def test_the_page_has_the_findings_of_the_text_and_charts_of_every_joint(loaded, arm, log):
     hostile = replace(log, name="<script>alert(1)</script>")
     result = check_logs(
         [hostile, replace(log, name="b", t=np.where(np.arange(2000) > 999, log.t + 2, log.t))], loaded
@@ -199,7 +199,7 @@ def test_the_page_tells_what_the_text_tells_and_draws_every_joint(loaded, arm, l
     assert shown.links == ["data:,", "#top"]
     assert (
         shown.tags.count("svg") == 2 * 3 * 3 + 2 * 3
-    )  # two trajectories, three joints, three charts; three marks in each legend
+    )  # charts of three joints for two trajectories and three quantities, and three marks in each legend
     told = " ".join(" ".join(shown.text).split())
     assert "1 gap in time" in told and "<script>alert(1)</script>" in told
     assert "1 gap in time" in " ".join(result.text().split())
@@ -211,7 +211,7 @@ def spelgen(tmp_path, monkeypatch):
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 
 
-def test_the_command_tells_80_columns_json_and_a_page(spelgen, robots, arm, log, tmp_path):
+def test_the_command_prints_80_columns_json_and_a_page(spelgen, robots, arm, log, tmp_path):
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf"]
@@ -240,8 +240,8 @@ def test_the_command_fails_where_logs_cannot_be_trained_on(spelgen, robots, arm,
     assert (strict.exit_code, strict.stderr) == (1, "3 warnings, and --strict allows none\n")
 
 
-def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, tmp_path):
-    """Neither settings of other steps, nor inertials, nor a transmission that says nothing."""
+def test_settings_that_logs_do_not_need_may_have_errors(spelgen, robots, arm, log, tmp_path):
+    """Logs are accepted if settings of other steps are wrong, inertials are absent, or a transmission is incomplete."""
     text = (robots / "rpr.urdf").read_text()
     text = re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL)
     odd = '<transmission name="t"><type>x/SimpleTransmission</type><joint name="joint1"/>'
@@ -259,7 +259,7 @@ def test_what_logs_do_not_need_does_not_refuse_them(spelgen, robots, arm, log, t
 def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
     spelgen, robots, arm, log, tmp_path, monkeypatch
 ):
-    """The report covers the kept samples and names their number."""
+    """Of logs beyond the bound of memory, the kept segments are checked, and the report states their number."""
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
@@ -273,7 +273,10 @@ def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
 
 
 def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, log, tmp_path):
-    """A velocity that is only too large gets no line: its unit, or the times, may be wrong."""
+    """Velocities of the opposite sense are an error with the line that corrects them.
+
+    A velocity that is only too large gets no line, since its unit or the times may be wrong.
+    """
     path = tmp_path / "arm.urdf"
     path.write_bytes((robots / "rpr.urdf").read_bytes())
     write_logs(tmp_path / "log.csv", [replace(log, qd=-log.qd)], arm.joint_names)
@@ -293,8 +296,8 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
-def test_a_torque_that_never_changes_is_told(loaded, log, constant):
-    """0.1 is no binary number: the remainder is rounding, not 0."""
+def test_a_constant_torque_is_reported(loaded, log, constant):
+    """A constant torque is reported, also if it is 0.1, whose mean differs from it by rounding."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
     assert [x.gravity.explained for x in report.joints] == [None] * 3
@@ -309,7 +312,7 @@ def test_arrays_of_another_arm_are_refused(loaded, log):
         check_logs([], loaded)
 
 
-def test_a_report_is_told_in_a_line_and_in_a_notebook(loaded, log):
+def test_a_report_has_one_line_and_a_notebook_form(loaded, log):
     report = check_logs([replace(log, name="<b>", qd=-log.qd)], loaded)
     assert repr(report) == "<LogReport rpr: 1 trajectory, 19.99 s, 2000 samples; 0 warnings, 1 error>"
     shown = report._repr_html_()
@@ -321,7 +324,10 @@ def test_a_report_is_told_in_a_line_and_in_a_notebook(loaded, log):
 @pytest.mark.parametrize("registry", [checks, robot_checks])
 @pytest.mark.parametrize("severity", ["info", "error"])
 def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registry, severity):
-    """As docs/extending.md says: `spelgen logs` reports it, and its severity decides whether logs are refused."""
+    """A new check needs only a function and its `Check`, as docs/extending.md states: `spelgen logs` reports it.
+
+    Its severity determines whether logs are refused.
+    """
     check = checks.Check("odd-name", severity, lambda joint: "it is called odd", expected="another name")
     monkeypatch.setattr(registry, "CHECKS", [*registry.CHECKS, check])
     monkeypatch.setattr(check_torque_logs, "CHECKS", robot_checks.CHECKS)
@@ -333,7 +339,7 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
 
 
 @pytest.mark.parametrize("samples", [1, 2, 10, 60])
-def test_a_log_too_short_for_a_fit_is_told(loaded, log, samples):
+def test_a_log_too_short_for_a_fit_is_named(loaded, log, samples):
     short = log[:samples]
     with pytest.raises(LogError, match="no samples to identify from") as refused:
         identify(loaded, short)
@@ -341,14 +347,14 @@ def test_a_log_too_short_for_a_fit_is_told(loaded, log, samples):
     assert message.endswith(refused.value.expected)
 
 
-def test_a_few_samples_tell_nothing_of_gravity(loaded, arm, log):
+def test_a_few_samples_give_no_figures_of_gravity(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
-    # in a fifth of a second no joint turns around
+    # within a fifth of a second no joint reverses
     assert {x.code for x in result.findings} == {"no-accelerations", "one-way"}
 
 
-def test_real_arms_are_believed(shared):
+def test_logs_of_real_arms_have_no_errors(shared):
     logs = shared / "logs" / "ur10e"
     real = load_arm(logs / "ur10e.urdf")
     paths = [path for path in sorted(logs.glob("*.parquet")) if "oad" not in path.stem]
@@ -360,7 +366,10 @@ def test_real_arms_are_believed(shared):
 
 @pytest.mark.parametrize("name", ["20_01_13_load_2600", "20_01_31_load"])
 def test_a_payload_is_not_another_unit_of_torques(shared, name):
-    """The payload's gravity at wrist 2 is 36 times the gravity of the URDF's wrist."""
+    """The gravity torque of a payload is not mistaken for another unit of the torques.
+
+    At wrist 2 it is 36 times the gravity torque of the URDF's wrist.
+    """
     folder = shared / "logs" / "ur10e"
     real = load_arm(folder / "ur10e.urdf")
     result = check_logs(read_logs([folder / f"{name}.parquet"], real), real)
@@ -377,7 +386,7 @@ WRONG_TORQUES = {
 
 
 @pytest.mark.parametrize("case", WRONG_TORQUES)
-def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
+def test_impossible_torques_are_refused_unless_accepted(loaded, log, case):
     change, code = WRONG_TORQUES[case]
     wrong = replace(log, tau=change(log.tau))
     with pytest.raises(SpelgenError) as caught:
@@ -391,7 +400,10 @@ def test_torques_that_cannot_be_are_refused_unless_accepted(loaded, log, case):
 
 @pytest.mark.parametrize("rate", [20, 200])
 def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
-    """M11 of two_link was a tenth of its true value at 20 Hz, where no accelerations can be filtered."""
+    """Negated torques of an arm without gravity are refused by their inertial part, at high and low sample rates.
+
+    At 20 Hz accelerations cannot be filtered, and the estimated inertia is a tenth of its true value.
+    """
     flat = load_arm(robots / "two_link.urdf")
     t = np.arange(0.0, 20.0, 1.0 / rate)
     q = np.stack([np.sin(1.3 * t), np.cos(2 * t) + 0.3 * np.sin(0.7 * t)], axis=1)
@@ -399,12 +411,12 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     torque = regressor(flat.chain, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(flat.chain)
     right = Trajectory(t, q, qd, torque + 0.3 * qd, "motion")
     assert check_logs([right], flat).errors == ()
-    # a drive that compensates more than its friction is no drive of the opposite sign
+    # drives that compensate more than their friction give torques that fall with velocity, which is no opposite sense
     assert check_logs([replace(right, tau=torque - 0.3 * qd)], flat).errors == ()
     refused = check_logs([replace(right, tau=-right.tau)], flat)
     assert ("too slow for fits to torques" in refused.text()) == (rate < 24)
     assert "No findings" not in refused.text()
-    assert check_logs([right[:1]], flat).errors == ()  # no rate at all
+    assert check_logs([right[:1]], flat).errors == ()  # a log of one sample has no sample rate
     (error,) = refused.errors
     assert "all joints: got torques of the opposite sense" in str(error)
     assert "--accept torque-sense" in str(error)
@@ -426,27 +438,30 @@ def test_gravity_of_another_mounting_is_refused(robots, tmp_path, log):
         require_sound_logs([log], load_arm(tmp_path / "arm.urdf"))
 
 
-def test_a_quantised_signal_is_told(loaded, log):
+def test_a_quantised_signal_is_reported(loaded, log):
     tau = log.tau.copy()
     step = np.ptp(tau[:, 0]) / 4
     tau[:, 0] = step * np.round(tau[:, 0] / step)
     assert "coarse" in {x.code for x in check_logs([replace(log, tau=tau)], loaded).findings}
 
 
-def test_a_position_limit_that_is_reached_without_contact_is_not_told(loaded, arm, log):
-    """A contact shows in the torques; `test_limits_in_logs` has joints at a stop."""
+def test_a_position_limit_that_is_reached_without_contact_is_not_reported(loaded, arm, log):
+    """A position limit that a joint reaches without contact is not reported.
+
+    A contact shows in the torques; `test_limits_in_logs` has joints at a stop.
+    """
     coordinates = tuple(x._replace(upper=float(log.q[:, k].max())) for k, x in enumerate(arm.coordinates))
     limited = replace(loaded, chain=replace(arm, coordinates=coordinates))
     assert check_logs([log], limited).findings == ()
 
 
-def test_a_joint_that_never_moves_back_is_told(loaded, log):
+def test_a_joint_that_never_reverses_is_reported(loaded, log):
     forward = np.abs(log.qd[:, 0])
     q = np.column_stack([cumulative_trapezoid(forward, log.t, initial=0.0), log.q[:, 1:]])
     moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]))
     one_way = [x.where for x in check_logs([moved], loaded).findings if x.code == "one-way"]
     assert one_way == [f"joint {loaded.chain.joint_names[0]!r}"]
-    # another log in which it does is enough
+    # it is enough that the joint reverses in another log
     back = replace(log, name="back")
     assert "one-way" not in {x.code for x in check_logs([moved, back], loaded).findings}
 
@@ -458,12 +473,12 @@ def test_commands_on_round_levels_are_not_quantised(samples_held):
     swing = 2.4 * np.sin(np.arange(2000) / 40)
     assert quantisation_step(np.round(swing)) == 1.0
     assert quantisation_step(np.round(swing + 0.4 * random.standard_normal(2000))) == 1.0
-    # a slow logger repeats values, and they are quantised all the same
+    # values of a slow logger are repeated, which does not change the quantisation step
     assert quantisation_step(np.repeat(np.round(swing[::5]), 5)) == 1.0
 
 
-def test_no_coupling_is_found_by_luck(loaded, log):
-    """Torques that no parameters explain: of all couplings one is the best, and none is told."""
+def test_no_coupling_is_found_by_chance(loaded, log):
+    """If no parameters explain the torques, the best of all couplings is not reported."""
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
         alone = Drives(np.eye(3), np.eye(3))
@@ -471,8 +486,11 @@ def test_no_coupling_is_found_by_luck(loaded, log):
         assert find_coupling(drive_problem(body_chain(loaded.chain), alone, samples)) is None
 
 
-def test_of_many_trajectories_an_even_part_is_filtered(monkeypatch):
-    """A long log is read in chunks: to filter each of them for every delay took minutes of a log of 10^7 samples."""
+def test_only_an_even_part_of_many_trajectories_is_filtered(monkeypatch):
+    """Of a log with many trajectories, an even part is filtered for each delay, to bound the time.
+
+    A long log is read in many chunks: filtering all of them for each delay took minutes for 10^7 samples.
+    """
     filtered = []
 
     def counted(moved, **options):
@@ -498,14 +516,17 @@ def drive_log(joints, *logs):
     return collected
 
 
-def test_a_coupling_of_recorded_logs_is_told_before_a_fit(shared):
+def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     notes = require_sound_logs(read_logs([shared / "logs" / "tx40"], tx40), tx40)
     assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]
 
 
 def test_seconds_of_recorded_logs_show_a_coupling(shared):
-    """The TX40's first 5.4 s, of which one tenth is explained a thousand times better and others three times."""
+    """The coupling of the TX40's wrist is found in the first 5.4 s of its log.
+
+    A coupling lowers the residual of one of ten blocks by a factor of a thousand, of others by three.
+    """
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)
     notes = require_sound_logs([log[: int(np.searchsorted(log.t, log.t[0] + 5.4))]], tx40)

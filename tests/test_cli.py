@@ -32,13 +32,13 @@ COMMANDS = [
 
 @pytest.fixture
 def spelgen(tmp_path, monkeypatch):
-    """Run a command in an empty folder, in this process."""
+    """Return a function that runs a command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 
 
 def process(*arguments, **options):
-    """Run a command in a process of its own."""
+    """Run a command in a process of its own; return its result."""
     command = [sys.executable, "-m", "spelgen", *map(str, arguments)]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120, **options)
@@ -48,7 +48,7 @@ def everything(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-# ---- the commands' own face
+# ---- help, version and listings
 
 
 def test_version(spelgen):
@@ -71,7 +71,7 @@ def test_every_option_has_a_help_text(spelgen, command):
 
 
 def test_help_and_inspect_load_nothing_heavy(robots):
-    """Each of these takes a quarter of a second or more to import, about as long as either command."""
+    """`--help` and `inspect` import no large package, each of which would double their duration."""
     heavy = {
         "torch",
         "scipy",
@@ -99,7 +99,7 @@ def test_help_and_inspect_load_nothing_heavy(robots):
         assert done.stdout.splitlines()[-1] == "set()", done.stderr
 
 
-# ---- standard output, standard error and files
+# ---- results on standard output, messages on standard error, and files
 
 
 def test_inspect_text_fits_80_columns(spelgen, robots):
@@ -184,7 +184,7 @@ def test_module_run_is_the_command(robots):
 
 
 def refused(result) -> str:
-    """The one line of a refusal."""
+    """Return the one line on stderr of a refused command: exit code 1, empty stdout, no traceback."""
     assert result.exit_code == 1
     assert result.stdout == ""
     assert result.stderr.count("\n") == 1
@@ -363,7 +363,7 @@ def test_closed_pipe_is_quiet(robots):
 @pytest.mark.parametrize("importing", [False, True])
 def test_interrupt_exits_130(spelgen, robots, monkeypatch, importing):
     def interrupted(*arguments, **options):
-        if importing:  # as compiled modules raise it
+        if importing:  # the exception that compiled modules raise when an import is interrupted
             raise ImportError("initialization failed") from KeyboardInterrupt()
         raise KeyboardInterrupt
 
@@ -383,12 +383,12 @@ def test_a_termination_ends_a_command_as_ctrl_c_does(robots, tmp_path):
     assert (done.returncode, done.stderr) == (130, "interrupted\n")
 
 
-# ---- the whole way, small
+# ---- from a URDF to a report, with little data
 
 
 @pytest.fixture(scope="module")
 def trained(robots, tmp_path_factory):
-    """A folder in which the whole way was gone, with very little data and training."""
+    """Run build, simulate, train, evaluate and report in a folder, with little data and training; return the folder."""
     folder = tmp_path_factory.mktemp("whole")
     for suffix in (".urdf", ".yaml"):
         text = (robots / f"two_link{suffix}").read_text(encoding="utf-8")
@@ -437,7 +437,7 @@ def test_a_second_run_needs_force_or_resume(trained, monkeypatch):
 
 
 def test_interrupted_training_writes_a_usable_run(spelgen, trained, tmp_path, monkeypatch):
-    """Ctrl-C after the first epoch; test_training.py sends the signals to a process."""
+    """Ctrl-C in the first epoch ends `train` with exit code 130 and a run that can be used and resumed."""
 
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -453,7 +453,7 @@ def test_interrupted_training_writes_a_usable_run(spelgen, trained, tmp_path, mo
     assert spelgen("report", tmp_path / "run").exit_code == 0
 
 
-# ---- words that nearly fit
+# ---- misspelt commands, options and values
 
 
 def test_bare_command_shows_the_help(spelgen):

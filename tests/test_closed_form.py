@@ -1,4 +1,4 @@
-"""The preset closed-form: rigid bodies against Pinocchio, derivatives against autograd, fits against known arms."""
+"""The preset closed-form: rigid bodies equal Pinocchio, derivatives equal autograd, and fits recover known arms."""
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +19,7 @@ def emitted(tmp_path_factory):
 
 
 def drawn(module, seed, deviation=0.5):
-    """A model with random weights."""
+    """Return the model of a module with normal random parameters of this standard deviation."""
     model = module.Model()
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
@@ -28,7 +28,7 @@ def drawn(module, seed, deviation=0.5):
 
 
 def rigid(module):
-    """The untrained model without friction and armature."""
+    """Return the untrained model of a module without friction and armature: the URDF's rigid bodies."""
     model = module.Model()
     model.nominal_armature.zero_()
     model.friction.nominal.zero_()
@@ -46,11 +46,12 @@ def near(a, b, tolerance=1e-9):
 
 
 def moved(q, qd, matrix_of):
-    """d/dt of matrix_of(q) along qd."""
+    """Return the derivative of matrix_of(q) with respect to time along qd."""
     return torch.func.jvp(matrix_of, (q,), (qd,))[1]
 
 
-@pytest.mark.parametrize("robot", [x for x in ROBOTS if x != "rpr"])  # whose bodies are no possible ones
+# rpr is omitted: one of its bodies is not physically consistent, and the model uses the nearest consistent one
+@pytest.mark.parametrize("robot", [x for x in ROBOTS if x != "rpr"])
 def test_untrained_it_is_the_urdfs_rigid_arm(emitted, robots, robot):
     module, arm = emitted[robot]
     model = rigid(module)
@@ -133,7 +134,7 @@ def test_any_batch_shape(emitted, batch):
 def test_backpropagation_reaches_every_weight(emitted):
     model = drawn(emitted["rpr"][0], seed=0, deviation=0.3)
     q, qd, _, tau = states(3)
-    z = 0.3 * model.memory(qd)  # on their way from one side to the other
+    z = 0.3 * model.memory(qd)  # friction states that are not saturated, so that all derivatives are nonzero
     model.forward_dynamics(q, qd, tau, z * torch.rand_like(z)).square().sum().backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad.abs().max() > 0, name

@@ -48,7 +48,7 @@ QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, 
 
 
 def silent(text):
-    """Ignore notes."""
+    """Print nothing: the output of comparisons is not tested."""
 
 
 @pytest.fixture(scope="module")
@@ -60,21 +60,21 @@ def quick():
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory, robots):
-    """two_link with 8 trajectories and 25 training steps."""
+    """Write the URDF of two_link with settings for 8 trajectories and 25 training steps; return its path."""
     folder = tmp_path_factory.mktemp("robot")
     urdf = folder / "two_link.urdf"
     urdf.write_bytes((robots / "two_link.urdf").read_bytes())
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings["simulation"]["trajectories"] = 8
     settings["comparison"] |= {"first": 0.25, "steps": 20, "momentum_steps": 5, "seeds": 1, "width": 8}
-    # of fits to logs that are not simulated by the comparison
+    # settings of fits to recorded logs, which the comparison does not simulate
     settings["training"] |= {"epochs": 2, "momentum_steps": 0}
     urdf.with_suffix(".yaml").write_text(yaml.safe_dump(settings))
     return urdf
 
 
 def simulated(robot, **changes):
-    """A comparison of PRESETS on the simulated robot."""
+    """Return a comparison of PRESETS on one robot whose logs are simulated."""
     return Comparison(arms={"arm": ComparedArm(urdf=robot)}, **{"presets": PRESETS, **changes})
 
 
@@ -96,7 +96,7 @@ def results(study):
 
 
 def trained(job):
-    """The trained model of a job."""
+    """Return the model of a job with its trained parameters."""
     model = job.build()
     model.load_state_dict(torch.load(job.folder / "model.pt"))
     return model
@@ -155,14 +155,14 @@ def test_figures_of_a_run_agree_with_one_another(results):
         assert sizes["smallest eigenvalue of M / mean"] > 0
     labels = [f"outputs of {matrix}" for matrix in "MDGV"]
     assert [results["hybrid"].simulated.sizes[label] for label in labels] == [1, 2, 0, 1]
-    # as in the paper
+    # phnode has the numbers of outputs and inputs of its paper
     sizes = results["phnode"].simulated.sizes
     assert [sizes[label] for label in labels] == [21, 21, 6, 1]
     assert sizes["inputs of M"] == 4
 
 
 def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
-    """Recomputed from the logs of each role: sums over joints, means over samples and windows."""
+    """Losses, recomputed from the logs, are squared errors summed over joints, means over samples and windows."""
     job = next(job for job in study.jobs if job.preset == "hybrid")
     model, losses = trained(job), results["hybrid"].simulated.losses
     for key, role, samples in (
@@ -253,7 +253,7 @@ def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, res
 
 
 def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
-    """Pinocchio's own reading of the file, and rotor inertia times gear squared on the diagonal."""
+    """The true M of the simulated arm equals Pinocchio's of the URDF, plus rotor inertia times gear squared."""
     urdf = robots / "ur10e.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
     q = torch.from_numpy(np.random.default_rng(0).uniform(-3, 3, (5, 6)))
@@ -265,7 +265,7 @@ def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
 
 
 def test_the_error_of_m_has_no_units():
-    """A tenth too large everywhere is an error of 0.1 on the diagonal of the identity, in any units of the joints."""
+    """An error of 10 % in all entries of M gives the same figure in any units of the joints."""
     scale = torch.diag(torch.tensor([1.0, 100.0, 0.01], dtype=torch.float64))
     true = (scale @ (torch.eye(3, dtype=torch.float64) + 0.2) @ scale).expand(4, 3, 3)
     assert mass_error(1.1 * true, true) == pytest.approx(0.1 / math.sqrt(3))
@@ -305,9 +305,13 @@ def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
 
 
 def test_decimated_windows_and_examples_start_at_a_multiple_of_the_decimation():
-    """A controller that holds its torque for four samples then has exactly the input of the windows."""
+    """Decimated windows and examples start at multiples of the decimation, as torques that a controller holds do.
+
+    The torque is constant over four samples, so each decimated window contains the complete input.
+    """
     count = 200
-    q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()  # number of the sample
+    # positions are the numbers of the samples
+    q = torch.arange(count, dtype=torch.float64).unsqueeze(-1).numpy()
     log = Trajectory(0.002 * q[:, 0], q, q, np.floor(q / 4), "a")
     windows = spread_windows([log], 5, 4)
     assert not (windows.q % 4).any()
@@ -326,7 +330,7 @@ def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_mat
     with torch.no_grad():
         assert rollout.energy_rise(model, windows) <= 1e-12
         assert rollout.smallest_eigenvalue(model, low, high) > 1e-12
-    # drives instead of braking
+    # negative friction, which adds energy
     model.friction_torque = lambda pose, qd, *state: -5.0 * qd
     with torch.no_grad():
         assert rollout.energy_rise(model, windows) > 1e-3
@@ -337,7 +341,7 @@ def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_mat
 
 @pytest.fixture(scope="module")
 def logs(robots, tmp_path_factory):
-    """Logs of two_link: four trajectories for training, four for testing."""
+    """Write logs of two_link, four trajectories for training and four for testing; return their folder."""
     folder = tmp_path_factory.mktemp("two_link")
     arm = load_arm(robots / "two_link.urdf")
     found = simulate(arm, trajectories=8)
@@ -348,7 +352,7 @@ def logs(robots, tmp_path_factory):
 
 @pytest.fixture
 def listed_arms(robots, logs, tmp_path, short_epochs):
-    """Write arms.yaml with arms that have these logs, and load it."""
+    """Return a function that writes arms.yaml with arms that all have these logs, and loads it."""
 
     def loaded(arms="ab", **changes):
         arm = {"urdf": str(robots / "two_link.urdf"), "data": [str(logs)]}
@@ -364,15 +368,18 @@ def compared(comparison, folder, jobs=1):
 
 
 def kill_two(folder: Path, killed: list[int]) -> None:
-    """Kill the worker that trains arm a and end the worker that trains arm b, each after its first checkpoint."""
+    """Kill the worker that trains arm a and terminate the worker of arm b, each after its first checkpoint.
+
+    killed: receives the process ids.
+    """
     waiting = {"a": signal.SIGKILL, "b": signal.SIGTERM}
-    # a loaded machine takes minutes to start workers
+    # wait up to some minutes, as workers start slowly on a loaded machine
     for _ in range(30_000):
         for lock in folder.glob("runs/*/*/.lock"):
             try:
                 text, arm = lock.read_text(), lock.parts[-3]
             except FileNotFoundError:
-                # the run ended after the folder was listed
+                # the run ended, and its lock file disappeared, after the files were listed
                 continue
             if arm in waiting and text.startswith("process") and (lock.parent / "config.json").exists():
                 killed.append(int(text.split()[1]))
@@ -394,7 +401,7 @@ def test_runs_of_killed_workers_are_resumed_and_end_with_the_same_weights(listed
     assert sorted(result.arm for result in study.results.values()) == ["a", "b"]
     assert not study.failures
     assert len(list(folder.glob("runs/*/*/result.json"))) == 2
-    # the same logs, killed at different times
+    # a second comparison, whose workers are killed at different times, gives equal weights
     a, b = (torch.load(next((folder / "runs" / x).glob("*/model.pt"))) for x in "ab")
     assert all(torch.equal(a[name], b[name]) for name in a)
 

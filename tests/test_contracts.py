@@ -1,4 +1,4 @@
-"""Contracts of an emitted module: they hold for each preset, robot, batch shape, and for any parameters."""
+"""Properties that emitted modules of all presets have, for each robot, batch shape, and for any parameters."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from torch.func import hessian, jacfwd, jacrev, jvp, vmap
 import spelgen
 from spelgen.design import load_design
 
-VARIANTS = {  # preset and design
+VARIANTS = {  # preset and design of each variant
     "phnode": ("phnode", None),
     "phnode-kan": ("phnode", replace(load_design("phnode"), net="kan")),
     "spel": ("spel", None),
@@ -20,17 +20,18 @@ VARIANTS = {  # preset and design
     "minimal": ("minimal", None),
     "closed-form": ("closed-form", None),
 }
-ALL_ROBOTS = ("hybrid", "minimal", "closed-form")  # variants with the derived structure of each robot
+# variants whose structure is derived from the robot, tested with all robots
+ALL_ROBOTS = ("hybrid", "minimal", "closed-form")
 WITH_FRICTION_STATE = ("hybrid", "closed-form")
 THREE = ("two_link", "rpr", "six_dof")
-URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # arms in addition to the robots of the repository
-# Standard deviations of random parameters; None: as `randomise` scales them. With 1.0 the bound of M is active.
+URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # generated arms, tested like the robots of the repository
+# Standard deviations of random parameters; None: the scales of `randomise`. With 1.0 the bound of M is active.
 DEVIATIONS = {"minimal": (None, 1.0), "closed-form": (0.5,)}
 LARGE = {
     "phnode": None,
     "phnode-kan": None,
     "closed-form": 1.5,
-}  # phnode inverts a matrix: 3.0 is ill-conditioned
+}  # largest scale of parameters: at 3.0 phnode would invert an ill-conditioned matrix
 
 each_case = pytest.mark.parametrize(
     ("variant", "robot"),
@@ -73,13 +74,13 @@ def random_model(module_of):
 
 
 def states(n: int, *shape: int, count: int = 4) -> tuple[Tensor, ...]:
-    """Random q, qd, qdd and tau, each (*shape, n)."""
+    """Return random q, qd, qdd and tau, (*shape, n) each."""
     generator = torch.Generator().manual_seed(0)
     return tuple(1.5 * torch.randn(*shape, n, dtype=torch.float64, generator=generator) for _ in range(count))
 
 
 def assert_near(found: Tensor, expected: Tensor, bound: float = 1e-10) -> None:
-    """Check the shape, and the difference relative to the largest entry."""
+    """Assert equal shapes, and a difference of at most a tolerance relative to the largest entry."""
     assert found.shape == expected.shape
     assert (found - expected).abs().max() <= bound * max(1.0, expected.abs().max().item())
 
@@ -106,7 +107,10 @@ def autograd_bias(model: nn.Module, q: Tensor, qd: Tensor) -> Tensor:
 
 @each_case
 def test_explicit_derivatives_equal_automatic_ones(variant, robot, random_model):
-    """q' = dH/dp and p' = -dH/dq - D q' + G tau; gravity is dV/dq; forward dynamics give the rate of p."""
+    """Explicit derivatives equal automatic ones: q' = dH/dp, p' = -dH/dq - D q' + G tau, and gravity dV/dq.
+
+    Forward dynamics agree with the rate of p.
+    """
     for deviation in DEVIATIONS.get(variant, (None,)):
         model = random_model(variant, robot, 4, deviation).requires_grad_(False)
         q, qd, other, tau = states(model.n, 25)
@@ -128,7 +132,8 @@ def test_explicit_derivatives_equal_automatic_ones(variant, robot, random_model)
 @each_case
 def test_forward_and_inverse_dynamics_are_inverses(variant, robot, random_model):
     model = random_model(variant, robot, 3, DEVIATIONS.get(variant, (None,))[0])
-    if variant.startswith("phnode"):  # random gains of the input may be almost zero
+    # the input network of phnode is constant, as its random gains may be almost zero and not invertible
+    if variant.startswith("phnode"):
         torch.nn.init.zeros_(model.input_network.weights[-1])
     q, qd, _, tau = states(model.n, 25)
     assert_near(model.inverse_dynamics(q, qd, model.forward_dynamics(q, qd, tau)), tau, 1e-8)
@@ -144,7 +149,8 @@ def test_mass_matrix_is_positive_definite_and_friction_dissipates(variant, robot
             damping = model.dissipation(q, speed)
             assert torch.linalg.eigvalsh(damping)[:, 0].min() > -1e-12 * damping.abs().max()
             assert_near(model.friction_torque(q, speed), times(damping, speed))
-            if variant in ALL_ROBOTS:  # friction of each joint by itself
+            # friction acts per joint, so the diagonal of the dissipation matrix is positive
+            if variant in ALL_ROBOTS:
                 assert damping.diagonal(dim1=-2, dim2=-1).min() > 0
 
 
@@ -182,7 +188,7 @@ def test_states_may_have_any_batch_shape_and_single_precision(variant, robot, mo
 def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     model = random_model(variant, "rpr", 0, 0.3).to(dtype)
     q, qd, _, tau = (x.to(dtype) for x in states(3, 20))
-    # friction states between the values of both directions of motion
+    # friction states that are not saturated, so that all derivatives are nonzero
     state = [0.3 * z * torch.rand_like(z) for z in friction_state(variant, model, qd)]
     loss = model.forward_dynamics(q, qd, tau, *state).square().sum() + model.hamiltonian(q, qd, *state).sum()
     loss.backward()
@@ -195,8 +201,10 @@ def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
     ("variant", "robot"), [*((x, "rpr") for x in VARIANTS), ("hybrid", "six_dof"), ("closed-form", "six_dof")]
 )
 def test_transforms_of_torch_func_apply(variant, robot, random_model):
-    """No branch depends on data. Jacobians of a batch by vmap equal Jacobians of its states, except in forward mode
-    through a solution of linear equations (see below)."""
+    """Models have no branches that depend on data: vmap, jacrev, jacfwd and hessian of torch.func apply.
+
+    Jacobians of a batch equal Jacobians of its states, except in forward mode through a solution of linear equations.
+    """
     model = random_model(variant, robot, 1).requires_grad_(False)
     q, qd, tau = states(model.n, 5, count=3)
     assert_near(vmap(model.forward_dynamics)(q, qd, tau), model.forward_dynamics(q, qd, tau), 1e-9)
@@ -224,7 +232,7 @@ def test_torch_differentiates_a_solution_in_forward_mode_under_vmap():
 
 @pytest.mark.parametrize("variant", [x for x in VARIANTS if x not in ("phnode-kan", "minimal")])
 def test_a_model_is_one_graph(variant, random_model):
-    """torch.export in strict mode for batches of any size, and torch.compile without graph breaks.
+    """A model is exported by torch.export in strict mode for batches of any size, and compiled without graph breaks.
 
     Variants all of whose parts occur in others are omitted, as each takes 7 s.
     """
@@ -241,7 +249,7 @@ def test_a_model_is_one_graph(variant, random_model):
 
 @each_variant
 def test_a_constant_mass_matrix_needs_no_network(variant, module_of):
-    """A gantry: M is a diagonal of trained numbers, and gravity does no work."""
+    """A gantry with constant M: M is a diagonal of trained numbers without networks, and gravity torques are zero."""
     model = module_of(variant, "gantry").Model()
     q, qd, _, tau = states(2, 20)
     assert_near(model.mass_matrix(q), model.mass_matrix(q[:1]).expand(len(q), 2, 2))

@@ -1,4 +1,4 @@
-"""Drives that move several joints: friction and rotor inertia act at motor speeds, and logs reveal couplings."""
+"""With motors that move several joints, friction and rotor inertia act at motor speeds, and logs reveal couplings."""
 
 import json
 import shutil
@@ -34,13 +34,15 @@ from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
-WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])  # joint torques by motor torques of the last two joints
-SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])  # of its motors, as of the fifth joint
+# matrix from torques of the last two motors to torques of the last two joints
+WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])
+# matrix from velocities of the last two joints to velocities of the motors, relative to motor 5
+SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])
 
 
 @pytest.fixture(scope="module")
 def wrist(tmp_path_factory):
-    """A six-joint arm with a differential at its last two joints: its module and the loaded arm."""
+    """Return a module and the loaded arm: six joints, with a differential at the last two."""
     folder = tmp_path_factory.mktemp("wrist")
     names = [f"j{k}" for k in range(1, 7)]
     shutil.copy(ROBOTS / "six_dof.urdf", folder / "arm.urdf")
@@ -54,7 +56,7 @@ def wrist(tmp_path_factory):
 
 
 def moved(model, seconds, seed=0):
-    """Samples of a smooth motion with the torque of the URDF's bodies, and of friction and rotors on the motors."""
+    """Return q, qd, qdd and torque of a smooth motion: rigid bodies, and friction and rotors at the motors."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 0.01)[:, None, None]
     speed, phase, size = (rng.uniform(*x, (4, 6)) for x in ((0.7, 4.0), (0.0, 6.3), (0.2, 0.5)))
     q, qd, qdd = ((size * speed**k * np.sin(speed * t + phase + k * np.pi / 2)).sum(axis=1) for k in range(3))
@@ -62,7 +64,7 @@ def moved(model, seconds, seed=0):
 
 
 def on_motors(q, qd, qdd, arm, strength, armature):
-    """The motors' torques, (T, 6)."""
+    """Return the joint torques (T, 6) of friction and rotors that act at the speeds of the motors."""
     speeds = np.eye(6)
     speeds[4:, 4:] = SPEEDS
     at_motors = strength * np.tanh(qd @ speeds.T / 0.01) + 0.3 * strength * (qd @ speeds.T)
@@ -72,7 +74,7 @@ def on_motors(q, qd, qdd, arm, strength, armature):
 
 
 def noisy(tau):
-    """Torques (T, 6) with 1 % of noise, with which a fit takes a seventh of the time that it takes without noise."""
+    """Return torques (T, 6) with noise of 1 %; without noise a fit would take seven times as long."""
     return tau + 0.01 * tau.std(axis=0) * np.random.default_rng(2).standard_normal(tau.shape)
 
 
@@ -121,8 +123,8 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     assert (np.square(found - tau).mean(axis=0) / tau.var(axis=0)).max() < 2e-3
 
 
-def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
-    """Slopes by every weight against finite differences."""
+def test_derivatives_are_right_for_coupled_motors(wrist):
+    """With coupled motors, derivatives of the fit with respect to every parameter equal finite differences."""
     module, arm = wrist
     motion = [x[::40] for x in moved(module, 4.0)]
     _, tau = on_motors(*motion, arm, np.ones(6), np.ones(6))
@@ -145,7 +147,10 @@ def test_the_fit_knows_that_a_motor_moves_both_joints(wrist):
 
 
 def test_energy_and_memory_are_those_of_the_motors(wrist):
-    """Power of friction is qd^T D qd; bristles follow the motors, in the model as along logs; M has C^T A C."""
+    """Dissipation, bristles and rotors act at motor speeds: power is qd^T D qd, and M contains C^T A C.
+
+    C: motor speeds per joint speed. A: diagonal matrix of the armatures. D: dissipation matrix.
+    """
     module, _ = wrist
     model = module.Model()
     with torch.no_grad():
@@ -164,7 +169,10 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
 
 
 def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
-    """Friction and rotors belong to the motors in least squares, in the emitted module and in reports."""
+    """Where torques are logged at the joints, friction and rotors still act at the motors.
+
+    This holds in least squares, in the emitted module and in reports.
+    """
     _, driven = wrist
     names = [x.name for x in driven.chain.coordinates]
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
@@ -189,7 +197,10 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
 
 
 def recorded(arm, logged_at, ratio, late=0.0):
-    """20 s of a six-joint arm whose sixth motor turns `ratio` times with the fifth joint too, torques 2 % noisy."""
+    """Return a log of 20 s of a six-joint arm whose motor 6 turns with joint 6 and `ratio` times joint 5, 2 % noise.
+
+    logged_at: "joints" or "motors", at which the torques are logged. late: delay of the torques [s].
+    """
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 20.0, 0.01)
     q, qd, qdd = moved(None, 20.0, seed=3)
@@ -250,7 +261,8 @@ def test_logs_show_torques_that_are_late_or_early(uncoupled, tmp_path, late):
     moved = identify(uncoupled, log)
     assert moved.torque_delay.delay == pytest.approx(late, abs=moved.torque_delay.interval + 1e-4)
     for aligned in (identify(uncoupled, read), moved):
-        assert aligned.nmse.mean() < 0.7 * as_logged.nmse.mean()  # noise is the rest
+        # the error of torques without correction of the delay is larger, not only noise
+        assert aligned.nmse.mean() < 0.7 * as_logged.nmse.mean()
 
 
 @pytest.mark.usefixtures("coarse_validation")
@@ -266,7 +278,10 @@ def test_a_fit_moves_late_torques_and_its_evaluation_too(uncoupled):
 
 
 def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
-    """Least squares without the coupling finds 5.7 ms of 10, and calls them sure: `logs` suggests neither."""
+    """With a coupling that the settings do not state, no torque delay is estimated, since it would be wrong.
+
+    Least squares without the coupling would find 5.7 ms instead of 10 ms, with an interval that excludes 10 ms.
+    """
     log = recorded(uncoupled, "joints", 1.0, late=0.01)
     assert not told(check_logs([log], uncoupled), "torque-delay")
     identified = identify(uncoupled, log)
@@ -280,7 +295,7 @@ def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
 
 @pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
-    """The fit is the one of an arm whose settings state the coupling, and so are its run and its delay."""
+    """A fit finds the coupling in the logs: it equals the fit of an arm whose settings state the coupling."""
     log, names = recorded(uncoupled, "joints", 1.0, late=0.01), uncoupled.chain.joint_names
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
     setting = f"couplings: [{{joints: [{names[4]}, {names[5]}], matrix: [[1, 1], [0, 1]]}}]\n"
@@ -297,7 +312,10 @@ def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
 
 
 def test_a_coupling_that_goes_with_the_delay_is_a_delay(uncoupled, monkeypatch):
-    """Number 160 of `benchmarks/truth.py`: 5 ms of delay of an arm without friction resemble a coupling."""
+    """A coupling whose evidence vanishes after a correction of the torque delay is not reported: the delay is.
+
+    The case is number 160 of `benchmarks/truth.py`: an arm without friction, with a delay of 5 ms.
+    """
     coupling = Coupling(5, 4, 1.0, "joints")
 
     def only_as_logged(problem):
@@ -317,7 +335,7 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
 
 
 def trained_gains(tmp_path, names, gear=1):
-    """A closed-form model of six_dof.urdf in which all gains are trained, from `gear` on."""
+    """Return a closed-form model of six_dof.urdf with trained motor gains, initially `gear`."""
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
     joints = ", ".join(f"{x}: {{gear: {gear}, gain: trained}}" for x in names)
     (tmp_path / "arm.yaml").write_text(f"torque: motor\njoints: {{{joints}}}\n", encoding="utf-8")
@@ -325,7 +343,7 @@ def trained_gains(tmp_path, names, gear=1):
 
 
 def test_gains_of_currents_are_found(uncoupled, tmp_path):
-    """Torques logged in one unit per joint: the gains are estimated together with bodies, friction and rotors."""
+    """If each joint's torques are logged in a unit of their own, gains are estimated with all other parameters."""
     gains = np.array([1.5, 0.7, 1.3, 0.8, 1.2, 0.9])
     logs = [recorded(uncoupled, "joints", 0.0)]
     model = trained_gains(tmp_path, uncoupled.chain.joint_names)
@@ -334,11 +352,14 @@ def test_gains_of_currents_are_found(uncoupled, tmp_path):
     with torch.no_grad():
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
     np.testing.assert_allclose(found / gains, 1.0, atol=0.15)
-    assert np.abs(np.log(found)).max() > 0.2  # they did not stay where they started
+    assert np.abs(np.log(found)).max() > 0.2  # the estimated gains are not their initial values of 1
 
 
 def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
-    """Gains of 40 Nm/A in place of 1; joint 1 is at rest and has the median of the others, joint 6 has 1.2."""
+    """Initial gains of 1 are replaced if the torques show gains near 40.
+
+    Joint 1 is at rest and gets the median of the other gains; joint 6, whose gain is 1.2, keeps its initial 1.
+    """
     gains = np.array([40.0, 42.0, 36.0, 44.0, 40.0, 1.2])
     log = recorded(uncoupled, "joints", 0.0)
     model = trained_gains(tmp_path, uncoupled.chain.joint_names)
@@ -350,14 +371,14 @@ def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
     set_initial_gains(model, samples, 0.3)
     with torch.no_grad():
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
-    # the masses of the URDF are not the robot's
+    # wide bounds, as the masses of the URDF are not the robot's
     np.testing.assert_allclose(found[1:5] / gains[1:5], 1.0, atol=0.35)
     assert found[0] == pytest.approx(np.median(found[1:5]), rel=0.3)
     assert found[5] == 1.0
 
 
 def test_initial_gains_that_are_right_are_kept(uncoupled, tmp_path):
-    """The slope is computed from joint torques: `gear` is not applied a second time."""
+    """Initial gains that agree with the torques are kept: `gear` is not applied twice."""
     model = trained_gains(tmp_path, uncoupled.chain.joint_names, gear=40)
     log = recorded(uncoupled, "joints", 0.0)
     (samples,) = dynamics_samples([replace(log, tau=log.tau / 40.0)])

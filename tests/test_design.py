@@ -1,4 +1,4 @@
-"""Each combination of design options is a model that works, or is refused with the two options in conflict."""
+"""Each combination of design options gives a working model, or is refused with the two options in conflict."""
 
 import itertools
 from dataclasses import asdict, replace
@@ -30,7 +30,7 @@ def made(values):
         return None
 
 
-def test_what_is_refused_names_the_two_options():
+def test_a_refused_combination_names_the_two_options():
     refused = [values for values in COMBINATIONS if made(values) is None]
     for values in refused:
         with pytest.raises(SpelgenError) as error:
@@ -40,7 +40,7 @@ def test_what_is_refused_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    # 96 of networks only; rigid bodies with friction state and without, with residual networks and without
+    # accepted: 96 combinations of networks only, and rigid bodies with or without friction state and networks
     assert len(COMBINATIONS) - len(refused) == 96 + 2 * 2
 
 
@@ -77,7 +77,8 @@ def test_a_preset_of_your_own(rpr, robots, tmp_path, monkeypatch):
     options = load_module(source).spec.options
     assert (options.preset, options.design.dissipation) == ("mine", "dense-3n")
     (tmp_path / "module.py").write_text(source, encoding="utf-8")
-    (tmp_path / "mine.yaml").unlink()  # the module knows how it was made
+    # the module states its own design, so that the file of the preset is not needed
+    (tmp_path / "mine.yaml").unlink()
     assert check(tmp_path / "module.py", robots / "rpr.urdf").reasons == ()
 
 
@@ -105,7 +106,7 @@ def test_a_wrong_preset_is_reported_with_its_line(tmp_path, monkeypatch, change,
     assert str(error.value).splitlines()[0] == message
 
 
-def test_no_preset_at_all():
+def test_an_unknown_preset_names_the_presets():
     with pytest.raises(SettingsError) as error:
         load_design("minmal")
     expected = "hybrid, closed-form, minimal, spel, spel-kan, phnode, or a YAML file"

@@ -35,9 +35,8 @@ HISTORY = re.compile(
     r"|earlier release|not taken|was tried)\b",
     re.IGNORECASE,
 )
-SLOW = {"tutorial_servo.md"}  # a fit of half a minute: only `pytest --update` runs it
-# Without the rows of the table of control.md that it does not assert, with shorter motions, above all without an
-# estimator.
+SLOW = {"tutorial_servo.md"}  # a fit takes half a minute: only `pytest --update` runs the page
+# replacements in the code of pages, to shorten their runs: fewer rows of a table, shorter motions, no estimator
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
@@ -52,7 +51,7 @@ TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_examples(page, tmp_path, monkeypatch, request):
     shutil.copytree(ROOT / "robots", tmp_path / "robots")
-    if page in TUTORIALS:  # as a notebook that is opened in docs/
+    if page in TUTORIALS:  # the working folder is docs/, as for a notebook that is opened there
         shutil.copytree(ROOT / "docs", tmp_path / "docs")
     folder = tmp_path / "docs" if page in TUTORIALS else tmp_path
     files = tree(tmp_path)
@@ -81,12 +80,12 @@ def test_examples(page, tmp_path, monkeypatch, request):
 
 
 def tree(folder: Path) -> dict[Path, bytes]:
-    """The files in a folder with their contents."""
+    """Return the contents of the files in a folder, by path."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def cell(text: str, block: str, output: str = "") -> str:
-    """The block with its output: from the text if it is there, or else the correct one."""
+    """Return a block of code with its output: the one in the text, if the text has this block, else the actual one."""
     for match in CELL.finditer(text):
         if match[1] == block:
             return match[0]
@@ -94,7 +93,7 @@ def cell(text: str, block: str, output: str = "") -> str:
 
 
 def notebook(page: Path) -> str:
-    """The page as a notebook: prose as Markdown cells, blocks with their outputs as code cells."""
+    """Return the notebook of a page: prose as Markdown cells, blocks with their outputs as code cells."""
     text, cells, end = page.read_text(encoding="utf-8"), [], 0
     for match in CELL.finditer(text):
         cells.append({"cell_type": "markdown", "source": text[end : match.start()].strip()})
@@ -127,7 +126,7 @@ def test_the_tables_of_settings_are_up_to_date(path, request):
 
 
 def run_commands(block: str, folder: Path) -> str:
-    """The correct block: each command with its output."""
+    """Run the commands of a console block; return the block with the actual output of each command."""
     told = []
     for command in re.findall(r"^\$ (.*)$", block, re.MULTILINE):
         program, *arguments = shlex.split(command)
@@ -138,7 +137,7 @@ def run_commands(block: str, folder: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors of a page's headings, as both MkDocs and GitHub make them of plain words."""
+    """Return the anchors of a page's headings, which MkDocs and GitHub make in the same way of plain words."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
 
@@ -156,7 +155,7 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_is_short_and_has_no_history(page):
-    """A page has at most 2,500 words; former versions and trials are described in docs/decisions.md only."""
+    """A page has at most 2,500 words, and only docs/decisions.md describes former versions and trials."""
     text = page.read_text(encoding="utf-8")
     assert len(text.split()) <= 2500
     if page.name != "decisions.md":
@@ -174,12 +173,12 @@ def test_files_that_are_named_exist(page):
         assert any((folder / name).exists() for folder in (ROOT, ROOT / "spelgen")), name
 
 
-# Position of the code among the arguments of functions that make messages.
+# position of the code among the arguments of functions that make messages
 CODE_ARGUMENTS = {"Diagnostic": 1, "warn": 1, "Check": 0, "_warning": 0, "_note": 0, "_remark": 0}
 
 
 def codes_of_messages() -> set[str]:
-    """The codes of all remarks, warnings and accepted errors in the source text of the package."""
+    """Return the codes of all remarks, warnings and accepted errors that the source text of the package contains."""
     constants: dict[str, ast.expr] = {}
     codes = set(get_args(Accepted))
     for path in sorted((ROOT / "spelgen").rglob("*.py")):
@@ -195,14 +194,14 @@ def codes_of_messages() -> set[str]:
                 place = CODE_ARGUMENTS.get(getattr(node.func, "attr", getattr(node.func, "id", "")))
                 found += [] if place is None else node.args[place : place + 1]
             elif isinstance(node, ast.Yield) and len(getattr(node.value, "elts", ())) == 4:
-                found += node.value.elts[:1]  # findings of spelgen/urdf/lint.py
+                found += node.value.elts[:1]  # codes of findings of spelgen/urdf/lint.py
         resolved = [constants.get(x.id, x) if isinstance(x, ast.Name) else x for x in found]
         codes |= {x.value for x in resolved if isinstance(x, ast.Constant) and isinstance(x.value, str)}
     return codes
 
 
 def test_every_code_is_explained_once():
-    """Each code of a message is in one row of docs/messages.md, and each code of this page exists."""
+    """Each code of a message has one row in docs/messages.md, and each code on this page exists."""
     page = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
     explained = Counter(code for row in rows for code in re.findall(r"`([a-z-]+)`", row))

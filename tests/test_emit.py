@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).parent / "golden"
 PRESETS = get_args(Preset)
 FORMS = pytest.mark.parametrize("standalone", [False, True], ids=["thin", "standalone"])
 
-# The part of torch that emitted modules use: all of it would take mypy many times as long, for the same types.
+# mypy follows only the part of torch that emitted modules use: all of torch would take many times as long
 MYPY = """[mypy]
 strict = True
 [mypy-torch.*,numpy.*,sympy.*]
@@ -46,7 +46,7 @@ def test_golden_text(robot, preset, request):
 
 
 def test_a_standalone_module_contains_the_text_of_the_thin_one(tmp_path):
-    """The arm, its model and the specification are the same lines in both forms, in the same order."""
+    """The lines of the arm, its model and the specification are equal in the thin and the standalone form."""
     for preset in PRESETS:
         thin, standalone = (built("rpr", preset=preset, standalone=x)[0] for x in (False, True))
         arm, model = thin.split("\n\n\nclass Model(")
@@ -78,7 +78,7 @@ def test_same_bytes_under_any_hash_seed_and_from_any_folder(tmp_path):
     assert len(texts) == 1
 
 
-def test_emitted_code_is_held_to_the_rules_of_written_code(tmp_path):
+def test_emitted_code_follows_the_rules_of_written_code(tmp_path):
     for robot, preset in [
         *(("rpr", preset) for preset in PRESETS),
         ("panda", "hybrid"),
@@ -131,7 +131,7 @@ HOSTILE = [
 
 @FORMS
 def test_no_text_of_the_urdf_becomes_code(tmp_path, standalone):
-    """With hostile names the syntax tree equals the tree for plain names, except for string constants."""
+    """Names in a URDF cannot become code: hostile names change only string constants of the module's syntax tree."""
     from xml.sax.saxutils import quoteattr
 
     def written(robot, names, file):

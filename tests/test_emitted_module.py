@@ -33,15 +33,16 @@ COUNT = 10_000 if MINUTES else 500
 
 
 def states(n: int, count: int, seed: int = 0) -> list[torch.Tensor]:
-    """Random q, qd, qdd and tau."""
+    """Return random q, qd, qdd and tau, (count, n) each."""
     generator = torch.Generator().manual_seed(seed)
     return [2 * torch.randn(count, n, dtype=torch.float64, generator=generator) for _ in range(4)]
 
 
 @pytest.mark.parametrize("robot", SIX)
 def test_exact_parameters_reproduce_pinocchio(robot, tmp_path):
-    """With exact functions for networks: M, gravity, forward and inverse dynamics to 1e-10, on Pinocchio's
-    own reading of the URDF.
+    """With exact functions in place of networks, M, gravity, forward and inverse dynamics equal Pinocchio's to 1e-10.
+
+    Pinocchio reads the URDF itself.
     """
     model = exact_model(robot, tmp_path)
     reference = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
@@ -70,7 +71,7 @@ def test_exact_parameters_reproduce_pinocchio(robot, tmp_path):
 
 @pytest.mark.parametrize("robot", SIX)
 def test_mass_matrix_is_positive_definite_for_any_weights(robot, tmp_path):
-    """For 100 draws of all weights, constants included, with standard deviation 30; COUNT random q each."""
+    """M is positive definite for 100 random draws of all parameters (standard deviation 30), at COUNT random q each."""
     model = random_model(robot, tmp_path, seed=0, design=NETWORKS)
     generator = torch.Generator().manual_seed(0)
     needed = 0
@@ -105,7 +106,7 @@ def test_the_bound_keeps_zeros_and_relations_and_is_inactive_at_nominal_values(r
 
 @pytest.mark.parametrize("robot", SIX)
 def test_network_outputs_depend_only_on_their_own_joints(robot, tmp_path):
-    """An output is unchanged to the bit when other joints move, and changes with its own joints."""
+    """A network output depends on its own joints; it is bitwise unchanged if other joints move."""
     model = random_model(robot, tmp_path, seed=2)
     q = states(model.n, 50)[0]
     network = model.residuals.mass
@@ -120,10 +121,11 @@ def test_network_outputs_depend_only_on_their_own_joints(robot, tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "ur10e"])
 def test_energy_is_conserved_without_input_and_dissipation(robot, tmp_path):
-    """Random weights, Runge-Kutta with 1.6 ms over 2 s: relative drift of H below 1e-8."""
+    """Without input and dissipation, H drifts by less than 1e-8 in 2 s of Runge-Kutta steps of 1.6 ms."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
     for weight in model.residuals.parameters(recurse=False):
-        weight.data.zero_()  # ripple of 66 waves in a turn takes shorter steps
+        # torque ripple of 66 periods per revolution is removed, as it would need shorter steps
+        weight.data.zero_()
     at, qd, _, _ = (0.25 * x for x in states(model.n, 4))
     with torch.no_grad():
         prepared, q, p = model.prepare(), at, model.momentum(at, qd)
@@ -164,7 +166,7 @@ def test_the_input_is_added_to_the_rate_of_momentum(tmp_path):
 
 
 def test_arm_with_a_constant_mass_matrix(tmp_path):
-    """A turning and a sliding joint on one axis: no output, two constants, still a whole model."""
+    """A turning and a sliding joint on one axis have a constant M: no network output, two constants, a whole model."""
     urdf = tmp_path / "rp.urdf"
     link = (
         '<link name="{}"><inertial><mass value="1"/>'
@@ -194,7 +196,7 @@ def test_arm_with_a_constant_mass_matrix(tmp_path):
 
 
 def test_a_standalone_module_imports_only_torch(tmp_path):
-    """Each preset, standalone, runs in a process that can import neither spelgen nor its dependencies except torch."""
+    """Standalone modules of all presets run in a process that can import torch, but no other package and no spelgen."""
     names = [preset.replace("-", "_") for preset in PRESET_NAMES]
     for name, preset in zip(names, PRESET_NAMES, strict=True):
         (tmp_path / f"panda_{name}.py").write_text(built("panda", preset=preset, standalone=True)[0])

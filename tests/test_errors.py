@@ -1,4 +1,4 @@
-"""The text of errors and diagnostics: file, line, element, got, expected, remedy."""
+"""Errors and diagnostics state file, line, element, the value found, the value expected, and advice."""
 
 import json
 import pickle
@@ -74,7 +74,7 @@ def test_a_diagnostic_is_the_public_json_object():
 
 
 def test_an_error_of_several_files_is_reported_once():
-    """A hundred logs without the same column are one thing to mend."""
+    """Equal errors of several files are one message that lists the files."""
     lacking = [LogError("3 columns", file=f"{k}.csv", expected="4") for k in range(9)]
     told = str(SpelgenErrors([*lacking, LogError("another", file="0.csv")]))
     assert told.splitlines() == [
@@ -94,6 +94,6 @@ def test_an_error_of_several_files_is_reported_once():
     ids=lambda error: type(error).__name__,
 )
 def test_a_copy_of_an_error_is_the_same_error(error):
-    """Ray copies the errors of its workers."""
+    """A pickled and unpickled error has the same type and text, as Ray copies the errors of its workers."""
     copied = pickle.loads(pickle.dumps(error))
     assert (type(copied), str(copied)) == (type(error), str(error))

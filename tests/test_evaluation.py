@@ -1,4 +1,4 @@
-"""Errors of an evaluation equal the errors of exact solutions; baselines are exact; results are valid JSON."""
+"""Errors of an evaluation equal the errors of exact solutions, baselines are exact, and results are valid JSON."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ UR10E = [
     f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
 
-# A slider of 3 kg that carries a pendulum of 2 kg at 0.5 m, with 0.1 kg m^2 about its centre; both damped.
+# a slider of 3 kg with a pendulum of 2 kg at 0.5 m, whose inertia about its centre is 0.1 kg m^2; both have damping
 CART = """<robot name="cart">
   <link name="rail"/>
   <joint name="swing" type="continuous"><parent link="cart"/><child link="rod"/><axis xyz="0 -1 0"/>
@@ -69,7 +69,10 @@ def draw(*shape, seed=0) -> torch.Tensor:
 
 
 def cart_torque(q, qd, qdd):
-    """Inverse dynamics of the cart by hand; x = s + 0.5 sin a, z = -0.5 cos a; joints (slide, swing)."""
+    """Return the inverse dynamics of the cart, derived by hand, (T, 2) [N, Nm]; joints: slide s and swing a.
+
+    The pendulum's centre of mass is at x = s + 0.5 sin a, z = -0.5 cos a.
+    """
     a, length, m, inertia, g = q[:, 1], 0.5, 2.0, 0.1, 9.81
     push, turn = m * length * a.cos(), m * length * a.sin()
     slide = (3 + m) * qdd[:, 0] + push * qdd[:, 1] - turn * qd[:, 1] ** 2 + 0.7 * qd[:, 0]
@@ -140,7 +143,7 @@ def test_constant_velocity_is_exact_without_acceleration():
 
 
 def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
-    """Trajectories of a model under random held torques."""
+    """Return trajectories of a model under random torques that are constant between samples."""
     random = torch.Generator().manual_seed(seed)
     start = 2 * torch.rand(count, model.n, generator=random, dtype=torch.float64) - 1
     tau = torch.randint(-2, 3, (count, samples, model.n), generator=random).double()
@@ -154,7 +157,7 @@ def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """A run whose best model is the one that made the logs."""
+    """Return the folder of a run whose trained model is the one that made the logs."""
     folder = tmp_path_factory.mktemp("run")
     module = write_module(folder)
     model = load_module(module)
@@ -169,10 +172,11 @@ def evaluated(run, logs, **options):
     return evaluate(run, read_test_logs(run, [logs]), **options)
 
 
-def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
+def test_the_true_model_has_no_error_and_its_baseline_has(run):
     result = evaluated(run, run.parent / "logs")
     assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
-        ("1 step", 1, 4 * 22),  # after two steps of the past
+        # windows begin two samples before a prediction, for predictors that use earlier samples
+        ("1 step", 1, 4 * 22),
         ("10 steps", 10, 4 * 13),
         ("1 s", 20, 4 * 3),
     ]
@@ -181,7 +185,8 @@ def test_the_true_model_is_perfect_and_its_baseline_is_not(run):
         assert horizon.errors["model"].mean_relative_rms < 1e-4
         assert horizon.errors["velocity stays constant"].mean_relative_rms > 0.3
     assert result.parameters == sum(x.numel() for x in load_run(run).model.parameters())
-    assert result.torque == {}  # 20 Hz is too sparse for accelerations
+    # torques are not evaluated at 20 Hz, at which accelerations cannot be computed
+    assert result.torque == {}
 
 
 def test_without_rollouts_logs_too_sparse_for_torques_are_an_error(run):
@@ -196,7 +201,8 @@ def test_errors_are_those_of_the_last_sample(run):
     )
     assert told == [(0, 1, "predicting 3 steps ahead")]
     windows = cut_windows(read_logs([run.parent / "logs"], JOINTS, role="test"), 6, measured=False)
-    error = windows.qd[:, 2] - windows.qd[:, 5]  # after two steps for the observer
+    # predictions start at the third sample, since the observer uses the first two
+    error = windows.qd[:, 2] - windows.qd[:, 5]
     found = result.horizons[0].errors["velocity stays constant"]
     np.testing.assert_allclose(found.qd, error.square().mean(dim=0).sqrt(), rtol=1e-12)
     np.testing.assert_allclose(found.qd_relative_rms, [1.0, 1.0], rtol=1e-12)
@@ -220,7 +226,16 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert shown[0]["error"] <= shown[1]["error"]
 
 
-def test_what_could_not_be_done_is_said(run):
+def test_predicted_windows_start_at_a_time_of_the_log(run):
+    logs = read_logs([run.parent / "logs"], JOINTS, role="test")
+    logs = [replace(log, t=log.t + 100.0) for log in logs]
+    for shown in evaluate(run, logs).traces.trajectories:
+        log = next(log for log in logs if log.name == shown.trajectory)
+        np.testing.assert_allclose(shown.q[0], log.q[np.abs(log.t - shown.start).argmin()], atol=1e-4)
+        assert shown.start >= 100.0
+
+
+def test_parts_of_an_evaluation_that_are_omitted_are_stated(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
         "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
@@ -232,13 +247,13 @@ def test_what_could_not_be_done_is_said(run):
     }
 
 
-def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
+def test_a_diverging_model_has_errors_of_null(run, tmp_path):
     weights = torch.load(run / "model.pt", weights_only=True)
     copy = tmp_path / "run"
     copy.mkdir()
     for path in run.iterdir():
         (copy / path.name).write_bytes(path.read_bytes())
-    # a gravity of 1e12 Nm; damping of any size is integrated
+    # the network of V gives gravity torques of about 1e12 Nm, so that the rollout diverges
     name = "potential.weights.1"
     torch.save(weights | {name: torch.full_like(weights[name], 1e12)}, copy / "model.pt")
     result = evaluated(copy, run.parent / "logs")
@@ -247,7 +262,7 @@ def test_a_model_that_runs_away_has_no_error_but_null(run, tmp_path):
     assert "NaN" not in json.dumps(result.to_dict())
 
 
-def test_what_is_no_run_is_refused(run, tmp_path):
+def test_a_folder_that_is_no_run_is_refused(run, tmp_path):
     with pytest.raises(RunError) as caught:
         evaluate(tmp_path / "none", [])
     assert str(caught.value) == (
@@ -259,7 +274,7 @@ def test_what_is_no_run_is_refused(run, tmp_path):
 
 @pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
-    """End to end on a URDF: its own dynamics made the logs, so the URDF baseline is perfect."""
+    """The URDF's dynamics made the logs, so the errors of the URDF baseline are zero, in torque and at the tip."""
     module = cart.with_name("cart_model.py")
     module.write_text(generate(cart))
     names = load_module(module).joint_names
@@ -279,7 +294,10 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
-    """No run, no file of logs: an arm, arrays, and other dynamics; the filter reaches torques too."""
+    """A model in memory is evaluated on arrays and compared with other dynamics, without a run folder or files.
+
+    The low-pass filter of the evaluation applies to torques too.
+    """
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
     logs = motions(dynamics, count=2, samples=130, rate=100.0)
@@ -302,7 +320,10 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
 
 
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
-    """The pendulum follows the slider: its own dynamics made the logs, in single precision the model is judged too."""
+    """An arm with a mimic joint has baselines, tip errors and predictions, also in single precision.
+
+    Its URDF's dynamics made the logs: the pendulum mimics the slider.
+    """
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))
     arm = load_arm(cart)
@@ -343,7 +364,7 @@ def moving(samples=600, rate=100.0, still=0) -> Trajectory:
 
 
 class Torques:
-    """Dynamics that have torques only."""
+    """Dynamics of which only inverse dynamics are known."""
 
     def __init__(self, inverse_dynamics):
         self.inverse_dynamics = inverse_dynamics
@@ -352,13 +373,15 @@ class Torques:
 def test_torque_errors_by_the_protocol():
     (samples,) = dynamics_samples([moving()])
     exact = torque_errors(Torques(lambda q, qd, qdd: torch.stack([qdd[:, 0], 0 * qdd[:, 1]], -1)), [samples])
-    assert exact.joint_nmse[0] < 1e-3  # the ends of the filter remain
-    assert exact.joint_nmse[1] is None  # a torque that never varies has nothing to explain
+    # not exactly zero, because of errors of the filter at the ends of the log
+    assert exact.joint_nmse[0] < 1e-3
+    assert exact.joint_nmse[1] is None  # nMSE is undefined for a torque that never varies
     tau = torch.from_numpy(samples.tau)
     offset = torque_errors(Torques(lambda q, qd, qdd: tau + torch.tensor([1.0, 2.0])), [samples])
     np.testing.assert_allclose(offset.rmse, [1.0, 2.0], rtol=1e-12)
     np.testing.assert_allclose(offset.joint_nmse[0], 1 / samples.tau[:, 0].var(), rtol=1e-12)
-    constant = np.where(samples.tau[:, :1] > 0, 0.1 + 0.2, 0.3)  # with rounding
+    # the torque of joint 2 is constant up to rounding
+    constant = np.where(samples.tau[:, :1] > 0, 0.1 + 0.2, 0.3)
     rounded = replace(samples, tau=np.concatenate([samples.tau[:, :1], constant], axis=1))
     assert torque_errors(Torques(lambda q, qd, qdd: tau), [rounded]).joint_nmse == (0.0, None)
     infinite = torque_errors(Torques(lambda q, qd, qdd: tau / 0), [samples])
@@ -366,12 +389,15 @@ def test_torque_errors_by_the_protocol():
 
 
 def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
-    """A short log that hardly varies has a large nMSE of its own, and weighs no more than its samples."""
+    """Torque errors are pooled over all samples of all logs, once with pauses and once without.
+
+    A short log whose torque hardly varies, with a large nMSE of its own, has a weight by its number of samples.
+    """
     random = np.random.default_rng(0)
     samples = []
     for name, count, size in (("long", 400, 10.0), ("short", 50, 0.1)):
         motion = random.standard_normal((count, 2))
-        motion[: count // 5] = 0.001  # at rest
+        motion[: count // 5] = 0.001  # the first fifth of each log is at rest
         tau = size * random.standard_normal((count, 2))
         samples.append(DynamicsSamples(name, motion, motion, motion, tau))
     found = torque_errors(Torques(lambda q, qd, qdd: torch.zeros_like(q) + 0.2), samples)
@@ -386,11 +412,11 @@ def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
 
 
 def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
-    """A joint without memory turns its friction around at once; the filter of the logs makes that a slope."""
+    """Predicted torques of dry friction, which reverses in a step, pass the same filter as the logged torque."""
     model = build(robots / "two_link.urdf", preset="closed-form")
     model.friction.memoryless.fill_(1.0)
     with torch.no_grad():
-        model.friction.raw_coulomb += 1.0  # so that steps are most of the torque
+        model.friction.raw_coulomb += 1.0  # more Coulomb friction, so that steps are most of the torque
     t = np.arange(2000) / 200
     frequencies = 2 * np.pi * np.array([0.4, 0.7])
     phase = frequencies * t[:, None]
@@ -399,7 +425,8 @@ def test_steps_of_dry_friction_are_filtered_as_the_torque_is(robots):
         tau = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
     samples = dynamics_samples([Trajectory(t, q, qd, tau)], reach=bristle_reach(model))
     error = torque_errors(model, samples).mean_nmse
-    assert error < 2e-6  # 8e-7; steps that are taken at 100 Hz, not at the times of the log, leave 5e-6
+    # the error is 8e-7; if friction reversed at samples of 100 Hz instead of the log's times it would be 5e-6
+    assert error < 2e-6
     unfiltered = [replace(x, direction=None) for x in samples]
     assert torque_errors(model, unfiltered).mean_nmse > 10 * error
 
@@ -420,7 +447,7 @@ def test_only_moving_samples_of_dense_logs_count():
 
 
 def test_the_ur10e_urdf_has_its_known_torque_error(shared):
-    """The mean nMSE of the bare URDF over the nine test trajectories, computed independently: 0.67."""
+    """The mean nMSE of the UR10e's URDF over nine test trajectories is 0.67, as computed independently."""
     pytest.importorskip("pinocchio")
     folder = shared / "logs" / "ur10e"
     trained = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
@@ -446,6 +473,6 @@ def test_logs_that_never_move_have_no_torque_errors(robots):
     assert found.horizons
 
 
-def test_what_diverged_keeps_its_column():
+def test_a_diverged_predictor_keeps_its_column():
     text = table("Prediction loss", {"seed 0": {"phnode": None, "spel": 1.0}}).text()
     assert "phnode" in text and text.splitlines()[-1].split() == ["seed", "0", "-", "1", "*"]

@@ -1,4 +1,4 @@
-"""A torque fit is sure of no more than its samples support: noise, prior widths, residual terms, few data."""
+"""Torque fits state no more certainty than their samples support: noise, prior widths, residual terms, few data."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from spelgen.settings.fits import GaussianPrior
 
 
 class Unabsorbed:
-    """Rigid bodies and a friction model that absorb none of an added torque."""
+    """Projection of a model whose rigid bodies and friction can absorb no added torque."""
 
     @staticmethod
     def orthogonalize(joint, torque):
@@ -38,7 +38,10 @@ class Unabsorbed:
 
 
 def recording(model, name: str, seconds: float, seed: int, correlation: float = 0.0) -> DynamicsSamples:
-    """A smooth motion with the model's torque and 2 % noise: white, or autoregressive with this coefficient."""
+    """Return samples of a smooth motion with a model's torque and 2 % noise.
+
+    correlation: coefficient of the autoregressive noise; 0: white.
+    """
     rng = np.random.default_rng(seed)
     q, qd, qdd = smooth_motion(model.n, seconds, rng)
     with torch.no_grad():
@@ -48,11 +51,14 @@ def recording(model, name: str, seconds: float, seed: int, correlation: float = 
 
 
 @pytest.mark.parametrize("coefficient", [0.0, 0.8])
-def test_errors_are_as_correlated_as_the_noise(coefficient):
-    """The residual of a fit of 60 parameters is less correlated, and smaller, than the noise."""
+def test_the_correlation_of_the_noise_is_restored(coefficient):
+    """`RigidProjection.errors` restores the correlation time of the noise from the residual of a fit.
+
+    The residual of a fit of 60 parameters is itself smaller and less correlated than the noise.
+    """
     rng, count, joints = np.random.default_rng(0), 1000, 8
     noise = lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0)
-    # smooth regressors, as of an arm
+    # regressor columns that vary slowly, as the ones of an arm do
     smooth = [lfilter([1.0], [1.0, -0.97], rng.normal(size=(count, 60)), axis=0) for _ in range(joints)]
     jacobian = tuple(map(torch.from_numpy, smooth))
     gain = tuple(torch.linalg.inv(x.mT @ x) for x in jacobian)
@@ -72,7 +78,7 @@ def test_errors_are_as_correlated_as_the_noise(coefficient):
 
 
 def test_the_fit_finds_whether_errors_are_correlated(robots):
-    """White noise of 100 Hz, and noise with an integrated correlation time of 0.4 s, on the same arm."""
+    """A fit distinguishes white noise at 100 Hz from noise with an integrated correlation time of 0.4 s."""
     found = {}
     for coefficient in (0.0, 0.95):
         model = build(robots / "two_link.urdf", "closed-form")
@@ -83,7 +89,7 @@ def test_the_fit_finds_whether_errors_are_correlated(robots):
 
 
 def test_estimated_prior_widths_are_bounded(robots):
-    """Bodies that are wrong by a factor of e^40, as for torques of another unit, widen the prior to its bound only."""
+    """Bodies that are wrong by a factor of e^40, as of torques in another unit, widen the prior only to its bound."""
     rigid = ParameterVector(build(robots / "two_link.urdf", "closed-form"))
     widths = GaussianPrior()
     prior = ParameterPrior.of(rigid, widths)
@@ -113,7 +119,7 @@ def residual_of(torque: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
 
 @pytest.fixture
 def hybrid(robots):
-    """Two links with single-joint terms only."""
+    """Return a hybrid model of two links whose residual terms are functions of single joints."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     return model
@@ -121,7 +127,10 @@ def hybrid(robots):
 
 @pytest.mark.parametrize("other, selected", [(1.0, True), (-0.2, False)])
 def test_a_term_has_to_hold_in_the_recording_that_is_held_out(hybrid, other, selected):
-    """Both halves of the first recording support the term, and the second one has the opposite torque."""
+    """A residual term is selected only if it also lowers the error in a second, held-out recording.
+
+    Both halves of the first recording support the term; the second recording has the torque times `other`.
+    """
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     torque = torch.stack([torch.sin(2 * q[:, 0]), torch.zeros_like(t)], dim=1)
@@ -133,7 +142,7 @@ def test_a_term_has_to_hold_in_the_recording_that_is_held_out(hybrid, other, sel
 
 
 def test_one_recording_supports_only_a_part_of_the_torque(hybrid):
-    """The same torque of position, at a joint whose torque is five times as large, and nearly this torque only."""
+    """From one recording a residual term may explain only a limited fraction of a joint's torque; from three, any."""
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     samples = residual_of(torch.stack([torch.sin(2 * q[:, 0]), torch.zeros_like(t)], dim=1), q)
@@ -146,7 +155,7 @@ def test_one_recording_supports_only_a_part_of_the_torque(hybrid):
 
 
 def test_no_spring_from_one_recording_at_a_joint_without_load(robots):
-    """The first axis of the six-axis arm is vertical."""
+    """From one recording, no spring is selected at a joint without gravity load: here a vertical first axis."""
     model = build(robots / "six_dof.urdf", "hybrid", width=8)
     q = torch.from_numpy(smooth_motion(6, 10.0, np.random.default_rng(0))[0])
     with torch.no_grad():
@@ -157,7 +166,10 @@ def test_no_spring_from_one_recording_at_a_joint_without_load(robots):
 
 
 def test_ripple_has_frequencies_of_which_the_samples_contain_two_periods(hybrid):
-    """A range of 2 rad contains two periods of 7 per revolution (1.8 rad), but not of 6 (2.1 rad)."""
+    """Candidates of torque ripple have at least two periods in the range of the samples.
+
+    A range of 2 rad contains two periods of 7 per revolution (1.8 rad), but not of 6 (2.1 rad).
+    """
     from spelgen.fitting.torque.joint_functions import RIPPLE, joint_functions
 
     q = torch.stack([torch.linspace(-1, 1, 500).double(), torch.zeros(500).double()], dim=1)
@@ -169,7 +181,7 @@ def test_ripple_has_frequencies_of_which_the_samples_contain_two_periods(hybrid)
 
 
 def test_spring_extrapolates_to_positions_without_samples(hybrid):
-    """A linear spring with its neutral position at -0.3 rad is fitted from -0.5 to 0.5 rad."""
+    """A linear spring with zero torque at -0.3 rad, fitted from -0.5 to 0.5 rad, extrapolates to -1.5 and 1.5 rad."""
     from spelgen.fitting.torque.joint_functions import TORQUE, joint_functions
 
     q = torch.stack([torch.linspace(-0.5, 0.5, 500).double(), torch.zeros(500).double()], dim=1)
@@ -183,7 +195,7 @@ def test_spring_extrapolates_to_positions_without_samples(hybrid):
 
 
 def test_slow_passes_are_few_errors(hybrid):
-    """A joint that passes its range once has as many independent errors as the range has splines."""
+    """The errors of a joint that passes its range once are as few independent errors as the range has splines."""
     from spelgen.fitting.torque.joint_functions import joint_functions
 
     lengths = []
@@ -198,7 +210,10 @@ def test_slow_passes_are_few_errors(hybrid):
 
 
 def test_held_out_errors_are_those_of_fits_without_the_block(robots):
-    """Against a refit of the linearized problem without each half second, one after the other."""
+    """Held-out errors by the jackknife equal the errors of refits without each half second.
+
+    The refits solve the linearized problem.
+    """
     model = build(robots / "two_link.urdf", "closed-form")
     samples = TorqueSamples.of([recording(model, "x", 4.0, 0)], 2)
     estimate = initial_fit(TorqueProblem.of(TorqueJacobian(model, samples), GaussianPrior()))
@@ -220,7 +235,7 @@ def test_held_out_errors_are_those_of_fits_without_the_block(robots):
         weighted = rows[:, kept] / noise[:, None, None] ** 2
         curvature = torch.einsum("jtk,jtl->kl", weighted, rows[:, kept]) + precision
         gradient = torch.einsum("jtk,jt->k", weighted, residual[:, kept]) - precision @ offset
-        # the estimate is stationary to the tolerance of the solver: the step of the whole problem is subtracted
+        # the step of the whole problem is subtracted, since the estimate is stationary only to the solver's tolerance
         whole = torch.einsum("jtk,jt->k", rows / noise[:, None, None] ** 2, residual) - precision @ offset
         step = torch.linalg.solve(curvature, gradient - whole)
         expected.append((residual[:, ~kept] - rows[:, ~kept] @ step).square().sum(dim=1))
@@ -239,7 +254,10 @@ ARMS = {
 
 
 def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolution, set[str], list[str]]:
-    """Fit `closed-form` to the first seconds of a recording; return the notes' codes and the few-data messages."""
+    """Fit `closed-form` to the first seconds of a recording.
+
+    Returns the fit, the codes of its notes, and the messages about too few data.
+    """
     urdf, log = (folder / x for x in ARMS[arm])
     model = build(urdf, "closed-form")
     (whole,) = read_logs([log], load_arm(urdf))
@@ -252,7 +270,7 @@ def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolutio
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_second_of_motion_supports_no_fit(shared, arm):
-    """A second and a half of each recorded arm: the warning names joints, what is as good, and the seconds needed."""
+    """After 1.5 s of motion a fit warns of too few data, with equally good methods and the seconds of motion needed."""
     _, codes, messages = first_seconds(shared / "logs", arm, 1.5)
     assert "few-data" in codes
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]

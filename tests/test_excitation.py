@@ -69,13 +69,16 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
-    )  # rigid bodies, friction and rotors; parameters in common count once
+    )  # 36 base parameters, and 4 of friction and rotor per joint, of which two are no independent parameters
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
-    """By Pinocchio's regressor: no column of friction or rotors, rigid bodies only, by numerical rank."""
+    """Without friction and rotors, the condition number is the one of Pinocchio's regressor of the rigid bodies.
+
+    The rank is determined numerically.
+    """
     pin = pytest.importorskip("pinocchio")
     from spelgen.dynamics.pinocchio_arm import pinocchio_model
     from spelgen.settings.settings import Settings
@@ -88,12 +91,16 @@ def test_the_condition_number_is_that_of_the_regressor(arm, found):
         for state in zip(motion.q[::10], motion.qd[::10], motion.qdd[::10], strict=True)
     ]
     values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
-    assert values[35] / values[0] > 1e-3 > 1e-9 > values[36] / values[0]  # all 36 base parameters show
+    # singular values: the motion excites all 36 base parameters, and no others exist
+    assert values[35] / values[0] > 1e-3 > 1e-9 > values[36] / values[0]
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
 def test_the_gradient_is_that_of_the_criterion(robots, robot):
-    """rpr's start overruns efforts, scara has prismatic and gravity-free joints; central differences tell."""
+    """The gradient of the criterion equals central differences, with and without torques beyond the effort limits.
+
+    The initial trajectory of rpr exceeds limits; scara has prismatic joints and joints without gravity load.
+    """
     arm = load_arm(robots / f"{robot}.urdf").chain
     trajectory = ExcitationTrajectory(10.0, 3, motion_bounds(arm, 0.9, 0.7))
     criterion = Criterion(arm, trajectory)
@@ -132,7 +139,10 @@ def test_an_arm_without_limits_gets_modest_ones(tmp_path):
 
 
 def test_joints_that_follow_keep_their_limits_too(tmp_path):
-    """b = 0.5 a - 0.1 within -0.3 .. 0.2 and 0.1 rad/s: a within -0.4 .. 0.6 and 0.2 rad/s, for limits of 1 and 2."""
+    """A mimic joint stays within its own limits: b = 0.5 a - 0.1.
+
+    -0.3 <= b <= 0.2 and |db/dt| <= 0.1 rad/s give -0.4 <= a <= 0.6 and |da/dt| <= 0.2 rad/s, of a's own 1 and 2.
+    """
     path = coupled_urdf(tmp_path / "coupled.urdf")
     limits = 'lower="-1" upper="1" effort="10" velocity="2"/><mimic'
     path.write_text(
@@ -165,7 +175,7 @@ def test_a_joint_without_room_is_refused(robots, tmp_path):
         ({"harmonics": 1}, "harmonics: got 1, expected 2 or more"),
     ],
 )
-def test_values_that_cannot_be_are_refused(loaded, changes, message):
+def test_values_out_of_range_are_refused(loaded, changes, message):
     with pytest.raises(SettingsError) as caught:
         excite(loaded, **CHOICE | changes)
     assert str(caught.value) == f"excite: {message}"

@@ -1,4 +1,4 @@
-"""Export to URDF: exact for closed-form models, the nearest rigid bodies for others."""
+"""Export to URDF is exact for closed-form models; for others the exported rigid bodies are the nearest ones."""
 
 import re
 
@@ -25,7 +25,7 @@ pytest.importorskip("pinocchio")
 
 
 def run_of(robot, folder, preset, change=lambda model: None):
-    """A run folder, with the files that `spelgen train` writes, of a model whose parameters ``change`` has modified."""
+    """Return a run folder with the files of `spelgen train`, and its model, with parameters modified by ``change``."""
     urdf = ROBOTS / f"{robot}.urdf"
     model = build(urdf, preset)
     with torch.no_grad():
@@ -47,7 +47,7 @@ def heavier(model):
 
 
 def differences(model, loaded):
-    """Largest difference of M and of the gravity torque to Pinocchio's from the exported files."""
+    """Return the largest differences of M and of gravity torques between a model and Pinocchio's of an exported arm."""
     engine = arm_dynamics(loaded.chain, loaded.settings)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -82,7 +82,7 @@ def test_exported_friction_in_the_urdf(tmp_path):
 
 
 def test_residual_terms_are_reported(tmp_path):
-    """The bodies of hybrid are exported exactly; residual terms of M, gravity and friction are reported as figures."""
+    """Bodies of a hybrid model are exported exactly, and the magnitude of the omitted residual terms is reported."""
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
@@ -109,7 +109,7 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     run, model = run_of("two_link", tmp_path, "spel")
     loaded, told = exported(run, tmp_path / "learned.urdf")
     mass, load_torque = differences(model, loaded)
-    assert mass > 0.1  # the mass matrix of an untrained spel is no rigid body's
+    assert mass > 0.1  # M of an untrained spel is not the mass matrix of any rigid bodies
     assert load_torque < 1e-8
     assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 
@@ -144,7 +144,7 @@ def test_a_run_without_its_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize("robot", ["rpr", "panda"])
 def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
-    """By the names and combinations of `inspect`, for all values of the single parameters."""
+    """Exported bodies have the model's base parameters, although single inertial parameters may differ."""
     run, model = run_of(robot, tmp_path, "closed-form", heavier)
     export(run.path, "urdf", tmp_path / "learned.urdf")
     arm = load_arm(ROBOTS / f"{robot}.urdf")
@@ -159,7 +159,7 @@ def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
 
 
 def test_inertials_of_fixed_links_have_no_orientation(tmp_path):
-    """Some readers ignore it. The tensor in the link's frame, and all else, remains the same."""
+    """<inertial> elements of fixed links have no rotation, which some readers ignore; the tensor remains equal."""
     inertial = (
         '<inertial><origin xyz="0.1 0 -0.2" rpy="0.4 1.1 -0.7"/><mass value="2"/>'
         '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" izz="0.05"/></inertial>'

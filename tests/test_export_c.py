@@ -38,7 +38,7 @@ BOTH = [("two_link", "closed-form"), ("rpr", "hybrid")]
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """Per robot and preset: the exported model, the folder of the C files, and the library."""
+    """Return, per robot and preset, the exported model, the folder of its C files, and the compiled library."""
     found = {}
     for robot, preset in BOTH:
         trained = Trained(moved_model(robot, preset), arm_of(robot), NAMES)
@@ -62,7 +62,8 @@ def test_c_equals_the_model(case, program, flags, compiled):
     options = [f"-D{model.name.upper()}_FLOAT"] if flags else []
     source = folder / f"{model.name}.c"
     library = compile_library(source, program, *options)
-    library = library.rename(folder / f"{program}{len(flags)}.so")  # ctypes caches libraries by name
+    # each library has its own name, as ctypes caches libraries by name
+    library = library.rename(folder / f"{program}{len(flags)}.so")
     kind, tolerance = (np.float32, 1e-5) if flags else (np.float64, 1e-12)
     called = called_by_c(library, c_functions(model, trained.entry_points), kind)
     found = check_parity(called, trained, NAMES, tolerance, dtype=kind)
@@ -70,7 +71,11 @@ def test_c_equals_the_model(case, program, flags, compiled):
 
 
 def test_derivatives_at_right_angles_are_the_models(monkeypatch):
-    """There gravity's torques vanish up to rounding, whose sign is no backend's to choose; bristles are bent."""
+    """At angles that are multiples of pi/2, derivatives of the exports equal the model's.
+
+    Gravity torques vanish there up to rounding, and the sign of the rounding must not decide on derivatives of
+    load-dependent friction.
+    """
 
     def at_right_angles(*arguments):
         inputs = random_inputs(*arguments)
@@ -103,7 +108,7 @@ def test_casadi_equals_the_model(robot, preset):
 
 @pytest.mark.parametrize("preset", ["closed-form", "hybrid"])
 def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
-    """And text of the URDF becomes no code: the robot's name would."""
+    """Exports have mimic joints, coupled motors and passive joints, and no text of the URDF becomes code."""
     urdf = tmp_path / "coupled.urdf"
     urdf.write_text(COUPLED)
     urdf.with_suffix(".yaml").write_text(MOTORS)
@@ -122,7 +127,7 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
         assert b"fast;" not in files["arm_2_fast_int_main.c"]
 
 
-def test_of_one_joint_a_matrix_is_one_number(tmp_path):
+def test_a_matrix_of_one_joint_is_a_scalar(tmp_path):
     urdf = tmp_path / "one.urdf"
     urdf.write_text(ONE_JOINT)
     arm = load_arm(urdf)
@@ -142,7 +147,7 @@ def test_names_for_code():
 
 @needs_gcc
 def test_the_longest_name_is_a_name(tmp_path):
-    """A function's first line may be too long by itself."""
+    """A robot name of the largest length compiles, although the first line of a function exceeds the line length."""
     described = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(described, name=identifier("gen3" * 20))
     assert len(model.name) == 40
@@ -194,7 +199,10 @@ int main(void)
 @needs_gcc
 @pytest.mark.parametrize("case", BOTH, ids=lambda each: "-".join(each))
 def test_c_is_sound_for_all_inputs(case, compiled):
-    """Zero, large, overflowing and infinite states, under address and undefined-behaviour sanitizers; NaN stays."""
+    """C has no undefined behaviour for zero, large, overflowing and infinite states; NaN in gives NaN out.
+
+    Checked under address and undefined-behaviour sanitizers.
+    """
     trained, folder, _ = compiled[case]
     name, n = trained.described.name, trained.described.n
     calls = []
@@ -228,7 +236,7 @@ FRACTIONS = np.array([[0.3, 0.7], [0.4, 0.6]])
 
 
 def test_bristles_follow_their_law_along_a_displacement():
-    """z' = qd up to the reach, integrated in small steps, there and back."""
+    """The bristle step of the exports equals dz/dt = qd, limited to |z| <= reach, integrated in small steps."""
     z, dq = ca.SX.sym("z", 4), ca.SX.sym("dq", 2)
     step = ca.Function("step", [z, dq], [model_expressions.bristle_step(REACH, z, dq)])
     found, small, steps, reach = np.zeros(4), np.zeros(4), 4000, REACH.ravel()
@@ -243,7 +251,10 @@ def test_bristles_follow_their_law_along_a_displacement():
 
 @needs_gcc
 def test_c_carries_frictions_memory(tmp_path):
-    """Two elements a joint: z turns dry friction, and long sliding bends it fully. NZ is the number of values."""
+    """C has the friction state: two elements per joint, which change dry friction by their deflection.
+
+    The macro NZ is the number of states.
+    """
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(model, breakaway=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))
     functions = c_functions(model, ENTRIES)
@@ -266,7 +277,10 @@ def test_c_carries_frictions_memory(tmp_path):
 
 @needs_gcc
 def test_in_single_precision_a_joint_that_creeps_moves_its_bristles(tmp_path):
-    """1e-6 rad/s at 1 kHz: near its reach of 0.1 rad a bristle in float would stay, or move by seven times as much."""
+    """In single precision, a joint that creeps by 1e-9 rad per step still moves its bristles.
+
+    Near its break-away displacement of 0.1 rad, a bristle in float would not move, or move by seven times as much.
+    """
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     functions = c_functions(model, ENTRIES)
     library = compile_library(write_c(model, functions, tmp_path), "gcc", f"-D{model.name.upper()}_FLOAT")

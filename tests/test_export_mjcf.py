@@ -27,7 +27,10 @@ from spelgen.exporting.rigid_body_projection import rigid_body_projection
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda"])
 def test_closed_form_bodies_go_to_mujoco_exactly(robot):
-    """The check at export time compares 200 states to 1e-9; here once more, by hand, and the tip."""
+    """Rigid bodies and tip of closed-form models are exact in MuJoCo.
+
+    The comparison does not use the export's own check, which compares 200 states to 1e-9.
+    """
     model, arm = moved_model(robot, "closed-form"), arm_of(robot)
     found = export(model, "mjcf", arm=arm)
     simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
@@ -49,7 +52,7 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
 
 
 def test_a_joint_that_friction_holds_does_not_creep():
-    """Under half of its friction, after a second [rad/s, m/s]; with MuJoCo's default it still moves."""
+    """A joint under half of its friction torque is at rest after a second; with MuJoCo's default it would creep."""
     found = export(moved_model("rpr", "closed-form"), "mjcf", arm=arm_of("rpr"))
     text = found.files[".xml"].decode()
     assert 'solimpfriction="0.9999 0.9999 0.001 0.5 2"' in text
@@ -98,7 +101,7 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
 
 @pytest.mark.parametrize("torque", ["motor", "joint"])
 def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
-    """Their rotors couple M: armature of tendons in MuJoCo, couplings in the settings of a URDF."""
+    """Rotors of coupled motors couple M: as armature of tendons in MJCF, as couplings in the settings of a URDF."""
     urdf = tmp_path / "wrist.urdf"
     shutil.copy(ROBOTS / "six_dof.urdf", urdf)
     names = [each.name for each in load_arm(urdf).chain.coordinates]
@@ -109,7 +112,7 @@ def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
     model = build(arm, "closed-form")
     with torch.no_grad():
         model.raw_armature += 0.5
-    found = export(model, "mjcf", arm=arm)  # compared with the model before it is given
+    found = export(model, "mjcf", arm=arm)  # the export compares M with the model, and fails if it differs
     simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
     assert simulated.nu == 6
     np.testing.assert_allclose(simulated.tendon_armature.max(), model.armature.detach()[5])
@@ -148,7 +151,10 @@ ROUNDED = """<robot name="rounded"><link name="base"/>
 
 
 def test_all_targets_agree_on_the_tip(tmp_path):
-    """Angles of five digits, which the model rounds: the tip is where Pinocchio has it, to 1e-12 in each target."""
+    """Each export places the tip where Pinocchio does, to 1e-12, although the URDF's angles have only five digits.
+
+    The model replaces such angles by exact multiples of pi/2.
+    """
     pin = pytest.importorskip("pinocchio")
     (tmp_path / "arm.urdf").write_text(ROUNDED.format("", "", ""))
     arm = load_arm(tmp_path / "arm.urdf")
@@ -179,7 +185,7 @@ def test_all_targets_agree_on_the_tip(tmp_path):
 
 
 def test_shapes_and_effort_limits_go_along(tmp_path):
-    """Shapes are where the URDF has them and have no mass; a missing mesh is named; motors stop at the effort limit."""
+    """Shapes are at the URDF's places without mass, missing meshes are named, and motors have the effort limits."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     ball.apply_translation([0.2, 0.1, 0.0])
     ball.export(tmp_path / "ball.stl")
@@ -207,7 +213,7 @@ def test_shapes_and_effort_limits_go_along(tmp_path):
         Rotation.from_euler("x", 1.5708).as_matrix() @ Rotation.from_euler("y", 0.3).as_matrix()
     )
     links["upper"][:3, 3] = [0, 0, 0.3]
-    expected = [  # by type: centre in the link, half sizes, whether it touches anything
+    expected = [  # type of the shape, link, centre in the link, half sizes, contact type (0: touches nothing)
         (mujoco.mjtGeom.mjGEOM_BOX, "upper", [0.1, 0, 0], [0.05, 0.1, 0.15], 0),
         (mujoco.mjtGeom.mjGEOM_MESH, "lower", [0.2, 0.2, 0.0], None, 0),
         (mujoco.mjtGeom.mjGEOM_CYLINDER, "upper", [0, 0.1, 0], [0.05, 0.15, 0], 1),

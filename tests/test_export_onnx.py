@@ -1,4 +1,4 @@
-"""ONNX Runtime computes the same numbers as the model, for any batch size."""
+"""ONNX Runtime computes the same numbers as the torch model, for any batch size."""
 
 import logging
 
@@ -17,7 +17,7 @@ from spelgen.exporting.export import export
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
 from spelgen.exporting.parity import check_parity
 
-# Forward dynamics contain mass_matrix, bias and friction; the export in single precision has tip_jacobian.
+# entries that other entries contain are omitted: mass_matrix, bias and friction are in forward_dynamics
 ENTRIES = (
     *("inverse_dynamics", "forward_dynamics", "gravity"),
     *("friction_step", "friction_memory", "tip_pose"),
@@ -26,7 +26,7 @@ ENTRIES = (
 
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory):
-    """An arm with a follower, motors and a passive joint, and its hybrid, every weight of which has moved."""
+    """Return a hybrid model with random parameters and its arm: mimic joint, coupled motors and a passive joint."""
     urdf = tmp_path_factory.mktemp("coupled") / "coupled.urdf"
     urdf.write_text(COUPLED)
     urdf.with_suffix(".yaml").write_text(MOTORS)
@@ -41,13 +41,13 @@ def coupled(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def exported(coupled):
-    """The export has compared every file with the model to 1e-10."""
+    """Return the ONNX export of the arm `coupled`, which the export has compared with the model to 1e-10."""
     model, arm = coupled
     return export(model, "onnx", arm=arm, entries=ENTRIES)
 
 
 def test_onnx_equals_the_model(coupled, exported, tmp_path):
-    """Another batch size than in the check at export time."""
+    """ONNX Runtime equals the model for another batch size than the export's own check."""
     model, arm = coupled
     assert "from the torch module" in exported.summary[0]
     session = onnx_session(exported.files["gravity.onnx"])
@@ -58,7 +58,7 @@ def test_onnx_equals_the_model(coupled, exported, tmp_path):
 
 
 def check_readme(found, model, arm, folder, tolerance):
-    """The lines of the README run; they make and step the friction state, and their numbers are the model's."""
+    """Run the Python example of the exported README; its friction states and results must equal the model's."""
     names = readme_results(found.files, folder)
     at = torch.ones(5, model.n, dtype=torch.float64)
     past = [model.memory(at)]
@@ -91,7 +91,7 @@ def test_onnx_in_single_precision(tmp_path):
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):
-    """Only standard operators, no traces of the machine, the same bytes twice; z is flat."""
+    """Exported files have only standard operators, no path of the machine, and equal bytes each time; z is flat."""
     files = {name: content for name, content in exported.files.items() if name.endswith(".onnx")}
     assert files["gravity.onnx"] == onnx_model(coupled[0].prepared(), "gravity")
     for content in files.values():
@@ -107,7 +107,7 @@ def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):
 
 @pytest.mark.parametrize("preset", ["spel", "minimal", "spel-kan", "phnode"])
 def test_networks_are_exported_to_onnx(preset):
-    """Presets of networks, which C and CasADi refuse; forward dynamics has all of their parts."""
+    """Presets of networks, which C and CasADi exports refuse, are exported to ONNX with all parts of the model."""
     trained = Trained(moved_model("two_link", preset), arm_of("two_link"))
     files = {"forward_dynamics": onnx_model(trained.model.prepared(), "forward_dynamics")}
     check_parity(called_by_onnx(files), trained, list(files), 1e-10)

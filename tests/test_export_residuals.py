@@ -1,4 +1,4 @@
-"""Residual terms of hybrid models are exported where they are not zero and omitted where they are."""
+"""Residual terms of hybrid models are exported if they are not zero, and omitted if they are zero."""
 
 import shutil
 
@@ -29,7 +29,7 @@ RESIDUALS = "residuals."
 
 
 def with_parts(robot, *parts):
-    """A hybrid model with modified bodies and only these residual terms."""
+    """Return a hybrid model with random parameters of bodies, drives and the residual terms that `parts` names."""
     model, moved = build(arm_of(robot), "hybrid"), moved_model(robot, "hybrid")
     names = tuple(PARTS[part] for part in parts)
     with torch.no_grad():
@@ -40,7 +40,7 @@ def with_parts(robot, *parts):
 
 
 def closed_form(model, robot):
-    """The closed-form model of the same bodies and drives."""
+    """Return the closed-form model with the bodies and drives of a hybrid model."""
     found = build(arm_of(robot), "closed-form").requires_grad_(False)
     found.load_state_dict(
         {key: value for key, value in model.state_dict().items() if key in found.state_dict()}
@@ -49,13 +49,13 @@ def closed_form(model, robot):
 
 
 def c_library(model, folder):
-    """The model's C, compiled."""
+    """Compile the C of a model; return the function that calls its entry points."""
     functions = c_functions(model, ENTRIES)
     return called_by_c(compile_library(write_c(model, functions, folder), "gcc"), functions)
 
 
 def test_zero_terms_are_omitted():
-    """C of a fit without residuals equals C of closed-form, byte for byte."""
+    """Without residual terms the C of a hybrid model equals the C of the closed-form model, byte for byte."""
     model = with_parts("rpr")
     ours = describe(model, arm_of("rpr"))
     other = describe(closed_form(model, "rpr"), arm_of("rpr"))
@@ -77,7 +77,7 @@ def test_zero_terms_are_omitted():
     ids="-".join,
 )
 def test_each_term_is_exported_by_itself(parts, tmp_path):
-    """Unused functions and tables would be refused by the compiler."""
+    """A single residual term is exported correctly, without unused functions or tables, which the compiler rejects."""
     trained = Trained(with_parts("scara", *parts), arm_of("scara"))
     model, names = trained.described, list(ENTRIES)
     check_parity(c_library(model, tmp_path), trained, names, 1e-12, states=20)
@@ -89,19 +89,21 @@ def test_each_term_is_exported_by_itself(parts, tmp_path):
 @needs_gcc
 @pytest.mark.parametrize("name", ENTRIES)
 def test_a_single_entry_is_exported_by_itself(name, tmp_path):
-    """Functions that only other entries call cause no compiler warning, which the export would treat as an error."""
+    """An export of a single entry has no function that only other entries call, which would be a compiler warning."""
     model = with_parts("rpr", *PARTS)
     described = describe(model, arm_of("rpr"))
     functions = c_functions(described, {name: ENTRIES[name]})
     compile_library(write_c(described, functions, tmp_path), "gcc")
 
 
-def test_a_function_of_one_joint_stays_with_it():
+def test_a_function_of_one_joint_is_exported_at_this_joint():
     model = with_parts("scara")
     functions = model.residuals
     functions.raw_torque_splines[1, 20] = 1.0
-    functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)  # twice the gear
-    functions.raw_torque_ripple[2, 3] = 1.0  # of a prismatic joint: no turns, no ripple
+    # ripple at two frequencies, the largest of which is twice the gear ratio
+    functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    # a prismatic joint has no revolutions, and so no ripple is exported
+    functions.raw_torque_ripple[2, 3] = 1.0
     found = describe(model, arm_of("scara")).residuals
     assert (list(found.torque), list(found.friction)) == ([1], [])
     assert [(each.joint, each.frequency, len(each.cosines)) for each in found.ripple] == [
@@ -112,7 +114,10 @@ def test_a_function_of_one_joint_stays_with_it():
 
 @needs_gcc
 def test_splines_at_their_ends_and_beyond(tmp_path):
-    """On knots, where the range ends, far outside: by C and CasADi as by torch, and slopes as torch has them."""
+    """Splines are exact on knots, at the end of the range and far outside of it.
+
+    C and CasADi equal torch, derivatives included.
+    """
     model = with_parts("two_link", "springs", "friction")
     described, functions = describe(model, arm_of("two_link")), model.residuals
     center, spacing = functions.middles.mean(dim=1), functions.spacing.flatten()

@@ -81,7 +81,7 @@ def c_object(folder: Path, tmp_path: Path) -> str:
 
 
 def compiled_driver(folder: Path, tmp_path: Path, *linked: str) -> Path:
-    """A program that calls all functions of the plugin."""
+    """Compile a C++ program that calls all functions of the exported plugin; return its path."""
     (tmp_path / "driver.cpp").write_text(DRIVER)
     run("g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{STUBS}", f"-I{folder / 'src'}",
         tmp_path / "driver.cpp", *linked, "-o", tmp_path / "driver", "-lm")  # fmt: skip
@@ -108,7 +108,7 @@ def test_the_plugin_equals_the_model(package, tmp_path):
         # the first call has no history: its friction states are the states of sliding joints
         model.friction_torque(torch.zeros_like(q), qd, model.memory(qd)),
         model.inverse_dynamics(q, qd, qdd, model.memory(qd)),
-        # against the direction in which the first velocity deflected the bristles
+        # a displacement against the direction in which the first velocity had deflected the bristles
         model.inverse_dynamics(q + moved, qd, qdd, model.memory_after(model.memory(qd), moved)),
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])
@@ -117,7 +117,7 @@ def test_the_plugin_equals_the_model(package, tmp_path):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++ on this machine")
 def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
-    """inverse_dynamics_solver 0.1.1 calls it .h."""
+    """The plugin compiles with inverse_dynamics_solver 0.1.1, whose header has the suffix .h."""
     _, folder = package
     stubs = shutil.copytree(STUBS, tmp_path / "stubs")
     header = stubs / "inverse_dynamics_solver" / "inverse_dynamics_solver.hpp"
@@ -127,9 +127,9 @@ def test_it_builds_against_the_header_of_older_interfaces(package, tmp_path):
 
 
 def stand_in_packages(folder: Path) -> list[str]:
-    """Write CMake packages of the stubs; return the definitions with which CMake finds them.
+    """Write CMake packages of the stubs of ROS 2; return the definitions with which CMake finds them.
 
-    ament_cmake and colcon are not replaced if the machine has them.
+    An installed ament_cmake is used instead of its stub.
     """
     interfaces = [
         "controller_interface",
@@ -154,7 +154,8 @@ def stand_in_packages(folder: Path) -> list[str]:
             text += (STUBS / "cmake" / "pluginlib.cmake").read_text()
         (folder / f"{name}Config.cmake").write_text(text)
     if Path("/usr/share/ament_cmake").is_dir():
-        definitions = ["-DPython3_EXECUTABLE=/usr/bin/python3"]  # has the Python package of ament
+        # the system's Python, which has the Python package of ament
+        definitions = ["-DPython3_EXECUTABLE=/usr/bin/python3"]
     else:
         definitions = []
         shutil.copy(STUBS / "cmake" / "ament_cmakeConfig.cmake", folder)
@@ -167,13 +168,16 @@ def stand_in_packages(folder: Path) -> list[str]:
     reason="no cmake or no g++ on this machine",
 )
 def test_colcon_builds_it(package, tmp_path):
-    """The installed library has both plugins. Without colcon its commands of CMake are run; stubs replace ROS 2."""
+    """colcon builds the package, and the installed library has both plugins; stubs replace ROS 2.
+
+    If colcon is not installed, its CMake commands are run instead.
+    """
     _, folder = package
     shutil.copytree(folder, tmp_path / "src" / folder.name)
     (tmp_path / "cmake").mkdir()
     definitions = stand_in_packages(tmp_path / "cmake")
     installed = tmp_path / "install" / folder.name
-    # colcon is of use with its extensions only
+    # without its extensions colcon cannot select packages
     if shutil.which("colcon") and "--packages-select" in run("colcon", "build", "--help"):
         run("colcon", "build", "--packages-select", folder.name, "--cmake-args", *definitions, cwd=tmp_path)
     else:

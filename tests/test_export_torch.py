@@ -12,8 +12,9 @@ from spelgen.exporting.export import export
 
 
 def test_programs_are_self_contained():
-    """The check at export time compares the programs with the model; here a batch of another size."""
-    model = moved_model("two_link", "phnode")  # whose M and G are networks of all joints: every preset goes
+    """Exported programs contain their parameters, and equal the model for another batch size than at the export."""
+    # phnode's M and G are networks of all joints: the preset that is hardest to trace
+    model = moved_model("two_link", "phnode")
     found = export(model, "torch", arm=arm_of("two_link"), entries=("forward_dynamics",))
     program = torch.export.load(io.BytesIO(found.files["forward_dynamics.pt2"])).module()
     states = [torch.randn(7, model.n, dtype=torch.float64) for _ in range(3)]
@@ -24,7 +25,10 @@ def test_programs_are_self_contained():
 
 @pytest.mark.parametrize("float32", [False, True])
 def test_the_lines_of_the_readme_run(tmp_path, float32):
-    """They make and step the friction state; their numbers are the model's, also in single precision."""
+    """The Python example of the exported README runs; its friction states and results equal the model's.
+
+    This holds in single precision, too.
+    """
     model, arm = moved_model("two_link", "closed-form"), arm_of("two_link")
     used = ("inverse_dynamics", "forward_dynamics", "friction_step", "friction_memory", "tip_jacobian")
     found = export(model, "torch", arm=arm, entries=used if float32 else (), float32=float32)

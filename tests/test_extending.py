@@ -30,14 +30,14 @@ JOINTS = ["joint1", "joint2"]
 
 
 def places(thing: str) -> list[str]:
-    """The files that the page names for it."""
+    """Return the files to which docs/extending.md sends an author of this extension."""
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith(f"| {thing} |"))
     return re.findall(r"`(spelgen/[\w/]+\.(?:py|yaml))`", row.split("|")[2])
 
 
 def stands_in(thing: str, module) -> bool:
-    """Whether the page sends there, and to one more file at most."""
+    """Return True if docs/extending.md names the file of a module for this extension, and at most one more file."""
     named = places(thing)
     return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
 
@@ -66,7 +66,8 @@ def test_a_preset(robots, tmp_path, monkeypatch):
         torch.nn.init.normal_(parameter)
     q = torch.zeros(1, 2, dtype=torch.float64)
     assert model.spec.options.preset == "toy"
-    assert model.dissipation(q, q)[0, 0, 1] != 0  # not of each joint by itself
+    # the dissipation couples joints 1 and 2, which friction per joint would not do
+    assert model.dissipation(q, q)[0, 0, 1] != 0
 
 
 def test_a_log_format(tmp_path, monkeypatch, log):
@@ -99,7 +100,8 @@ def test_a_baseline(robots, monkeypatch, log):
     monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms
-    assert error == pytest.approx(1, rel=0.2)  # 1: as if the arm had stood still
+    # a prediction of no motion has the error 1 relative to the motion
+    assert error == pytest.approx(1, rel=0.2)
     assert "stands still" in results.text()
 
 

@@ -60,7 +60,10 @@ def test_a_fit_in_memory_is_that_of_files(tmp_path):
 
 
 def test_the_seed_orders_batches():
-    """On the same training and validation logs: other batches, other weights; the same ones, the same weights."""
+    """The seed determines the order of batches: the same seed gives equal weights, another seed other weights.
+
+    Training and validation logs are the same.
+    """
     logs, held = motions(), motions(2, seed=1)
     weights = []
     for seed in (0, 0, 1):
@@ -130,7 +133,7 @@ def test_logs_that_cannot_be_fitted_are_reported():
 
 
 def swings(seed: int, rate=200.0) -> Trajectory:
-    """A smooth motion of the true arm with its own torques."""
+    """Return a log of a smooth motion of the true arm with its own torques."""
     random = np.random.default_rng(seed)
     t = np.arange(0, 6, 1 / rate)[:, None]
     speed, phase = random.uniform(2, 5, 2), random.uniform(0, 6, 2)
@@ -152,13 +155,13 @@ def test_torques_are_fitted_predicted_and_scored():
     assert found.score(test) > 0.9999
     tau = found.predict(test)
     assert tau.shape == test.tau.shape
-    inner = slice(100, -100)  # away from the ends, where the filter settles
+    inner = slice(100, -100)  # the ends of the log are omitted, at which the filter has transients
     assert np.abs(tau - test.tau)[inner].max() < 0.02 * test.tau.std()
     result = spelgen.evaluate(found, [test])
     assert result.torque["model"].mean_nmse == pytest.approx(1 - found.score([test]), rel=1e-6)
     constant = Trajectory(test.t, test.q, test.qd, np.ones_like(test.tau), "constant")
     assert found.predict(constant).shape == test.tau.shape
-    with pytest.raises(LogError, match="no motion to judge torques on"):
+    with pytest.raises(LogError, match="no motion for an evaluation of torques"):
         found.score(motions())
 
 
@@ -176,7 +179,7 @@ def test_the_filter_reaches_torques():
 def test_predictions_at_gaps_are_not_numbers():
     log = swings(0)
     t = log.t.copy()
-    t[1:] += 1.0  # the first sample is a segment by itself
+    t[1:] += 1.0  # the log has a gap after its first sample, which is then a segment of its own
     found = spelgen.fit(Model(), [swings(1), swings(2)], TorqueFit(evaluations=20))
     tau = found.predict(Trajectory(t, log.q, log.qd, log.tau, "gap"))
     assert np.isnan(tau[0]).all() and np.isfinite(tau[1:]).all()
@@ -205,8 +208,8 @@ def test_a_torque_fit_states_its_error(tmp_path):
 
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
-    """Equal predictions and equal gradients."""
-    # where bristles begin to slide steps of 1e-7 have gradients of 1e-3
+    """Predictions and gradients of the rk4 and the dopri5 solver agree."""
+    # tighter tolerances than the default: near the onset of sliding, steps of 1e-7 have gradients of 1e-3
     monkeypatch.setitem(SOLVER, "rtol", 1e-9)
     monkeypatch.setitem(SOLVER, "atol", 1e-11)
     model = random_model("two_link", tmp_path, seed=0, preset=preset)
@@ -247,7 +250,10 @@ def test_windows_are_fitted_by_dopri5():
 
 @pytest.mark.usefixtures("short_epochs")
 def test_the_tour_on_an_arm_with_a_joint_that_follows(tmp_path):
-    """From a URDF to a saved run, networks and rigid bodies, with the regularizer towards the URDF."""
+    """For an arm with a mimic joint, load, simulate, build, fit, evaluate and save work.
+
+    Networks and rigid bodies are fitted, with the regularizer towards the URDF.
+    """
     (tmp_path / "followed.urdf").write_text(FOLLOWED)
     arm = spelgen.load_arm(tmp_path / "followed.urdf")
     logs = spelgen.simulate(arm, trajectories=3, duration=1.0)

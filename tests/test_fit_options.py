@@ -32,7 +32,7 @@ OF_NETWORKS = {"torque": {"evaluations", "weight_decay", "urdf_weight"}}
 
 def test_every_option_has_a_value_here_and_a_place_in_the_settings():
     assert OWNERS.keys() == VALUES.keys()
-    in_a_file = OWNERS.keys() - {"adapt"}  # of one run, not of a robot
+    in_a_file = OWNERS.keys() - {"adapt"}  # `adapt` belongs to one run, not to a robot, and is no setting
     assert in_a_file <= TrainingSettings.model_fields.keys()
     beside = {"objective", "cutoff", "decimation", "gap", "torque_delay", "validation_fraction", "seed"}
     assert TrainingSettings.model_fields.keys() == in_a_file | beside
@@ -48,9 +48,9 @@ def test_an_option_applies_or_the_error_names_its_objective(option, objective, r
         several = "objectives" if len(owners) > 1 else "objective"
         told = f"{option}: belongs to the {several} {' and '.join(owners)}, this fits {objective}"
     elif rigid_bodies and objective == "momentum":
-        told = "objective: momentum belongs to models of networks alone, this is one of rigid bodies"
+        told = "objective: momentum is for models that consist of networks; this model has rigid bodies"
     elif option in (OF_NETWORKS if rigid_bodies else OF_CLOSED_FORM).get(objective, ()):
-        kind = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        kind = "models that consist of networks" if rigid_bodies else "models of rigid bodies"
         told = f"{option}: with the objective {objective} belongs to {kind}"
     else:
         config = make()
@@ -115,7 +115,7 @@ def test_a_sidecar_names_its_line(sidecar):
     with pytest.raises(SettingsError) as caught:
         assert load_settings(path).training.options
     assert str(caught.value) == (
-        "arm.yaml:4: training.window: got 7, expected nothing beside 'objective: torque': "
+        "arm.yaml:4: training.window: got 7, expected no value with 'objective: torque': "
         "this belongs to momentum and rollout"
     )
     path = sidecar("training:\n  window: 7\n  weight_decay: 0.1\n  cutoff: 5\n  decimation: 2\n")
@@ -140,11 +140,14 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
         told == "Error: --set learning_rate: belongs to the objectives momentum and rollout, this fits torque"
     )
     told = refused(module, *data, "--objective", "torque", "--set", "urdf_weight=0")
-    assert told == "Error: --set urdf_weight: with the objective torque belongs to models of networks alone"
+    assert (
+        told
+        == "Error: --set urdf_weight: with the objective torque belongs to models that consist of networks"
+    )
     told = refused(module, *data, "--objective", "momentum")
     assert (
         told
-        == "Error: --objective: momentum belongs to models of networks alone, this is one of rigid bodies"
+        == "Error: --objective: momentum is for models that consist of networks; this model has rigid bodies"
     )
     networks = write_module(tmp_path, "networks.py")
     told = refused(networks, *data, "--set", "evaluations=40")
@@ -156,7 +159,7 @@ def test_the_command_line_names_the_flag(robots, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_goes_on_with_its_own_options(tmp_path):
+def test_a_resumed_run_keeps_its_options(tmp_path):
     logs, run = tmp_path / "train.parquet", tmp_path / "run"
     write_logs(logs, motions(), JOINTS)
     train = [
@@ -191,7 +194,7 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
 
 
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
-    """An option that does not apply is reported before logs are read, which may take long."""
+    """An option that does not belong to the objective is reported before the logs are read, which may take long."""
 
     def unread():
         raise AssertionError("the logs were read")

@@ -1,4 +1,4 @@
-"""Files of `inspect --formulas`: readable text, complete, and free of code from names."""
+"""Files of `inspect --formulas` are readable and complete, and contain no code from names."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ m2] about the origin of the joint's frame, turned so that z is the joint's axis,
 of all that moves rigidly with the joint: 1 joint1, 2 joint2. q is the joint's
 position [rad, m]."""
 
-# The notation that a roboticist would write by hand.
+# expected closed forms, in the notation of a roboticist
 ON_A_BOARD = {
     "rpr": {
         "M11": "Ixx3R*(0.5*cos(2*q3) + 0.5) - Ixy3*sin(2*q3) + Izz1R + 2*hz2R*q2 + m2R*q2**2",
@@ -70,7 +70,7 @@ ON_A_BOARD = {
 
 @pytest.fixture
 def spelgen(tmp_path, monkeypatch):
-    """Run a command in an empty folder, in this process."""
+    """Return a function that runs a command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 
@@ -80,7 +80,7 @@ def test_small_arms_are_shown_completely(robots, spelgen):
 
 
 @pytest.mark.parametrize("robot", ON_A_BOARD)
-def test_entries_as_on_a_board(robots, robot):
+def test_entries_have_the_notation_of_a_textbook(robots, robot):
     told = inspect(robots / f"{robot}.urdf").closed_forms()
     rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
     assert {name: rows[name] for name in ON_A_BOARD[robot]} == ON_A_BOARD[robot]
@@ -88,8 +88,8 @@ def test_entries_as_on_a_board(robots, robot):
 
 def test_large_entries_are_counted_and_shown_on_request(robots, spelgen):
     whole = spelgen("inspect", robots / "ur10e.urdf", "--formulas").stdout
-    assert "\nM11: 540 terms, not written out\n" in whole
-    assert "--entry 1,1 shows M11 alone" in " ".join(whole.split())
+    assert "\nM11: 540 terms, omitted\n" in whole
+    assert "--entry 1,1 shows only M11" in " ".join(whole.split())
     assert max(map(len, whole.splitlines())) <= 80
     alone = spelgen("inspect", robots / "ur10e.urdf", "--entry", "1,1").stdout
     assert alone.count("\nM") == 1 and "\nM11 = " in alone
@@ -105,7 +105,7 @@ def test_either_triangle_and_only_the_parameters_in_the_entry(robots, spelgen):
 
 
 def test_zeros_of_the_inertials_shorten(robots):
-    """The SCARA-like wrist of ur10e: joint 6 has no effect on five of six axes when it turns about its own centre."""
+    """Zero inertial values shorten closed forms: joint 6 of ur10e turns about its centre of mass, so M65 = 0."""
     told = inspect(robots / "ur10e.urdf", assume="inertials").closed_forms()
     rows = {row["name"]: row["expression"] for row in to_dict(told)["entries"]}
     assert (rows["M62"], rows["M63"], rows["M64"], rows["M65"]) == (*3 * ["Izz6*cos(q5)"], "0")
@@ -133,14 +133,14 @@ def test_without_inertials_there_are_no_values(robots, spelgen, tmp_path):
 
 
 def test_lines_keep_the_width(shared):
-    """Skew axes have twelve digits, and entries begin with long terms."""
+    """Lines have at most 80 characters, even if coefficients have twelve digits and entries begin with long terms."""
     arm = make_arm(read_urdf(shared / "arms" / "kinova_j2n6s300.urdf"))
     told = text(formulas(arm, derive(arm, "inertials")))
     assert re.search(r"\d\.\d{12}\*cos", told)
     assert max(map(len, told.splitlines())) <= 80
 
 
-# ---- files
+# ---- files that are written
 
 
 @pytest.mark.parametrize(
@@ -179,13 +179,13 @@ def test_a_long_entry_is_omitted_and_reported():
     source = sympy_source(formulas(arm, derive(arm), longest=100))
     names: dict = {}
     exec(compile(source, "closed_forms.py", "exec"), names)
-    assert "# M11: 466 terms, not written out\n# M21: 279 terms" in source
+    assert "# M11: 466 terms, omitted\n# M21: 279 terms" in source
     assert (2, 2) in names["entries"] and (1, 1) not in names["entries"]
     assert "M" not in names
 
 
 def test_too_large_entries_are_not_expanded():
-    """The first entries of eight generic joints have more than 10^5 terms."""
+    """Entries of M that would have more than 10^5 terms are not expanded, but named: the first ones of eight joints."""
     arm = random_arm(8, 0)
     found = formulas(arm, derive(arm))
     terms = {formula.name: formula.terms for formula in found.rows}
@@ -194,7 +194,8 @@ def test_too_large_entries_are_not_expanded():
 
 
 EVIL = {
-    "rpr": "coding: utf_7&#10;import os; os.mkdir(&quot;taken&quot;)#",  # a file's encoding, PEP 263
+    # a name that declares the encoding of a Python file, PEP 263
+    "rpr": "coding: utf_7&#10;import os; os.mkdir(&quot;taken&quot;)#",
     "joint1": "&quot;&quot;&quot; + open('taken', 'w') #",
     "joint2": r"\end{align*}\input{taken}%",
     "joint3": "taken&#13;&#8232;&#133;x",
@@ -202,7 +203,7 @@ EVIL = {
 
 
 def test_hostile_names_are_comments_only(robots, spelgen, tmp_path):
-    """Names that are code, TeX or line ends."""
+    """Names that contain code, TeX or line ends occur only in comments of the written files."""
     urdf = (robots / "rpr.urdf").read_text()
     for name, evil in EVIL.items():
         urdf = urdf.replace(f'"{name}"', f'"{evil}"')
@@ -224,7 +225,7 @@ def test_hostile_names_are_comments_only(robots, spelgen, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*outputs, "evil.urdf"])
 
 
-# ---- errors
+# ---- requests that are refused
 
 
 def test_entries_that_are_none(robots, spelgen):

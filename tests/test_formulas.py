@@ -1,4 +1,4 @@
-"""Closed forms equal Pinocchio as text, as LaTeX and as a SymPy file."""
+"""Closed forms written as text, LaTeX and SymPy file equal M and V of Pinocchio."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ print(json.dumps(found))
 
 @cache
 def written(robot, assume="kinematics"):
-    """A robot with its structure and closed forms, all entries written out."""
+    """Return one of the project's arms, its structure, and its closed forms, with all entries expanded."""
     arm = load_arm(ROOT / "robots" / f"{robot}.urdf").chain
     structure = derive(arm, assume)
     return arm, structure, formulas(arm, structure, longest=WRITABLE)
@@ -55,7 +55,7 @@ def written(robot, assume="kinematics"):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_sympy_file_by_itself_equals_pinocchio(robots, robot, tmp_path):
-    """The file is executed where this package cannot be imported; Pinocchio reads the URDF by itself."""
+    """The SymPy file runs where spelgen cannot be imported, and its M and V equal Pinocchio's of the URDF."""
     arm, _, found = written(robot)
     write_text(tmp_path / "closed_forms.py", sympy_source(found))
     model = pin.buildModelFromUrdf(str(robots / f"{robot}.urdf"))
@@ -76,7 +76,10 @@ def test_the_sympy_file_by_itself_equals_pinocchio(robots, robot, tmp_path):
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_text_read_back_equals_pinocchio(robot, assume):
-    """By any inertial values under ``kinematics``, by the URDF's under ``inertials``."""
+    """The text of closed forms, evaluated as Python, equals Pinocchio.
+
+    Under ``kinematics`` this holds for any inertial values, under ``inertials`` for the URDF's.
+    """
     arm, _, found = written(robot, assume)
     assert not found.unwritten
     if assume == "kinematics":
@@ -94,7 +97,7 @@ def test_latex_read_back_equals_pinocchio(robot):
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "scara"])
 def test_sympy_proves_each_expression(robot):
-    """Exactly, and not by numbers: by sines and cosines of single angles each is its unshortened expansion."""
+    """Each shortened expression equals its full expansion exactly, proved by SymPy in sines and cosines."""
     arm, _, found = written(robot)
     expansion = Expansion(arm, budget=10**9)
     generators = [function for q in found.q for function in (sympy.sin(q), sympy.cos(q), q)]
@@ -107,7 +110,7 @@ def test_sympy_proves_each_expression(robot):
         for each in found.base:
             polynomial = expansion.polynomial(element, each.index)
             for powers, share in polynomial.terms():
-                if row.entry != "V" or any(powers):  # V is known up to a constant
+                if row.entry != "V" or any(powers):  # without the constant of V, since it is arbitrary
                     monomial = sympy.prod(x**power for x, power in zip(generators, powers, strict=True))
                     expanded += (
                         sympy.Rational(int(share.p), int(share.q))
@@ -119,7 +122,7 @@ def test_sympy_proves_each_expression(robot):
 
 
 def test_python_users_get_sympy(robots):
-    """Names and shapes of the result of `inspect(path).closed_forms()`, which SymPy can process further."""
+    """`inspect(path).closed_forms()` returns symbols, entries, M and V that SymPy can differentiate and simplify."""
     found = inspect(robots / "rpr.urdf").closed_forms()
     q1, q2, q3 = found.q
     names = {symbol.name: symbol for symbol in found.base_parameters}
@@ -140,7 +143,10 @@ def test_python_users_get_sympy(robots):
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=arms())
 def test_random_arms_equal_pinocchio(drawn, tmp_path_factory):
-    """Any joint types, tilted and parallel axes, mimic joints in the chain and on branches."""
+    """Closed forms of random arms equal Pinocchio.
+
+    The arms have any joint types, tilted and parallel axes, and mimic joints in the chain or on branches.
+    """
     path = tmp_path_factory.mktemp("drawn") / "arm.urdf"
     path.write_text(drawn.text)
     arm = make_arm(read_urdf(path), joints=drawn.joints)

@@ -35,7 +35,7 @@ JOINTS = (
 
 
 def swings(samples: int, seed: int = 0) -> np.ndarray:
-    """A smooth path, (samples, 2), that reverses many times."""
+    """Return a smooth path of two joints with many reversals, (samples, 2) [rad, m]."""
     t = np.linspace(0.0, 4.0, samples)[:, None]
     phase = np.random.default_rng(seed).uniform(0, 6, (2, 3))
     waves = [np.sin((1.0 + 2.3 * k) * t + phase[:, k]) / (1 + k) for k in range(3)]
@@ -47,10 +47,10 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     model.friction.reach = reach = torch.tensor(REACH).double()
     z = torch.zeros(2, 3).double()
     qd = q.diff(dim=0)
-    for moved in qd:  # Euler, with steps far below the least reach
+    for moved in qd:  # reference: explicit Euler, with steps far below the smallest break-away displacement
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
-    # between coarse samples a joint may reverse: finer samples show it
+    # coarse samples may skip a reversal between them, fine samples do not
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
@@ -63,7 +63,7 @@ def test_a_step_of_any_length_is_exact_in_one_direction():
     parts = z
     for part in torch.rand(50, 1).double().softmax(dim=0):
         parts = moved_bristles(parts, (part * way).unsqueeze(-1), reach)
-    # Fifty sums of a way of 20 mrad round by some 1e-17, and an element may end at zero.
+    # fifty displacements of 20 mrad in total accumulate rounding errors of about 1e-17, and the exact state may be zero
     torch.testing.assert_close(parts, moved_bristles(z, way.unsqueeze(-1), reach), rtol=1e-12, atol=1e-15)
 
 
@@ -78,18 +78,19 @@ def test_load_dependent_friction_is_smooth_at_right_angles():
     slopes = [torch.func.jacrev(dry)(x * still).diagonal() for x in (-1e-13, 0.0, 1e-13)]
     torch.testing.assert_close(slopes[0], slopes[2], rtol=0, atol=1e-9)
     assert slopes[1].abs().max() < 1e-9
-    # far from there it is the size of the torque
+    # far from zero load, the derivative of friction with respect to the load has the magnitude of the load dependence
     far = torch.func.jacrev(dry)(-5 * still).diagonal()
     torch.testing.assert_close(far, -constants.load_dependence, rtol=1e-3, atol=0)
 
 
 def test_bristles_are_passive():
-    """d/dt stored energy = supplied power - dissipated power, and the dissipated power is never negative."""
+    """Bristles are passive: supplied power minus the rate of stored energy, the dissipation, is never negative."""
     laws = FrictionLaws(JOINTS, breakaway={"revolute": REACH[0], "prismatic": REACH[1]})
     with torch.no_grad():
         for weight in laws.parameters():
             weight += torch.randn(weight.shape, generator=torch.Generator().manual_seed(1)).double()
-        laws.raw_stribeck -= 100.0  # the strengths are constant then
+        # without Stribeck effect and load dependence the maximum bristle torques are constant
+        laws.raw_stribeck -= 100.0
         laws.raw_load_dependence -= 100.0
         constants = laws.prepare()
         qd = torch.randn(500, 2, generator=torch.Generator().manual_seed(2)).double()
@@ -99,13 +100,13 @@ def test_bristles_are_passive():
         power = (constants.torque(qd, torch.zeros_like(qd), z) * qd).sum(dim=-1)
         lost = power - stored.sum(dim=(-2, -1))
         assert lost.min() >= -1e-12
-        assert power.min() < 0  # bristles do give back
+        assert power.min() < 0  # some supplied power is negative, when bristles release stored energy
         energy = constants.stored_energy(z)
         assert energy.min() > 0
 
 
 def test_energy_of_an_unforced_arm_never_rises(tmp_path):
-    """H with the energy of the bristles, of a closed-form rpr, along its own motion."""
+    """Without input, H with the stored energy of the bristles never increases along the motion of a closed-form rpr."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
         model.friction.raw_stribeck -= 100.0
@@ -132,7 +133,8 @@ def test_jitter_of_an_encoder_is_no_motion():
     path = np.round(path / step) * step
     assert encoder_step(path) == pytest.approx(step)
     z = bristles_along(path, BristleReach(np.array([[3e-4, 3e-3, 3e-2]])))
-    assert z[-1, 0] == pytest.approx(z[1005, 0], rel=0.4)  # a tremor of 4000 samples has not unwound them
+    # 4000 samples of encoder jitter have not relaxed the bristles
+    assert z[-1, 0] == pytest.approx(z[1005, 0], rel=0.4)
     assert encoder_step(rng.normal(size=(500, 1))) == 0
 
 
@@ -175,7 +177,10 @@ def test_least_squares_finds_the_strengths_of_bristles():
 
 
 def test_the_weak_form_includes_all_work_of_the_drives():
-    """An offset of the measured torque and friction that drives make up for are no fault of the rigid bodies."""
+    """The weak form of the momentum balance includes the torque offset and the friction compensation of drives.
+
+    Otherwise their work would be attributed to the rigid bodies.
+    """
     model = load_module(built("rpr", preset="closed-form")[0])
     dynamics = model
     with torch.no_grad():

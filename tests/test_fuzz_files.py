@@ -1,4 +1,4 @@
-"""Any log, settings file, mesh or run folder gives a result or errors of one line each."""
+"""Any log, settings file, mesh or run folder gives a result, or errors of one line each."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ def arm(robots):
 
 
 def used(path: Path, arm, mapping=None) -> None:
-    """A log as the commands use it."""
+    """Read and check a log, as the commands do."""
     check_logs(read_logs(path, arm, mapping), arm)
 
 
 @st.composite
 def changes(draw, content):
-    """JSON-like content with one value removed or replaced by an anomalous one."""
+    """Return JSON-like content with one value removed or replaced by an anomalous one."""
     if isinstance(content, dict) and content and draw(st.integers(0, 4)):
         key = draw(st.sampled_from(sorted(content)))
         if not draw(st.integers(0, 3)):
@@ -109,7 +109,7 @@ def test_logs_of_arrays(tmp_path, arm):
                 )
                 pa.parquet.write_table(table, path)
             except (pa.ArrowException, TypeError, ValueError):
-                return  # tables that cannot be written need not be read
+                return  # pyarrow cannot write the table, so there is no file to read
         used(path, arm)
 
     arrays = st.dictionaries(NAMES, ARRAYS, min_size=1, max_size=2)
@@ -178,7 +178,7 @@ def test_settings(tmp_path, robots):
 
 
 def test_meshes(tmp_path):
-    """Files of every format with bytes changed: drawn, or the arm is drawn without them."""
+    """A mesh file of any format with changed bytes is drawn, or the arm is drawn without it."""
     ball = pytest.importorskip("trimesh").creation.icosphere(subdivisions=1)
     kinds = ("stl", "obj", "ply", "glb", "dae", "off")
     whole = {kind: ball.export(file_type=kind) for kind in kinds}
@@ -200,7 +200,7 @@ def test_meshes(tmp_path):
 
 @pytest.fixture(scope="module")
 def run(robots, tmp_path_factory) -> Path:
-    """A run folder of every file."""
+    """Return a run folder that contains each kind of file."""
     model = build(robots / "two_link.urdf", "closed-form")
     found = fit(model, [motion(300)], TorqueFit(), arm=robots / "two_link.urdf")
     folder = found.save(tmp_path_factory.mktemp("run") / "run")

@@ -15,7 +15,7 @@ from spelgen.errors import SpelgenError
 ROOT = Path(__file__).parents[1]
 OURS = sorted((ROOT / "robots").glob("*.urdf"))
 THEIRS = sorted((ROOT.parent / "shared" / "arms").rglob("*.urdf"))[::9]
-LARGEST = 60_000  # bytes of a file that is mutated: longer ones only take longer
+LARGEST = 60_000  # [bytes] size of files that are mutated: larger ones only take longer
 MUTANTS = 300 if MINUTES else 2 * FEW
 NAMES = st.sampled_from(["a", "b", "c", "d", "base", "", "a b", "é", "{{ a }}", "a'b", "l" * 200])
 TYPES = st.sampled_from(
@@ -30,7 +30,7 @@ NUMBERS = st.sampled_from(
 
 @st.composite
 def elements(draw: st.DrawFn, name: str, attributes: tuple[str, ...], content: str = "") -> str:
-    """Zero, one or two copies of an element with some of its attributes, each of which may be anomalous."""
+    """Draw zero, one or two copies of an XML element with some of its attributes, whose values may be anomalous."""
     present = [x for x in attributes if draw(st.integers(0, 9))]
     told = " ".join(f'{x}="{draw(NUMBERS)}"' for x in present)
     return f"<{name} {told}>{content}</{name}>" * draw(st.sampled_from([0, 1, 1, 1, 1, 1, 2]))
@@ -72,7 +72,7 @@ def robots_of_any_kind(draw: st.DrawFn) -> str:
 
 @st.composite
 def nearly_right(draw: st.DrawFn) -> str:
-    """A serial chain that is valid except for its numbers."""
+    """Draw the URDF of a serial chain whose structure is valid, but whose numbers may be anomalous."""
     count = draw(st.integers(1, 4))
     told = [f'<link name="l{k}">{draw(elements("inertial", (), ""))}</link>' for k in range(count + 1)]
     for k in range(count):
@@ -103,11 +103,11 @@ def test_mutated_files(tmp_path, kind):
         source = draw.choice(sources)
         path.write_bytes(mutated(source, draw) if kind == "bytes" else shuffled(source, draw))
         answers.add(require_answer(path))
-    assert answers == {True, False}  # some are still read, some are not
+    assert answers == {True, False}  # some mutated files are still accepted, some are refused
 
 
 def mutated(source: bytes, draw: random.Random) -> bytes:
-    """A few bytes changed, taken out, put in, or a piece repeated."""
+    """Return a file with a few bytes changed, removed or inserted, or with a part repeated."""
     content = bytearray(source)
     for _ in range(draw.randint(1, 3)):
         place, length = draw.randrange(len(content)), draw.choice([1, 1, 1, 8, 200])
@@ -124,7 +124,7 @@ def mutated(source: bytes, draw: random.Random) -> bytes:
 
 
 def shuffled(source: bytes, draw: random.Random) -> bytes:
-    """Quoted values swapped: still XML, with another meaning."""
+    """Return an XML file with some quoted values exchanged: it is still XML."""
     parts = source.split(b'"')
     values = [k for k in range(1, len(parts), 2)]
     for _ in range(draw.randint(1, 4)):
@@ -134,7 +134,7 @@ def shuffled(source: bytes, draw: random.Random) -> bytes:
 
 
 def require_answer(path: Path) -> bool:
-    """Whether a structure was derived; if not, that it was refused as users may expect."""
+    """Return True if a structure is derived; otherwise check that the errors are one line each and name the file."""
     try:
         found = inspect(path)
     except SpelgenError as error:

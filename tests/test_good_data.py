@@ -1,4 +1,4 @@
-"""Logs as loggers write them are read: unfinished and ROS 1 bags, rows of others, coarse clocks, LeRobot's values."""
+"""Uncommon but valid logs are read: unfinished bags, ROS 1 bags, rows of several sources, coarse clocks, LeRobot."""
 
 import bz2
 import json
@@ -34,17 +34,17 @@ START = 1_700_000_000_000_000_000
 
 
 def joint_state(store, stamp: int, names, *arrays):
-    """A message with the time [ns] in its header."""
+    """Return a JointState message with the time [ns] in its header."""
     header, clock = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     stamps = {"stamp": clock(sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": ""}
-    if "seq" in header.__dataclass_fields__:  # ROS 1
+    if "seq" in header.__dataclass_fields__:  # headers of ROS 1 have a sequence number
         stamps["seq"] = 0
     values = [np.array(x, dtype=float) for x in arrays]
     return store.types[STATE](header(**stamps), list(names), *values)
 
 
 def bag_of(messages, folder, ros: int = 2):
-    """A bag of (stamp, names, position, velocity, effort), received 10 ms apart."""
+    """Write a bag of JointState messages (stamp [ns], names, position, velocity, effort), received 10 ms apart."""
     pytest.importorskip("rosbags", reason="reading bags needs the extra 'ros'")
     from rosbags.rosbag1 import Writer as Ros1Writer
     from rosbags.rosbag2 import StoragePlugin
@@ -100,7 +100,10 @@ def test_all_complete_messages_of_an_unfinished_recording_are_read(tmp_path, sha
 
 @pytest.mark.parametrize("packed", ["lz4", "zstd"])
 def test_packed_chunks_of_an_unfinished_recording_are_read(tmp_path, packed):
-    """A file of the format's specification, by its records."""
+    """Compressed chunks of a file without index, as of a recording that was cut off, are read.
+
+    The file is written by the format's specification, record by record.
+    """
     lz4, zstd = pytest.importorskip("lz4.frame"), pytest.importorskip("backports.zstd")
 
     def record(code, body):
@@ -196,7 +199,7 @@ def test_times_of_a_coarse_clock_are_reconstructed_where_rows_are_evenly_spaced(
     assert log.sample_rate == pytest.approx(100, rel=0.01)
     assert np.abs(log.t - log.t[0] - T).max() < tick
     assert "too coarse for the rows: times were reconstructed" in log.repairs[0]
-    # the rate of the mapping replaces the times
+    # with a `sample_rate` in the mapping, times are computed from it
     (log,) = read_logs(path, JOINTS, {"sample_rate": 100})
     check_read(log)
 
@@ -207,7 +210,8 @@ def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(t
     refused = pytest.raises(LogError, match=r"with the time of another row, but another state.*sample_rate")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
-    pa.csv.write_csv(columns_of(np.arange(400) // 10 * 1e-5), tmp_path / "log.csv")  # a rate that no arm has
+    # the steps of this clock would mean a sample rate that no arm has
+    pa.csv.write_csv(columns_of(np.arange(400) // 10 * 1e-5), tmp_path / "log.csv")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
 
@@ -227,7 +231,7 @@ def test_times_in_another_unit_are_named_with_the_line_to_write(tmp_path, unit, 
 
 
 def dataset(folder, values, fps=30):
-    """A data set of LeRobot 3 with these positions and commands (T, n) of motors named like the joints."""
+    """Write a LeRobot 3 data set with equal positions and commands `values` (T, n) of motors named like the joints."""
     (folder / "meta").mkdir(parents=True)
     (folder / "data" / "chunk-000").mkdir(parents=True)
     names = [f"{joint}.pos" for joint in JOINTS]
@@ -259,7 +263,8 @@ def test_normalised_positions_of_lerobot_are_converted_by_the_calibration_or_ref
     folder = dataset(tmp_path / "set", normalised)
     with pytest.raises(LogError, match=r"within LeRobot's normalised range.*units: \{q: deg\}.*calibration"):
         read_logs(folder, JOINTS, POSITION)
-    expected = Q + (2048 - (low + high) / 2) * 2 * np.pi / 4096  # 0 is the middle of the range
+    # LeRobot's normalised zero is the middle of the calibrated range
+    expected = Q + (2048 - (low + high) / 2) * 2 * np.pi / 4096
     stated = POSITION | {"units": {"q": "normalised"}, "calibration": CALIBRATION}
     (log,) = read_logs(folder, JOINTS, stated)
     np.testing.assert_allclose(log.q, expected, atol=1e-5)
@@ -306,7 +311,7 @@ NO_LIMITS = {
 
 
 def unlimited_arm(robots, folder, name, form):
-    """Load a robot whose joints have this form of limits."""
+    """Write and load one of the project's robots with the <limit> of `form`, which states no finite range."""
     text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
     (folder / "x.urdf").write_text(text)
     return load_arm(folder / "x.urdf")

@@ -28,7 +28,7 @@ ROBOTS = ("two_link", "rpr", "scara", "six_dof", "ur10e", "panda")
 
 
 def pinocchio(path, arm):
-    """Pinocchio's model of the same arm, its other joints locked."""
+    """Return Pinocchio's model of an arm's URDF, in which all joints that are not the arm's are locked."""
     names = [coordinate.name for coordinate in arm.coordinates]
     whole = pin.buildModelFromUrdf(str(path))
     locked = [i for i in range(1, whole.njoints) if whole.names[i] not in names]
@@ -52,7 +52,7 @@ def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot
         [pin.computeJointTorqueRegressor(model, data, *state).copy() for state in zip(*states, strict=True)]
     )
     ours = ours.reshape(len(theirs), -1)
-    # the same columns in other frames: each side explains the other
+    # columns of different body frames span the same space: each set is a linear combination of the other
     explained = ours @ np.linalg.lstsq(ours, theirs, rcond=1e-11)[0]
     np.testing.assert_allclose(explained, theirs, atol=1e-8 * np.abs(theirs).max())
     assert np.linalg.matrix_rank(ours, tol=1e-8) == np.linalg.matrix_rank(theirs, tol=1e-8)
@@ -60,7 +60,7 @@ def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_are_those_of_inspect(robots, robot):
-    """Names, order, grouping and values of the bodies' are the exact ones; friction's come behind."""
+    """Base parameters of the bodies have the names, order, groups and values of `inspect`; friction's come last."""
     path = robots / f"{robot}.urdf"
     arm = load_arm(path).chain
     exact = exact_base_parameters(arm)
@@ -74,20 +74,20 @@ def test_base_parameters_are_those_of_inspect(robots, robot):
     values = base.combination[: base.bodies, :inertial] @ urdf_parameters(arm)
     np.testing.assert_allclose(values, [float(each.value) for each in exact], rtol=1e-12, atol=1e-12)
     assert all(name.rstrip("R0123456789") in FrictionModel().effects for name in base.names[base.bodies :])
-    # the first joint's rotor and the inertia about its axis are indistinguishable
+    # rotor inertia of joint 1 cannot be distinguished from the link's inertia about the joint axis
     assert "armature1" not in base.names
     assert base.identifiability()["armature1"] == "in combination"
     assert base.identifiability()["viscous1"] == "alone"
 
 
 def columns(arm, friction, q, qd, qdd):
-    """The whole regressor: the bodies' columns, then the columns of friction and drives."""
+    """Return the regressor (T, n, K): columns of the bodies, then of friction and drives."""
     return np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd)], axis=2)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_make_the_torque(robots, robot):
-    """The regressor is the product of the base parameters' columns and their combinations."""
+    """The regressor equals the columns of the base parameters, times the matrix that combines parameters to them."""
     arm, friction = load_arm(robots / f"{robot}.urdf").chain, FrictionModel(stribeck=True)
     base = base_parameters(arm, friction)
     states = np.random.default_rng(5).uniform(-2, 2, (3, 60, len(arm.coordinates)))
@@ -99,7 +99,10 @@ def test_base_parameters_make_the_torque(robots, robot):
 
 
 def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
-    """Samples of a smooth random motion with the URDF's torques, friction and rotors added; and the parameters."""
+    """Return samples of a smooth random motion, and the parameters that give their torques.
+
+    Parameters: the URDF's bodies, friction and rotors.
+    """
     friction = friction or FrictionModel()
     n = len(arm.coordinates)
     rng = np.random.default_rng(seed)
@@ -113,7 +116,7 @@ def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
     added = np.concatenate([np.full(n, drives[effect]) for effect in friction.effects])
     x = np.concatenate([urdf_parameters(arm), added])
     tau = columns(arm, friction, q, qd, qdd) @ x
-    # some joints are measured better than others
+    # noise with a standard deviation per joint, from 0.2 to 2 times the given level
     scale = noise * tau.std(0) * np.linspace(0.2, 2.0, n)
     return DynamicsSamples("known", q, qd, qdd, tau + scale * rng.normal(size=tau.shape)), x
 
@@ -217,7 +220,7 @@ def test_command(robots, tmp_path):
 def test_pseudo_inertia_is_pinocchios(seed):
     root = np.random.default_rng(seed).normal(size=(4, 4))
     ten = parameters_of(root @ root.T)
-    theirs = ten[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]  # Pinocchio's order: Ixx, Ixy, Iyy, Ixz, Iyz, Izz
+    theirs = ten[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]]  # Pinocchio's order is Ixx, Ixy, Iyy, Ixz, Iyz, Izz
     matrix = pin.PseudoInertia.FromDynamicParameters(theirs).toMatrix()
     np.testing.assert_allclose(pseudo_inertia(ten), matrix, atol=1e-12)
     np.testing.assert_allclose(parameters_of(pseudo_inertia(ten)), ten, atol=1e-12)
@@ -226,7 +229,7 @@ def test_pseudo_inertia_is_pinocchios(seed):
 
 
 def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
-    # thinner than any body: Izz > Ixx + Iyy
+    # a tensor with Izz > Ixx + Iyy, which no physical body has
     factor, possible = reference_factor(np.array([1.0, 0, 0, 0, 0.1, 0, 0, 0.1, 0, 0.5]))
     assert not possible
     ten = parameters_of(factor @ factor.T)
@@ -236,7 +239,7 @@ def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
 
 
 TRAINING = ("20_02_10_30sec_12harm", "20_02_12_50sec_12harm", "20_02_05_20sec_8harm")
-BASELINE = {  # ../shared/logs/README.md
+BASELINE = {  # published nMSE of these recordings, from ../shared/logs/README.md
     "19_12_23_free": 0.0056, "20_01_31_unload": 0.0138, "20_02_05_20sec_12harm": 0.0092,
     "20_02_06_20sec_10harm": 0.0118, "20_02_06_20sec_5harm": 0.0080, "20_02_10_20sec_7harm": 0.0138,
     "20_02_12_40sec_12harm": 0.0039, "20_02_19_14harm50sec": 0.0092, "20_02_19_15harm50sec": 0.0079,
@@ -270,7 +273,10 @@ def test_ur10e_gives_the_published_figures(shared):
 
 @pytest.mark.parametrize("cutoff", [1.0, 8.0, 45.0, 160.0])
 def test_samples_omit_the_transients_of_the_filter(cutoff):
-    """A log that begins and ends in motion; without a filter, above 50 Hz, no sample is omitted."""
+    """Samples within the transients of the low-pass filter, at both ends of a log, are omitted.
+
+    Without a filter, for cutoffs above 50 Hz, no sample is omitted.
+    """
     t = np.arange(0.0, 10.0, 1e-3)
     q = np.column_stack([1.5 * np.sin(t)])
     log = Trajectory(t, q, 1.5 * np.column_stack([np.cos(t)]), -q, "swing")

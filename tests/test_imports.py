@@ -1,4 +1,4 @@
-"""Imports run only within a layer and from the layers above; derivation needs no torch, fits no symbolic algebra."""
+"""Imports follow the layers of the package; derivation imports no torch, and fits import no symbolic algebra."""
 
 import ast
 from functools import cache
@@ -14,7 +14,7 @@ RUNTIME = [
 ]
 CARRIED = {"__future__", "collections", "functools", "math", "torch", "typing"}
 
-# A folder (or a file of the top level) may import only from itself and from those before it in this list.
+# A folder (or a file of the top level) may import only from itself and from folders before it in this list.
 ROWS = """
 version errors labels listing tasks templates runtime files
 urdf settings arm design spec
@@ -38,12 +38,15 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 
 # Modules that a file may not import, neither directly nor through others.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
-PLAIN = {"spelgen.arm.actuation"}  # G by the files, without the exact arithmetic of its folder
+# allowed everywhere: it computes G from the files, without the exact arithmetic of its folder
+PLAIN = {"spelgen.arm.actuation"}
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-MODELS = {f"emission.{name}" for name in ("assemble", "build")}  # models in memory
+# the modules of `emission` that make models in memory, and so import torch
+MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "scene")}
-LEAST_SQUARES = ("fitting.fit", "fitting.train")  # fit least squares as well, whose base parameters are exact
+# modules that fit least squares as well, whose base parameters are exact
+LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {
     "spec": {"sympy", "flint", "torch"},
@@ -57,7 +60,10 @@ def folder(name: str) -> str:
 
 
 def test_every_file_imports_only_from_its_layer_and_those_above():
-    """The runtime, which emitted modules carry, imports only itself, torch and the standard library (CARRIED)."""
+    """Each file imports only from its own layer and from layers above it in LAYERS.
+
+    The runtime, which emitted modules contain, imports only itself, torch and the standard library (CARRIED).
+    """
     assert {folder(name) for name in FILES} == set(FOLDERS)
     wrong = {}
     for name in LAYERS:
@@ -71,7 +77,7 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
 
 
 def test_no_file_imports_from_a_higher_layer():
-    """Derivation imports no torch and fits import no symbolic algebra, neither directly nor through others."""
+    """No file imports a module of NEVER, directly or indirectly: for instance derivation imports no torch."""
     wrong = {}
     for name, never in NEVER.items():
         modules = reached(name) - PLAIN
@@ -81,7 +87,7 @@ def test_no_file_imports_from_a_higher_layer():
 
 @cache
 def imported(name: str) -> frozenset[str]:
-    """Every module that a file names in an import, those inside functions included."""
+    """Return the modules that a file names in imports, those inside functions included."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(_file(name).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

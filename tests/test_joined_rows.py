@@ -1,4 +1,4 @@
-"""States of one arm in several messages, topics or rows are joined at the times of the rarest signal."""
+"""States of an arm in several messages, topics or rows are joined at the times of the signal with the lowest rate."""
 
 import numpy as np
 import pyarrow as pa
@@ -33,14 +33,14 @@ def joints(request, robots):
 
 
 def parts_of(joints, rng):
-    """Return two random non-empty sets of joints, as indices."""
+    """Split joints at random into two non-empty groups; return their indices."""
     order = rng.permutation(len(joints))
     cut = int(rng.integers(1, len(joints)))
     return order[:cut], order[cut:]
 
 
 def write_bag(folder, messages):
-    """Write a bag of (time [ns], topic, names, q, qd, tau)."""
+    """Write a bag of JointState messages (time [ns], topic, names, q, qd, tau)."""
     pytest.importorskip("rosbags", reason="reading bags needs the extra 'ros'")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -60,7 +60,8 @@ def write_bag(folder, messages):
 def test_joints_in_two_messages_are_joined(joints, topics, clocks, tmp_path):
     rng = np.random.default_rng(sum(map(ord, clocks + topics[0])) + len(joints))
     signals = motion(int(rng.integers(1000)), len(joints))
-    steps = {"equal": (10, 10), "shifted": (10, 10), "of different rates": (4, 10)}[clocks]  # ms
+    # [ms] time between the messages of both topics
+    steps = {"equal": (10, 10), "shifted": (10, 10), "of different rates": (4, 10)}[clocks]
     shift = 0 if clocks == "equal" else 3
     messages = []
     for part, topic, step, first in zip(parts_of(joints, rng), topics, steps, (0, shift), strict=True):
@@ -73,7 +74,7 @@ def test_joints_in_two_messages_are_joined(joints, topics, clocks, tmp_path):
     assert len(log) >= 398 and log.sample_rate == pytest.approx(100, rel=1e-3)
     start = (
         0 if abs(log.q - signals(log.t)[0]).max() < 1e-3 else shift * 1e-3
-    )  # times count from the first message
+    )  # times of the log count from its first message
     for name, values in zip(FIELDS, signals(log.t + start), strict=True):
         np.testing.assert_allclose(
             getattr(log, name), values, atol=0.0 if clocks == "equal" else 1e-3, rtol=1e-9
@@ -97,10 +98,11 @@ def test_a_gap_of_one_message_is_a_gap_of_the_log(joints, tmp_path):
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
-    """As a plot tool exports topics: the times of all, and empty cells in the columns of the others."""
+    """A table with the rows of several topics, as plot tools export it, is joined; other topics' cells are empty."""
     rng = np.random.default_rng(len(joints))
     signals = motion(3, len(joints))
-    times = [np.arange(0.0, 4.0, 0.01), np.arange(0.002, 4.0, 0.005)]  # q and qd; torques
+    # sample times of q and qd, and sample times of torques
+    times = [np.arange(0.0, 4.0, 0.01), np.arange(0.002, 4.0, 0.005)]
     t = np.concatenate(times)
     rows = np.full((3, len(t), len(joints)), np.nan)
     rows[:2, : len(times[0])] = signals(times[0])[:2]
@@ -119,7 +121,7 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     assert log.repairs == (
         "signals in separate rows or messages: interpolated at the times of the rarest one",
     )
-    # torques in every third row only
+    # only every third row has torques
     kept = np.arange(len(times[0])) % 3 == rng.integers(3)
     columns = {"t": times[0]}
     for name, values in zip(FIELDS, signals(times[0]), strict=True):

@@ -19,7 +19,7 @@ def spelgen(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(robots, tmp_path_factory):
-    """Logs of two seconds, and the module that they are of."""
+    """Return a folder with a built module and simulated logs of two trajectories of 3 s."""
     folder = tmp_path_factory.mktemp("json")
     (folder / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Jumps in logs: each kind of fault, drawn at random, is named, and its remedy gives the sound log back."""
+"""Jumps in logs: each kind of random fault is named, and the advised line restores the log without the fault."""
 
 import re
 
@@ -27,7 +27,7 @@ def arm(robots, request):
 
 
 def motion(arm, seed: int, rate: float = 100.0, seconds: float = 20.0) -> dict[str, np.ndarray]:
-    """Columns of a smooth motion in SI units with a noise of encoders."""
+    """Return the columns of a log in SI units: a smooth motion with encoder noise."""
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate)) / rate
     columns = {"t": t}
@@ -41,7 +41,7 @@ def motion(arm, seed: int, rate: float = 100.0, seconds: float = 20.0) -> dict[s
 
 
 def written(columns, path):
-    """A log file of these columns, by its suffix."""
+    """Write a log file of these columns in the format of its suffix; return its path."""
     if path.suffix == ".npz":
         np.savez(path, **columns)
     elif path.suffix == ".csv":
@@ -60,7 +60,7 @@ def errors(logs, arm) -> str:
 
 
 def advised(text: str) -> LogMapping:
-    """The mapping in the one line of an error."""
+    """Return the mapping that the one line of advice in an error states."""
     (line,) = re.findall(r"write '(.*)' under 'logs'", text)
     return LogMapping.model_validate(yaml.safe_load(line))
 
@@ -122,7 +122,8 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
         "unsigned": values % size,
         "turn": values % size,
     }[form]
-    if form == "overflow":  # at +- half of the register, with the joint in the middle of a revolution
+    # the register overflows at +- half of its range, near the middle of a revolution of the joint
+    if form == "overflow":
         words = (values - values.mean() + size) % size - size / 2
         values = values - values.mean() + size / 2
     base = {"joints": {joint: {"counts_per_turn" if turning else "counts_per_metre": per_turn}}}
@@ -142,7 +143,7 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
     expected = values * factor
     difference = decoded.q[:, joints.index(joint)] - expected
     assert np.ptp(difference) < 1e-6
-    if form != "overflow":  # of which no one knows in which revolution it began
+    if form != "overflow":  # after an overflow, the number of whole revolutions at the start is unknown
         assert difference[0] == pytest.approx(0, abs=1e-6)
     assert "jumps" not in errors([decoded], arm)
 
@@ -159,7 +160,10 @@ def test_the_first_jump_of_a_joint_that_rests_at_zero_is_counted(arm, tmp_path):
 
 
 def test_sign_bits_and_outliers_of_half_a_turn_of_angles_without_limits(robots, tmp_path):
-    """A sign bit of whole turns is no wrap, and an outlier of half a turn does not shift the samples after it."""
+    """Without position limits, a sign bit is not mistaken for a wrap of angles by whole turns.
+
+    An outlier of half a turn does not shift the samples after it.
+    """
     text = (robots / "two_link.urdf").read_text().replace('type="revolute"', 'type="continuous"')
     (tmp_path / "x.urdf").write_text(text)
     arm = load_arm(tmp_path / "x.urdf")
@@ -205,7 +209,8 @@ def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, fo
         columns = motion(arm, int(random.integers(1000)))
         joint = joints[random.integers(len(joints))]
         rows = np.sort(random.choice(np.arange(25, 1970, 20), 4, replace=False))
-        rows[[0, -1]] = random.choice([[0, 1999], [1, 1970], [25, 1998]])  # also at the ends of the recording
+        # some recordings have outliers at the first or the last sample, too
+        rows[[0, -1]] = random.choice([[0, 1999], [1, 1970], [25, 1998]])
         name = f"{quantity}_{joint}"
         wrong = columns | {name: columns[name].copy()}
         wrong[name][rows] += size * random.choice([-1, 1], 4)
@@ -230,7 +235,7 @@ def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(a
     assert log.sample_rate == pytest.approx(250 / often, rel=0.01)
     assert log.repairs[0].startswith(f"every row is written {often} times: ")
     assert log.q == pytest.approx(columns_of(columns, "q", joints)[::often])
-    # rows of which only some columns are held cannot be removed
+    # rows in which only some columns repeat their values cannot be removed
     some = {name: x[held] if name.startswith("tau") else x for name, x in columns.items()}
     (log,) = read_logs(written(some, tmp_path / "some.csv"), joints)
     told = f"tau that changes {250 / often:.3g} times a second in rows at 250 Hz: each value lasts {often} samples"
@@ -243,14 +248,17 @@ def test_rows_that_are_written_several_times_are_read_once_with_their_own_rate(a
 
 @pytest.mark.parametrize("rate", [100.0, 60.0, 27.0])
 def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, tmp_path, rate):
-    """Each state is written two or three times, three or four times, ...: it is read once."""
+    """If a logger writes the newest state at a higher rate than states change, each state is read once.
+
+    The rate of the logger is no multiple of the rate of the states, so that the number of repeats varies.
+    """
     columns, joints = motion(arm, 5, rate=250.0), arm.chain.joint_names
     newest = np.floor(np.arange(len(columns["t"])) * rate / 250 + 1e-9)
     first = np.searchsorted(newest, newest)
     log = {name: x if name == "t" else x[first] for name, x in columns.items()}
     (found,) = read_logs(written(log, tmp_path / "log.csv"), joints)
     assert len(found) == pytest.approx(len(np.unique(newest)), rel=0.02)
-    # a state at which all joints reverse may be read twice
+    # a state at which all joints reverse may be read twice, as it does not change
     assert np.mean((np.diff(found.q, axis=0) != 0).any(axis=1)) > 0.98
 
 
@@ -265,7 +273,7 @@ def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_r
     (kept,) = read_logs(file, joints)
     (note,) = kept.repairs
     assert "rows repeat the row before in motion: 'dropouts: dropped' under 'logs' removes them" in note
-    # where all joints reverse, a repeat is no step behind
+    # where all joints reverse, a repeated row cannot be recognised
     count = int(note.split(" rows ")[0])
     assert 0.95 * len(repeats) < count <= len(repeats)
     (dropped,) = read_logs(file, joints, {"dropouts": "dropped"})
@@ -292,7 +300,7 @@ def test_quick_but_sound_signals_have_no_jumps():
     random = np.random.default_rng(0)
     steps = np.repeat(random.uniform(-1, 1, 60), 50)
     q = np.zeros_like(t)
-    for k in range(1, len(t)):  # a servo that follows steps within some samples
+    for k in range(1, len(t)):  # the simulated servo reaches a step of its command within some samples
         q[k] = q[k - 1] + 0.4 * (steps[k - 1] - q[k - 1])
     counts = 2 * np.pi / 4096
     q = np.round(q / counts) * counts
@@ -317,7 +325,10 @@ def columns_of(columns, quantity, joints):
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, tmp_path, form):
-    """Position and command wrap at different rows, and may start a revolution apart."""
+    """Wrapped servo commands and positions are unwrapped together.
+
+    They wrap at different rows, and may start a revolution apart.
+    """
     for number, name in enumerate(ROBOTS):
         text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
         (tmp_path / f"{name}.urdf").write_text(text)

@@ -1,4 +1,4 @@
-"""Logs beyond the bound of memory: evenly spread segments are kept, file by file, and fitted like any other logs."""
+"""Logs beyond the bound of memory: evenly spread segments of all files are kept, and fitted like any other logs."""
 
 import subprocess
 import sys
@@ -24,12 +24,12 @@ from spelgen.settings.fits import Rollout
 
 JOINTS = ("shoulder", "elbow")
 MOTORS = ("joint1", "joint2")
-ROW = 8 * 7  # bytes of a row: t, and q, qd, tau of two joints
+ROW = 8 * 7  # [bytes] size of a row: t, and q, qd, tau of two joints
 SEGMENT = 50
 
 
 def recordings(count=8, samples=400, rate=100.0) -> list[Trajectory]:
-    """Smooth motion at jittered times."""
+    """Return logs of smooth motions at jittered sample times."""
     random = np.random.default_rng(0)
     found = []
     for number in range(count):
@@ -46,7 +46,7 @@ def same(first: Trajectory, second: Trajectory) -> bool:
 
 @pytest.fixture
 def bound(monkeypatch):
-    """Set the bound of the kept samples, in rows."""
+    """Return a function that sets the bound of kept samples to a number of rows."""
 
     def set_bound(rows: int) -> None:
         tuning = replace(segments.TUNING, kept_bytes=ROW * rows, segment_samples=SEGMENT)
@@ -69,7 +69,7 @@ def test_logs_within_the_bound_are_read_whole(tmp_path, bound, format):
 @pytest.mark.parametrize("files", [1, 4])
 @pytest.mark.parametrize("rows", [100, 700, 1599, 3199])
 def test_kept_segments_are_evenly_spread_over_all_files(tmp_path, bound, files, rows):
-    """The bound holds, each segment is consecutive rows of the log, and every k-th segment is kept, of all files."""
+    """Every k-th segment of consecutive rows is kept, over all files, and the bound is not exceeded."""
     logs = recordings()
     for number in range(files):
         share = len(logs) // files
@@ -145,7 +145,10 @@ def test_windows_of_reduced_logs_cross_no_gap(tmp_path, bound):
 
 
 def test_a_fit_of_reduced_logs_is_one_of_its_samples(robots, tmp_path, bound):
-    """The same weights, split and digest as of the kept samples in memory; a resumed run finds the same samples."""
+    """A fit to logs beyond the bound equals a fit to the kept samples in memory: weights, split and digest.
+
+    A resumed run uses the same samples.
+    """
     module = tmp_path / "arm.py"
     module.write_text(generate(robots / "two_link.urdf", preset="spel", width=4))
     write_logs(tmp_path / "train.parquet", recordings(), MOTORS)
@@ -189,7 +192,7 @@ print(peak() - before)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
 @pytest.mark.parametrize(("format", "rows", "files"), [("parquet", 120_000, 6), ("csv", 40_000, 6)])
 def test_memory_is_bounded_by_the_largest_file_and_the_kept_samples(tmp_path, format, rows, files):
-    """Peak of a process: three times the size of the largest file, and four times the kept numbers."""
+    """Peak memory is below three times the largest file plus four times the kept samples."""
     random, kept, joints = np.random.default_rng(0), 4_000_000, [f"j{k}" for k in range(7)]
     for number in range(files):
         log = Trajectory(np.arange(rows) / 1000.0, *random.standard_normal((3, rows, 7)))
@@ -202,5 +205,5 @@ def test_memory_is_bounded_by_the_largest_file_and_the_kept_samples(tmp_path, fo
         peaks[function] = int(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
     largest = (tmp_path / f"0.{format}").stat().st_size
     assert peaks["read_bounded_logs"] < 3 * largest + 4 * kept
-    # the measure sees all numbers that are in memory
+    # without the bound, the measured peak memory contains all samples
     assert peaks["read_logs"] > 8 * 22 * rows * files

@@ -1,4 +1,4 @@
-"""Delays of single joints, copied torques, wrongly stated units: each is named with the line that mends it."""
+"""Delays of single joints and wrongly stated units are named with the line that corrects them."""
 
 import re
 from dataclasses import replace
@@ -26,7 +26,7 @@ def delayed(log, k, delay, motion, torque):
 @pytest.mark.parametrize(("motion", "torque"), [(True, False), (False, True), (True, True)])
 def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_path):  # noqa: F811
     rng = np.random.default_rng(len(arm.chain.name) + 2 * motion + torque)
-    # the first two joints: the delay of a light link may be invisible
+    # the delayed joint is joint 1 or 2, as the delay of a light link may have no visible effect
     k, delay = int(rng.integers(2)), float(rng.uniform(0.06, 0.14) * rng.choice([1, -1]))
     log = recorded(arm, int(rng.integers(1000)), excitation, noise=0.01)
     wrong = delayed(log, k, delay, motion, torque)
@@ -38,7 +38,7 @@ def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_pat
     inner = (read.t > 0.2) & (read.t < log.t[-1] - 0.2)
     for name in ("q", "qd"):
         expected = np.stack([np.interp(read.t, log.t, x) for x in getattr(log, name).T], axis=1)
-        # within 15 ms of motion
+        # the corrected log differs by at most the motion within 15 ms
         bound = 0.015 * np.abs(np.gradient(expected, read.t, axis=0)).max(axis=0) + 1e-6
         assert (np.abs(getattr(read, name) - expected)[inner].max(axis=0) <= bound).all()
     assert check_logs([read], again).errors == ()
@@ -53,7 +53,7 @@ def test_torques_of_all_joints_that_are_late_have_one_line(arm):  # noqa: F811
 
 @pytest.mark.parametrize(("rate", "torque"), [(1.015, True), (0.985, True), (1.006, False)])
 def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torque):  # noqa: F811
-    """A constant delay would explain only a part of such a log, and no setting corrects it."""
+    """A joint whose clock runs fast or slow is named; no setting corrects it, and no constant delay is advised."""
     k, log = len(arm.chain.joint_names) // 2 - 1, recorded(arm, 21, excitation, noise=0.01)
 
     def stamped(values):
@@ -62,7 +62,7 @@ def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torqu
         return values
 
     tau = stamped(log.tau) if torque else log.tau
-    # the joint with a slow clock has no values at the end
+    # the log ends earlier, since the joint with the slow clock has no values at the end
     wrong = replace(log, q=stamped(log.q), qd=stamped(log.qd), tau=tau)[: int(0.97 * len(log))]
     error = told(arm, wrong)
     assert f"joint {arm.chain.joint_names[k]!r}: got" in error and "--accept joint-clock" in error
@@ -75,7 +75,7 @@ def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torqu
 @pytest.mark.parametrize("arm", ["six_dof", "ur10e"], indirect=True)
 @pytest.mark.parametrize("units", [{"q": "deg"}, {"q": "deg", "qd": "rad/s"}])
 def test_a_unit_of_positions_that_contradicts_the_velocities_is_named(arm, units):  # noqa: F811
-    """The velocities are right: the answer is not another unit for them."""
+    """If the stated unit of positions contradicts right velocities, the message names the unit of the positions."""
     mapping = LogMapping.model_validate({"units": units})
     log = recorded(arm, 13)
     error = told(arm, replace(log, q=np.deg2rad(log.q), mapping=mapping), mapping)
@@ -91,7 +91,7 @@ def test_a_unit_of_positions_that_contradicts_the_velocities_is_named(arm, units
     indirect=["arm"],
 )  # fmt: skip
 def test_a_unit_of_torques_that_the_mapping_states_wrongly_is_named(arm, sign, line):  # noqa: F811
-    """The answer is the unit, and not a gain of 1000 on mNm."""
+    """If the stated unit of torques is wrong, the message states the right unit, instead of a gain of 1000 on mNm."""
     mapping = LogMapping.model_validate({"units": {"tau": "mNm"}})
     log = recorded(arm, 13)
     error = told(arm, replace(log, tau=sign * 1e-3 * log.tau, mapping=mapping), mapping)
@@ -126,7 +126,10 @@ def test_a_unit_that_the_mapping_states_wrongly_is_named(arm, stated, logged):  
 
 
 def test_torques_in_ticks_are_named_although_inertia_dominates(robots):
-    """Gravity is a small part of the torque: the ratio of the gravity of a fit to the URDF's shows the unit."""
+    """Torques in units of a register are named although gravity is only a small part of the torque.
+
+    The unit is found from the ratio of fitted gravity parameters to the URDF's.
+    """
     small = load_arm(robots / "two_link.urdf")
     log = recorded(small, 1, noise=0.01)
     error = told(small, replace(log, tau=log.tau * 1000 / 30))

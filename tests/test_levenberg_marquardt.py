@@ -18,7 +18,7 @@ from spelgen.settings.fits import CONFIGS
 
 
 class Rosenbrock:
-    """10 (y - x^2) and 1 - x, whose sum of squares has its minimum at (1, 1)."""
+    """The Rosenbrock problem: residuals 10 (y - x^2) and 1 - x, whose sum of squares has its minimum at (1, 1)."""
 
     def residual(self, x):
         return torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
@@ -39,7 +39,7 @@ def first_state(problem):
 
 
 def test_the_minimum_of_the_rosenbrock_function_is_found():
-    """No step raises the cost, every step is reported, and a run from the minimum takes none."""
+    """The solver finds the minimum: no step raises the cost, each is reported, and at the minimum it takes no step."""
     problem, states = Rosenbrock(), [first_state(Rosenbrock())]
     result = levenberg_marquardt(
         problem, states[0], max_steps=100, min_decrease=1e-20, callback=states.append
@@ -63,7 +63,10 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 
 
 def test_an_ascent_direction_ends_the_solver():
-    """With the sign of the step wrong no damping lowers the cost, until the step is negligible."""
+    """If steps have the wrong sign, so that no damping lowers the cost, the solver ends with this reason.
+
+    It ends with the reason of a small prediction, if the predicted reduction is negligible.
+    """
 
     class Ascending(Rosenbrock):
         def candidates(self, x, step):

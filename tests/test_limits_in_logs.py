@@ -1,4 +1,4 @@
-"""Torques that are clipped and positions at a stop are named; flat signals that the motion explains are not doubted."""
+"""Clipped torques and positions at a stop are named; flat signals that the motion explains are accepted."""
 
 import re
 from dataclasses import replace
@@ -16,7 +16,7 @@ from spelgen.settings.log_mapping import LogMapping
 
 
 def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
-    """Return the limits in the errors about clipped torques, per joint; every error must be one of these."""
+    """Return the limits in the errors about clipped torques, per joint; a log may have no other errors."""
     found = {}
     for error in check_logs([log], arm).errors:
         joint, limits = re.match(r"joint '(.*)', tau: got torques that stop at (.*?) N", str(error)).groups()
@@ -27,13 +27,16 @@ def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
 @pytest.mark.parametrize("motion", [excitation, pick_and_place])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_joints_with_clipped_torques_are_named_with_their_limits(arm, motion, seed):  # noqa: F811
-    """All joints at one fraction of their largest torque, or one of them at limits that differ in sense."""
+    """Clipped torques are named with their limits: of all joints at a fraction of the largest torque, or of one joint.
+
+    The limits of one joint may differ in both directions.
+    """
     log = recorded(arm, seed, motion)
     names, rng = arm.chain.joint_names, np.random.default_rng(seed)
     limit = 0.6 * np.abs(log.tau).max(axis=0)
     found = clipped_joints(arm, replace(log, tau=np.clip(log.tau, -limit, limit)))
     share = (np.abs(log.tau) > limit).mean(axis=0)
-    # a joint that is at its limit most of the time has too few other samples that contradict it
+    # joints that are at the limit for more than 40 % of the time have too few other samples to be named
     assert {names[k] for k in np.flatnonzero((share > 0.05) & (share < 0.4))} <= found.keys()
     assert found
     assert all(
@@ -48,7 +51,7 @@ def test_the_joints_with_clipped_torques_are_named_with_their_limits(arm, motion
 
 
 def test_clipped_torques_are_refused_and_slower_motion_mends_them(arm):  # noqa: F811
-    """The message advises slower motion: at a third of the speed: the clipped torques were torques of acceleration."""
+    """Clipped torques are refused with the advice of slower motion; at a third of the speed nothing is clipped."""
     log = recorded(arm, 3)
     slow = recorded(arm, 3, lambda arm, rng: (excitation(arm, rng)[0] * 3, excitation(arm, rng)[1]))
     k = int((np.abs(log.tau).max(axis=0) / np.abs(slow.tau).max(axis=0)).argmax())
@@ -64,7 +67,7 @@ def test_clipped_torques_are_refused_and_slower_motion_mends_them(arm):  # noqa:
 
 
 def test_torques_of_uniform_acceleration_are_flat_and_right(robots):
-    """One vertical joint that accelerates and brakes with one value: both tops of its torque are flat."""
+    """The flat torque of a vertical joint that accelerates and brakes uniformly is not reported as clipped."""
     arm = load_arm(robots / "scara.urdf")  # noqa: F811
     t = np.arange(0.0, 20.0, 1 / RATE)
     n = len(arm.chain.coordinates)

@@ -1,4 +1,4 @@
-"""The estimator finds a payload, contacts and friction that were added to torques; its equations hold."""
+"""The live estimator finds a payload, contacts and friction changes that were added to torques; its equations hold."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ def numbers(*arrays):
 
 @pytest.fixture(scope="module")
 def arm():
-    """A model with hysteresis, 12 s of motion at 200 Hz, its torques, and a run of it."""
+    """Return a model with hysteretic friction, a log of 12 s at 200 Hz with its torques, and the accelerations."""
     model = moved_model("six_dof", "closed-form", 0.1).double()
     t = np.arange(0.0, 12.0, 1 / RATE)
     coarse = np.arange(0.0, 13.0, 0.01)
@@ -65,7 +65,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """A run folder of the model, with noise levels from half a minute of logs."""
+    """Return a run folder of the model, with noise levels of half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
     folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
@@ -74,7 +74,7 @@ def run(arm, levels, tmp_path_factory):
 
 
 def loaded(model, log, qdd, theta):
-    """The torques of a log with a payload: by the regressor of the last body."""
+    """Return the torques of a log plus the torques of a payload theta (10,) at the last body, (T, n) [Nm]."""
     rows = chain_regressor(model.chain, log.q, log.qd, qdd)[:, :, -10:]
     return log.tau + rows @ theta
 
@@ -92,7 +92,10 @@ def coupled(folder):
 
 @pytest.mark.parametrize("robot", ["six_dof", "rpr", "coupled"])
 def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
-    """d/dt p = torque - friction along any motion, also of mimic and prismatic joints and coupled motors."""
+    """dp/dt of the momentum balance equals torque minus friction along any motion.
+
+    This holds for mimic joints, prismatic joints and coupled motors as well.
+    """
     urdf = coupled(tmp_path) if robot == "coupled" else ROBOTS / f"{robot}.urdf"
     model = build(urdf, "hybrid").double()
     random = np.random.default_rng(1)
@@ -116,7 +119,7 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
 
 
 def test_the_jacobian_is_the_velocity_of_the_tip(arm):
-    """J qd is the derivative of the tip's position, which `TipKinematics` computes."""
+    """The estimator's Jacobian of the tip equals the one of `TipKinematics`."""
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.dynamics.tip_frame import tip_frame
 
@@ -153,7 +156,7 @@ def test_a_payload_is_found_with_its_intervals(arm, levels, run):
         PAYLOAD[1:4] / 2 < payload.center_interval[:, 1]
     )
     assert inside.sum() >= 2
-    # physically consistent
+    # the estimated payload is physically consistent
     assert np.linalg.eigvalsh(pseudo_inertia(torch.from_numpy(payload.parameters)).numpy())[0] > 0
 
 
@@ -166,7 +169,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # beyond 0.3 s without the disturbance
+    # predictions of more than 0.3 s ahead do not include the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
 
@@ -185,14 +188,14 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
 
 
 def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
-    """A force of 40 N at the tip for half a second."""
+    """A force of 40 N at the tip for half a second is detected within 60 ms, with its joint torques and force."""
     model, log, _ = arm
     jacobian = load_terms(model.chain, *numbers(log.q, log.qd, levels.point))[2].numpy()
     force = np.array([0.0, 30.0, -27.0])
     torque = np.einsum("tij,i->tj", jacobian, force)
     begin, end = 7.0, 7.5
     acts = ((log.t >= begin) & (log.t < end))[:, None]
-    # an external torque lowers the measured one
+    # an external torque reduces the torque that the motors need
     _, states = estimates(run, levels, log, log.tau - acts * torque)
     touched = np.array([state.t for state in states if state.contact.touched.any()])
     assert begin < touched[0] < begin + 0.06
@@ -203,7 +206,7 @@ def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):
 
 
 def test_a_contact_is_reported_until_it_ends(arm, levels, run):
-    """The disturbance adapts to the contact, and is not removed from it."""
+    """A contact of two seconds is reported until it ends, although the disturbance estimate adapts to it."""
     _model, log, _ = arm
     acts, torque = (log.t >= 7.0) & (log.t < 9.0), 0.1 * EFFORT[1]
     _, states = estimates(run, levels, log, log.tau - np.outer(acts, torque * (np.arange(6) == 1)))
@@ -226,7 +229,10 @@ def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
 
 
 def test_delayed_torques_are_compared_with_the_motion_of_their_time():
-    """Torques are logged 15 ms late: the fit finds the delay; without it, motion would give external torques."""
+    """Torques that are logged 15 ms late are compared with the motion at their time.
+
+    The fit finds the delay; without it, the motion would cause wrong external torques.
+    """
     urdf, late = ROBOTS / "two_link.urdf", 3
     model = moved_model("two_link", "closed-form", 0.03).double()
     random = np.random.default_rng(4)
@@ -243,7 +249,7 @@ def test_delayed_torques_are_compared_with_the_motion_of_their_time():
 
     def external_torques(delay):
         states = Estimator(fit, levels=levels.model_copy(update={"delay": delay})).replay(log[3500:])
-        # the friction state is unknown in the first seconds
+        # the first three seconds are omitted, in which the friction state is unknown
         torques = [x.contact.external_torque / levels.observer for x in states[600:]]
         return np.sqrt(np.mean(np.square(torques), axis=0))
 
@@ -251,7 +257,7 @@ def test_delayed_torques_are_compared_with_the_motion_of_their_time():
 
 
 def test_friction_drift_is_found(arm, levels, run):
-    """Friction is 4 % larger, or smaller, than in the model; the prior standard deviation is 3 %."""
+    """Friction that is 4 % larger or smaller than in the model is estimated; the prior standard deviation is 3 %."""
     model, log, _ = arm
     z = bristles_along(log.q, bristle_reach(model))
     friction = model.friction_torque(*numbers(log.q, log.qd, z)).numpy()
@@ -291,7 +297,7 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
     }  # fmt: skip
     with pytest.raises(ValueError, match=r"got q, qd and tau \(1, 5\), .*, expected \(1, 6\): 6 joints"):
         step(101, q=log.q[101, :5])
-    # a clock that was set back for good
+    # a clock that stays set back is accepted after some samples
     for k in range(TUNING.restart - 1):
         assert step(101 + k, t=0.001 * k) == "reversed"
     assert step(110, t=0.1) == "gap"
@@ -299,7 +305,7 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
 
 
 def test_hostile_samples_give_finite_estimates(arm, levels, run):
-    """NaN, jumps, zero and negative steps and saturated torques, one in three samples."""
+    """Estimates stay finite if one in three samples has NaN, jumps, a zero or negative step, or saturated torques."""
     _model, log, _ = arm
     random = np.random.default_rng(5)
     t, q, qd, tau = (x.copy() for x in (log.t, log.q, log.qd, log.tau))
@@ -321,7 +327,7 @@ def test_hostile_samples_give_finite_estimates(arm, levels, run):
 
 
 def test_one_log_has_one_result(arm, levels, run):
-    """Sample by sample as along the log; the same bytes each time."""
+    """Samples one at a time give the same estimates as a whole log, in the same bytes each time."""
     _model, log, _ = arm
     short = log[:600]
     _, states = estimates(run, levels, short, short.tau)
@@ -336,7 +342,10 @@ def test_one_log_has_one_result(arm, levels, run):
 
 @pytest.mark.parametrize("offset", [0.0, 0.5], ids=["consistent", "outside of the cone"])
 def test_the_payload_is_the_map_estimate(offset):
-    """Its cost is as low as by a general solver, also if the likelihood is largest far outside of the cone."""
+    """The payload estimate has the smallest cost that a general solver finds.
+
+    This also holds if the likelihood is largest far outside of the cone of consistent inertias.
+    """
     random = np.random.default_rng(2)
     root = random.standard_normal((10, 10)) * TUNING.load_prior * 2e-3
     covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(TUNING.load_prior**-2.0))
@@ -348,7 +357,10 @@ def test_the_payload_is_the_map_estimate(offset):
     linear, precision = precision @ mean, precision - np.diag(TUNING.load_prior**-2.0)
 
     def cost(factor):
-        """Of a triangular root of the pseudo-inertia, for the prior mean of 2 kg; always consistent."""
+        """Return the cost of the payload whose pseudo-inertia has this triangular root (10,), so that it is consistent.
+
+        The prior mean is 2 kg.
+        """
         triangle = np.zeros((4, 4))
         triangle[np.tril_indices(4)] = factor
         inertia = triangle @ triangle.T + 1e-12 * np.eye(4)
@@ -378,7 +390,10 @@ def test_an_indefinite_covariance_is_no_payload_and_no_error():
 
 
 def test_noise_levels_are_those_of_the_residuals():
-    """White noise and an Ornstein-Uhlenbeck process of known size, under drifting friction and an offset."""
+    """Estimated noise levels are the true ones of white noise and of an Ornstein-Uhlenbeck disturbance.
+
+    Friction drifts, and there is a torque offset.
+    """
     random = np.random.default_rng(0)
     white, disturbance, constant = np.array([0.3, 1.0]), np.array([0.6, 1e-9]), 0.8
     decay = np.exp(-0.1 / constant)
@@ -397,22 +412,28 @@ def test_noise_levels_are_those_of_the_residuals():
 
 @pytest.mark.parametrize("minutes", [0.2, 2.0])
 def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
-    """Alarms of 300 arms whose peaks are exponential, for thresholds from one log each."""
+    """Thresholds from one short log of each of 300 arms give less than one false alarm per minute, on average.
+
+    The peaks of residuals are exponentially distributed.
+    """
     random, windows = np.random.default_rng(0), round(60 * minutes / TUNING.window)
     alarms = []
     for _ in range(300):
         third = np.array_split(random.exponential(size=(windows, 6)), 3)
         tail = held_out_tail([1.0 + peaks for peaks in third], levels)
         thresholds = levels.model_copy(update=tail).thresholds(1.0)
-        # probability of a peak above its threshold, times the number of peaks per minute
+        # expected alarms per minute: probability that a peak exceeds its threshold, times peaks per minute
         alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
     assert np.mean(alarms) < 1.0
-    # not by thresholds that nothing reaches: without errors in the estimates they would be log(720) + 1 = 7.6
+    # thresholds are not arbitrarily high; without estimation errors they would be log(720) + 1 = 7.6
     assert np.median(thresholds) < 25.0
 
 
 def test_scales_of_peaks_are_shrunk_by_their_error(levels):
-    """Equal scales become nearly equal; different scales that many peaks determine remain different."""
+    """Scales of peaks are shrunk towards each other by their standard error.
+
+    Equal scales become nearly equal; different scales that many peaks determine remain different.
+    """
     random, n = np.random.default_rng(2), len(EFFORT)
 
     def scales(windows, true):
@@ -428,18 +449,18 @@ def test_scales_of_peaks_are_shrunk_by_their_error(levels):
     shrunk, single, count = scales(1000, true)
     np.testing.assert_allclose(shrunk, true / true.mean(), rtol=0.1)
     assert 600 < count < 610
-    # one joint, and joints without any residual
+    # thresholds are finite for one joint, and for joints without any residual
     for joints in (1, 3):
         tail = held_out_tail([np.zeros((20, joints))] * 3, nominal_levels(*np.ones((3, joints))))
         assert all(np.isfinite(value).all() for value in tail.values())
 
 
 def test_thresholds_hold_in_a_log_that_differs(levels):
-    """One log of three has residuals that are twice as large; a further log is like it."""
+    """If one of three logs has residuals twice as large, thresholds hold in a further log like it."""
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
-    # 50 s: at most one alarm
+    # at most one alarm in 50 s
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3
@@ -484,7 +505,7 @@ def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
     payload = json.loads(result.stdout)["payload"]
     assert payload["status"] == "payload"
     assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
-    # the noise levels of the run, for an estimator with this load as part of the arm
+    # the run folder keeps its noise levels, which an estimator of the arm with the load needs
     assert (tmp_path / "run" / "estimator.json").exists()
 
 

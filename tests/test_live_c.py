@@ -1,4 +1,4 @@
-"""The C estimator equals the Python one along recorded logs, keeps its times, and survives hostile samples."""
+"""The C estimator equals the Python estimator along logs, is fast enough, and gives finite results for any sample."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ PLAIN = "-O0"
 
 
 def randomised(urdf, preset="hybrid"):
-    """A model with all terms: its parameters moved by small random numbers."""
+    """Return a model with small random numbers added to all parameters, so that no term is zero."""
     model = build(urdf, preset).double()
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -51,7 +51,7 @@ def require_equal(found: Columns, states: list[EstimatorState], tolerance: float
 
 
 def segments(files: list[Path], arm: Arm) -> Trajectory:
-    """Return a segment of each of the logs in a row, of all together about SAMPLES samples, with gaps of a second."""
+    """Return one log of segments of several recordings, about SAMPLES samples in total, with gaps of a second."""
     columns: list[list[np.ndarray]] = []
     end, count = 0.0, SAMPLES // len(files)
     for (log,) in (read_logs([file], arm) for file in files):
@@ -64,14 +64,17 @@ def segments(files: list[Path], arm: Arm) -> Trajectory:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_c_equals_python_along_recordings(name, tmp_path):
-    """With an unfitted model, noise as large as its residuals, and delayed torques: every part is busy."""
+    """C and Python estimators give equal outputs along recordings, in conditions that use each part of the estimator.
+
+    The model is not fitted, the noise is as large as its residuals, and torques are delayed.
+    """
     urdf = SHARED / ("arms/panda_erd.urdf" if name == "panda" else f"logs/{name}/{name}.urdf")
     files = sorted((SHARED / "logs" / name).glob("*.parquet"))
     if not files:
         pytest.skip(f"no logs of {name}: the folder of recordings is not here")
     model, arm = randomised(urdf), load_arm(urdf)
     log = segments(files, arm)
-    # The log odds of airbot amplify rounding errors most: without a delay, as in most fits.
+    # airbot has no delay here, since its log odds amplify rounding errors most
     levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels, *([PLAIN] if name != "ur10e" else []))
@@ -84,7 +87,10 @@ def test_c_equals_python_along_recordings(name, tmp_path):
 
 
 def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
-    """A mimic joint, a prismatic one, coupled motors and a passive joint, unusable samples, and early torques."""
+    """C and Python estimators give equal outputs with mimic and prismatic joints, coupled motors and a passive joint.
+
+    Some samples are unusable, and torques are early.
+    """
     (tmp_path / "arm.urdf").write_text(COUPLED)
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")
@@ -112,7 +118,7 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
 
 
 def motion_of(model, seconds: float) -> Trajectory:
-    """A smooth motion with the torques of the model."""
+    """Return a log of a smooth motion with the torques of the model."""
     q, qd, qdd = smooth_motion(model.n, seconds, np.random.default_rng(3))
     state = [bristles_along(q, bristle_reach(model))] if model.elements else []
     with torch.no_grad():
@@ -123,7 +129,7 @@ def motion_of(model, seconds: float) -> Trajectory:
 
 
 def hostile(log: Trajectory, count: int | None = None) -> tuple[np.ndarray, ...]:
-    """Samples of a log, repeated to a number of samples, of which one in five is not usable."""
+    """Return times and samples of a log, repeated up to `count` samples, of which one in five is unusable."""
     random = np.random.default_rng(5)
     rows = np.arange(count or len(log)) % len(log)
     laps = np.arange(len(rows)) // len(log)
@@ -139,8 +145,8 @@ def hostile(log: Trajectory, count: int | None = None) -> tuple[np.ndarray, ...]
     t[kinds == 5] -= 0.5
     t[1:][kinds[1:] == 6] = t[:-1][kinds[1:] == 6]
     tau[kinds == 7] = 1e9
-    t[len(t) // 2 :] += 3.0  # a gap
-    t[2 * len(t) // 3 :] -= 5.0  # a clock that is set back
+    t[len(t) // 2 :] += 3.0  # a gap of 3 s in the times
+    t[2 * len(t) // 3 :] -= 5.0  # the clock is set back by 5 s
     return t, q, qd, tau
 
 
@@ -157,7 +163,7 @@ def test_a_million_hostile_samples_give_finite_estimates():
         rows = slice(start, start + 10**5)
         found = compiled.run(t[rows], q[rows], qd[rows], tau[rows])
         for name, values in vars(found).items():
-            # an upper limit of the mass is infinite before the first report
+            # the upper limit of the mass is infinite before the first report
             assert np.isfinite(values[found.limit < np.inf] if name == "limit" else values).all(), name
         total += len(found.mass)
     counts = compiled.refused()
@@ -191,7 +197,7 @@ def test_a_saved_state_is_restored_and_a_damaged_one_is_not():
     state = compiled.saved()
     compiled.start()
     assert compiled.restore(state)
-    # a clock that starts again, with all that was found
+    # after `restore`, times may start at zero again, and all estimates are kept
     after = compiled.run(log.t[:50], log.q[:50], log.qd[:50], log.tau[:50])
     assert (after.refusal == 0).all()
     np.testing.assert_array_equal(after.status[0], before.status[-1])
@@ -218,7 +224,7 @@ def test_a_run_with_noise_levels_exports_the_estimator(tmp_path):
 
 
 def test_step_and_report_take_microseconds(tmp_path):
-    """At most 5 us a step of seven joints and 1 ms a report on a desktop; ten times as long on a loaded machine."""
+    """A step of seven joints takes at most 5 us and a report 1 ms; limits are ten times larger for loaded machines."""
     urdf = Path(__file__).parents[1] / "robots" / "panda.urdf"
     model = randomised(urdf, "closed-form")
     log = motion_of(model, 20.0)

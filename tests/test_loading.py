@@ -59,7 +59,7 @@ def test_line_ends_of_another_system_are_accepted(module):
 @pytest.mark.parametrize("standalone", [False, True])
 @pytest.mark.parametrize("edit", ["append", "insert", "number"])
 def test_an_edited_module_is_refused_and_not_executed(tmp_path, standalone, edit):
-    """A line with a side effect at either end, and a changed number that the specification does not state."""
+    """A module with an added statement or a changed number is refused, and its code is not executed."""
     path, mark = tmp_path / "module.py", tmp_path / "mark"
     text = built("rpr", standalone=standalone)[0]
     effect = f"open({str(mark)!r}, 'w').close()\n"
@@ -80,7 +80,10 @@ def test_an_edited_module_is_refused_and_not_executed(tmp_path, standalone, edit
 
 
 def test_the_remedy_for_an_edited_module_works(tmp_path):
-    """`from MODULE import Model` gives a model that `spelgen.fit` accepts; a run folder cannot keep it."""
+    """The advised `from MODULE import Model` gives a model of an edited module that `spelgen.fit` accepts.
+
+    A run folder refuses to keep it.
+    """
     import spelgen
     from spelgen.errors import RunError
     from spelgen.settings.fits import Rollout
@@ -124,7 +127,7 @@ def test_what_is_no_module_is_refused(tmp_path):
 
 
 def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_path):
-    """Modules had their facts, and a runtime, where the specification is now; formats have numbers."""
+    """Modules of earlier formats, or without a specification, are refused with the advice to build and train again."""
     old = tmp_path / "old.py"
     old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
     assert refusal(old) == (
@@ -143,7 +146,7 @@ def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_pat
 
 
 def test_a_specification_is_checked_like_any_file(module):
-    """Even if the rest of the module is the text of its specification."""
+    """A specification with invalid values is refused even if the module's text agrees with it."""
     spec = read_spec(module)
     joint = replace(spec.joints[0], armature=float("nan"))
     module.write_text(module_text(replace(spec, joints=(joint, *spec.joints[1:]))), encoding="utf-8")

@@ -102,15 +102,18 @@ def test_prismatic_counts_are_metres(tmp_path):
 
 
 def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
-    t = np.concatenate([np.arange(50) * 0.01, 5 + np.arange(50) * 0.01, [20.0]])  # two gaps
+    # the times have gaps after 0.5 s and before the last sample
+    t = np.concatenate([np.arange(50) * 0.01, 5 + np.arange(50) * 0.01, [20.0]])
     log = {"t": t, "q_a": np.sin(t), "tau_a": t}
     path = parquet(tmp_path / "x.parquet", log)
     with pytest.raises(LogError, match=r"missing column qd_a: got only the columns t, q_a, tau_a"):
         read_logs([path], ("a",))
     (found,) = read_logs([path], ("a",), mapping=LogMapping(velocity="differentiated"))
     inner = [k for k in range(100) if k % 50 not in (0, 49)]
-    np.testing.assert_allclose(found.qd[inner, 0], np.cos(t[inner]), atol=2e-5)  # dt^2 / 6
-    assert np.abs(found.qd[[0, 49, 50, 99], 0] - np.cos(t[[0, 49, 50, 99]])).max() < 0.006  # dt / 2
+    # error of central differences, dt^2 / 6
+    np.testing.assert_allclose(found.qd[inner, 0], np.cos(t[inner]), atol=2e-5)
+    # error of one-sided differences at the ends of segments, dt / 2
+    assert np.abs(found.qd[[0, 49, 50, 99], 0] - np.cos(t[[0, 49, 50, 99]])).max() < 0.006
     assert found.qd[100] == 0.0
 
 
@@ -136,7 +139,7 @@ def test_typed_times_count_from_the_first_however_small_it_is(tmp_path):
     stamps = 50_000_000 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
     path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.duration("ns"))))
     check(read_logs([path], JOINTS)[0], "x", rtol=1e-15)
-    # an unset first stamp is followed by a gap
+    # the first time stamp is unset (zero), so that a gap follows it
     stamps = 1_700_000_000_000_000_001 + np.array([0, 10_000_000, 20_000_000, 30_000_000])
     stamps[0] = 0
     path = parquet(tmp_path / "x.parquet", columns(t=pa.array(stamps, pa.timestamp("ns"))))
@@ -145,7 +148,7 @@ def test_typed_times_count_from_the_first_however_small_it_is(tmp_path):
 
 def test_measured_currents_times_gains_are_the_recorded_torques(shared):
     gains = {"shoulder_pan": 14.87, "shoulder_lift": 13.26, "elbow": 11.13, "wrist_1": 10.62}
-    gains |= {"wrist_2": 11.03, "wrist_3": 11.47}  # [Nm/A], logs/README.md
+    gains |= {"wrist_2": 11.03, "wrist_3": 11.47}  # [Nm/A] motor gains of the UR10e, from logs/README.md
     joints = [f"{name}_joint" for name in gains]
     text = {
         "columns": {"tau": "i_{joint}"},
@@ -313,8 +316,11 @@ def test_npz_never_unpickles(tmp_path):
         read_logs([tmp_path], JOINTS)
 
 
-def test_arrays_that_are_not_asked_for_are_not_looked_at(tmp_path):
-    """A member that inflates to 2 GB of zeros, one that is no array, and one that is pickled."""
+def test_arrays_that_are_no_columns_are_not_read(tmp_path):
+    """Members of an archive that are no columns of the log are not read.
+
+    One inflates to 2 GB of zeros, one is no array, one is pickled.
+    """
     np.savez_compressed(tmp_path / "x.npz", **columns(pickled=np.array([print], dtype=object)))
     with zipfile.ZipFile(tmp_path / "x.npz", "a", compression=zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("README.txt", "how this was recorded")
@@ -355,7 +361,10 @@ def test_arrays_that_promise_more_than_they_hold_are_refused(tmp_path):
 
 
 def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monkeypatch):
-    """As docs/extending.md says: reading, folders, messages and suggestions follow."""
+    """A new log format needs only a reader and its name in FORMATS, as docs/extending.md states.
+
+    Reading, folders, messages and suggestions then include it.
+    """
 
     def read(file, joints, mapping):
         rows = [[float(x) for x in line.split()] for line in file.read_text().splitlines()]
@@ -381,7 +390,10 @@ def test_a_trajectory_named_twice_in_a_column_is_one_text(tmp_path):
 
 
 def test_repeated_patterns_do_not_backtrack(tmp_path):
-    """Six open ends on a name of 5000 letters: by a regular expression, centuries."""
+    """A column pattern with six placeholders is matched quickly against a name of 5000 letters.
+
+    A regular expression would backtrack for centuries.
+    """
     np.savez(tmp_path / "x.npz", **{"a" * 5000: T})
     with pytest.raises(LogError, match="missing column"):
         read_logs(tmp_path / "x.npz", JOINTS, {"columns": {"t": "{trajectory}" * 6 + "t"}})
@@ -406,7 +418,7 @@ STATE = "sensor_msgs/msg/JointState"
 
 @pytest.fixture(params=["MCAP", "SQLITE3"])
 def bag(request, tmp_path):
-    """Write a bag of (topic, names, position, velocity, effort) messages, 10 ms apart; return its folder."""
+    """Return a function that writes a bag of (topic, names, position, velocity, effort) messages, 10 ms apart."""
     pytest.importorskip("rosbags", reason="reading ROS 2 bags needs the extra 'ros'")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -640,7 +652,10 @@ def test_a_wrong_cell_after_lines_of_units_is_reported_with_its_line(tmp_path, f
 
 
 def test_the_cut_last_line_of_a_csv_is_left_out(tmp_path):
-    """A recorder without power; a line that is cut in the middle of a file is an error with its number."""
+    """The incomplete last line of a CSV, as of a recorder that lost power, is omitted with a remark.
+
+    An incomplete line elsewhere is an error with its number.
+    """
     lines = text_log().splitlines()
     (tmp_path / "x.csv").write_text("\n".join([*lines, lines[-1][:9]]))
     (found,) = read_logs(tmp_path / "x.csv", JOINTS)
@@ -710,7 +725,7 @@ def test_lists_do_not_name_recordings(tmp_path):
 
 @pytest.mark.parametrize("form", ["[{}, {}]", "({} {})", "array('d', [{}, {}])"])
 def test_places_of_lists_are_columns(tmp_path, form):
-    """As of sensor_msgs/JointState: a list in a cell for all joints, in the message's order."""
+    """Elements of list columns are addressed by index: a cell has the values of all joints, as in JointState."""
     mapping = {
         "columns": {"t": "time"},
         "joints": {
@@ -754,7 +769,7 @@ def test_accelerations_are_not_offered_as_torques(tmp_path):
 
 
 def joint_states(order=("b", "a")):
-    """Lines as `ros2 topic echo --csv` writes them, at 100 Hz."""
+    """Return 50 lines in the format of `ros2 topic echo --csv` of JointState messages at 100 Hz."""
     lines = []
     for k in range(50):
         values = {"a": (0.01 * k, 1.0, 5.0 + 0.1 * k), "b": (-0.02 * k, -2.0, 7.0)}
@@ -771,7 +786,7 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # the gripper that is also logged is omitted
+    # columns of joints that the arm does not have, such as a gripper, are omitted
     (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
     assert arm_alone.q.shape == (50, 1)
 
@@ -913,7 +928,7 @@ def test_separators_of_thousands_are_an_error_with_what_to_do(tmp_path):
 
 
 def test_vectors_of_matlab_and_conversions_of_other_files(tmp_path, monkeypatch):
-    """The command of each message makes a log of the file."""
+    """For .mat, .npy and .txt files, the command that the error message states converts them to a readable log."""
     import scipy.io
 
     monkeypatch.chdir(tmp_path)

@@ -1,7 +1,7 @@
-"""`spelgen logs` names the lines for a log whose columns, zeros or gravity are others than the settings state.
+"""`spelgen logs` advises the right lines for a log whose columns, zeros or gravity differ from the settings.
 
-Faults are drawn: joint, order, angle and direction. Every line is written into the settings, the log is read again, and
-it is then the log without the fault. Inertials of the URDF are 30 % wrong, torques have noise, and friction.
+Faults are random: joint, order, angle and direction. After the advised line is written into the settings, the log is
+read without the fault. The URDF's inertials are 30 % wrong, torques have noise, and joints have friction.
 """
 
 import re
@@ -21,8 +21,7 @@ from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
 
-# The search for an error takes three seconds with six joints, and one with four, so that most tests run with the first
-# four joints of an arm. Tests of orders of columns and of right logs run with all six joints.
+# most tests use the first four joints of an arm, as a search with six joints takes three seconds, with four one
 ROBOTS = ("rpr", "four_dof")
 RATE, SECONDS = 100.0, 20.0
 
@@ -30,7 +29,7 @@ RATE, SECONDS = 100.0, 20.0
 @pytest.fixture(scope="module", params=ROBOTS)
 def arm(request, robots, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    # without limits: motions are drawn as for any arm
+    # the URDF has no effort limits, which would show the unit of torques
     path = robots / f"{request.param.replace('four', 'six')}.urdf"
     text = re.sub(r'effort="[^"]*"', 'effort="0"', path.read_text())
     if request.param == "four_dof":
@@ -50,14 +49,17 @@ def excitation(arm, rng):
 
 def pick_and_place(arm, rng):
     t = np.arange(0.0, SECONDS, 1 / RATE)
-    s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # 1.6 s of motion, 0.4 s of rest
+    s = np.clip((t % 2.0) / 1.6, 0.0, 1.0)[:, None]  # each motion takes 1.6 s, followed by 0.4 s of rest
     stops = rng.uniform(-1.0, 1.0, (round(SECONDS / 2) + 1, len(arm.chain.coordinates)))
     number = (t // 2.0).astype(int)
     return t, stops[number] + (10 * s**3 - 15 * s**4 + 6 * s**5) * (stops[number + 1] - stops[number])
 
 
 def recorded(arm, seed, motion=excitation, noise=0.02, gravity=1.0) -> Trajectory:
-    """Return a log of an arm whose inertials are 30 % off the URDF's."""
+    """Return a log of an arm whose inertials differ by 30 % from the URDF's, with friction and noise.
+
+    motion: returns times (T,) and positions (T, n). noise: relative. gravity: factor on the gravity torque.
+    """
     rng = np.random.default_rng(seed)
     t, q = motion(arm, rng)
     qd = np.gradient(q, t, axis=0)
@@ -79,7 +81,7 @@ def flipped(log, k, motion, torque):
 
 
 def drawn_joint(log, rng, first=0):
-    # the last link may be symmetric: its sense and its zero are then no matter
+    # the last joint is not drawn, as its link may be symmetric, so that its sense and its zero have no effect
     return int(rng.integers(first, log.q.shape[1] - 1))
 
 
@@ -105,14 +107,14 @@ FAULTS = {
 
 
 def told(arm, log, mapping=None):
-    """Return the only error about a log."""
+    """Return the text of the error about a log; there must be exactly one."""
     report = check_logs([log], arm, mapping)
     (error,) = report.errors
     return str(error)
 
 
 def mended(arm, error, logs):
-    """Return the arm with the first line that an error advises in its settings, and the logs read again with it."""
+    """Write the first line that an error advises into the settings; return the arm and the logs, both read again."""
     line, place = re.search(r"write '(.*?)' ((?:under 'logs' )?)in the robot's YAML", error).groups()
     settings = arm.robot.path.with_suffix(".yaml")
     settings.write_text(f"logs: {{{line}}}\n" if place else f"{line}\n")
@@ -166,7 +168,8 @@ def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     turning = [k for k, x in enumerate(arm.chain.coordinates) if x.joint_type == "revolute"]
     k = turning[1] if len(turning) > 2 else 2
     log = recorded(arm, int(rng.integers(1000)))
-    if arm.chain.name == "rpr":  # its last link is rigidly turned: other masses could make up for it
+    # a zero offset of a joint of rpr is not visible, as other inertials explain the same torques
+    if arm.chain.name == "rpr":
         assert check_logs([turned(log, k, np.deg2rad(angle))], arm).errors == ()
         return
     wrong = turned(log, k, np.deg2rad(angle))
@@ -174,7 +177,7 @@ def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     assert "--accept joint-zero" in error
     write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
     _, (read,) = mended(arm, error, tmp_path / "log.csv")
-    # half a turn to either side is the same zero
+    # angles that differ by a whole turn are the same zero
     assert np.abs(np.angle(np.exp(1j * (read.q - log.q)))).max() < 0.1
 
 
@@ -186,7 +189,7 @@ def turned(log, k, angle):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
-    """On a wall, on a ceiling, and anyhow: torques of a base with this mounting."""
+    """The direction of gravity is found for a base on a wall, on a ceiling, and in a random orientation."""
     rng = np.random.default_rng(seed)
     direction = [np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), rng.standard_normal(3)][seed]
     gravity = 9.81 * direction / np.linalg.norm(direction)
@@ -195,12 +198,13 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
-    assert lines, error  # rpr on a ceiling is as well an arm with a joint that turns the other way
+    # for rpr on a ceiling, an equivalent reading with a joint of opposite sense may be listed first
+    assert lines, error
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
 
 def test_a_small_tilt_of_the_base_is_a_warning(arm):
-    """Five degrees about the x axis: the mounting of a robot may be as wrong."""
+    """A base that is tilted by five degrees is a warning, as the mounting of a robot may have this error."""
     tilted = replace(arm, chain=replace(arm.chain, gravity=(0.0, 0.85, -9.77)))
     report = check_logs([recorded(tilted, 16, noise=0.01)], arm)
     assert report.errors == ()
@@ -217,7 +221,7 @@ def test_compensated_gravity_is_called_so(arm, part):
 
 
 def test_another_unit_is_offered_as_gain(arm):
-    """Per mille of 3 Nm: gravity shows the factor as exactly as the masses of the URDF are right."""
+    """Torques in another unit get a gain, which gravity determines as accurately as the masses of the URDF."""
     log = recorded(arm, 6)
     error = told(arm, replace(log, tau=log.tau / 0.003))
     gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
@@ -226,9 +230,9 @@ def test_another_unit_is_offered_as_gain(arm):
 
 
 def test_a_link_with_a_mistyped_mass_is_named(arm):
-    """One mass of the URDF is six times too large, and its tensor about the centre of mass is right."""
+    """A link whose mass in the URDF is six times too large is named; its tensor about the centre of mass is right."""
     moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.chain.bodies]
-    # the first joint of these arms is vertical: its body's first moment is invisible
+    # body 1 is not drawn: joint 1 of these arms is vertical, so that the body's first moment has no effect
     k = 1 + int(np.argmax(moments[1:]))
     body = arm.chain.bodies[k]
     heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
@@ -308,7 +312,7 @@ def test_training_refuses_it_unless_it_is_accepted(arm):
 
 
 def test_a_line_keeps_what_the_mapping_states(arm):
-    """A gain and a sense that are there already are multiplied."""
+    """An advised line keeps the gain and the sense that the mapping already states, multiplied by the correction."""
     joint = arm.chain.joint_names[1]
     mapping = LogMapping.model_validate({"joints": {joint: {"gain": 14.2, "sign": -1}}})
     error = told(arm, flipped(recorded(arm, 8), 1, True, False), mapping)
@@ -317,7 +321,10 @@ def test_a_line_keeps_what_the_mapping_states(arm):
 
 @pytest.mark.parametrize("arm", ["rpr", "six_dof"], indirect=True)
 def test_a_slow_arm_with_right_torques_is_not_refused(arm):
-    """At 12.5 Hz and an eighth of the speed, accelerations are differences of noisy positions."""
+    """A slow arm with right torques is accepted, although its accelerations are differences of noisy positions.
+
+    The log has 12.5 Hz, and the motion an eighth of the speed of the other tests.
+    """
     log = recorded(arm, 9)
     t, qd = 8.0 * log.t, log.qd / 8.0
     rigid = regressor(arm.chain, log.q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(arm.chain)
@@ -329,7 +336,10 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
 
 
 def test_gravity_along_all_axes_is_called_compensated(tmp_path):
-    """With both axes horizontal, gravity along the axes gives the same torques as none."""
+    """Without gravity torques in a log, compensated gravity is reported, not a direction of gravity.
+
+    Both axes are horizontal, so that gravity along the axes would give the same torques.
+    """
     rows = (
         ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
         ("elbow", "revolute", "shoulder_link", "0.3 0 0", "0 1 0", -3, 3, 1),
@@ -347,12 +357,17 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
     error = told(upright, replace(log, tau=log.tau * [37.0, 11.0]))
     gains = np.array(list(map(float, re.findall(r"gain: ([\d.e-]+)", error))))
     assert "--accept torque-unit" in error
-    assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)  # by the coupling of the joints
-    np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))  # by the masses of the URDF
+    # the ratio of both gains is determined by the coupling of the joints
+    assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)
+    # the common factor is determined by the masses of the URDF
+    np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))
 
 
 def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
-    """A driver logs the magnitude of a current: no own factors of all joints, which would lower the error a little."""
+    """If the magnitude of one torque is logged, the error names it, instead of gains of all joints.
+
+    Such gains would lower the residual a little.
+    """
     arm = load_arm(shared / "logs" / "airbot" / "airbot.urdf")
     (log,) = read_logs(shared / "logs" / "airbot" / "ga_N12T25.parquet", arm)
     tau = log.tau.copy()
@@ -364,7 +379,10 @@ def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
 
 @pytest.mark.parametrize("of_all", [False, True])
 def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
-    """The joint whose torque changes its direction most often, or all joints that do so in a tenth of the time."""
+    """Torques that are logged as magnitudes are named, of one joint or of all joints.
+
+    The torque of each named joint has the less frequent sign in more than a tenth of the samples.
+    """
     log = recorded(arm, 14)
     share = np.minimum((log.tau > 0).mean(axis=0), (log.tau < 0).mean(axis=0))
     unsigned = np.full(len(share), True) if of_all else share == share.max()
@@ -374,8 +392,8 @@ def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
     np.testing.assert_array_equal(named, unsigned & (share > 0.1))
 
 
-def test_torques_of_one_direction_by_nature_are_believed(robots, tmp_path):
-    """Gravity loads both joints to one side, in all positions of the log."""
+def test_torques_of_one_direction_by_gravity_are_accepted(robots, tmp_path):
+    """Torques that never change sign, since gravity loads both joints to one side throughout, are accepted."""
     arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
     upright = replace(arm, chain=replace(arm.chain, gravity=(0.0, -9.81, 0.0)))
 
@@ -409,7 +427,7 @@ def made_arm(folder, rows):
 
 @pytest.fixture(scope="module")
 def lift(tmp_path_factory):
-    """Return an arm whose first joint moves along gravity."""
+    """Return an arm whose first joint is a vertical slide."""
     rows = (
         ("slide", "prismatic", "base", "0 0 0", "0 0 1", 0, 0.4, 3),
         ("shoulder", "revolute", "slide_link", "0.1 0 0", "0 0 1", -3, 3, 2),
@@ -426,7 +444,10 @@ def lifting(arm, rng):
 
 
 def hysteresis(q, breakaway):
-    """Return the normalised friction torque (T, n) of one bristle per joint that slips at this deflection [rad, m]."""
+    """Return the normalised friction torque (T, n) of one bristle per joint along positions (T, n).
+
+    breakaway: displacement at which the bristles slip [rad, m].
+    """
     z = np.zeros_like(q)
     for k in range(1, len(q)):
         z[k] = np.clip(z[k - 1] + (q[k] - q[k - 1]) / breakaway, -1, 1)
@@ -435,7 +456,10 @@ def hysteresis(q, breakaway):
 
 @pytest.mark.parametrize("seed", [0, 1, 5])
 def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_path):
-    """The friction of each joint has a hysteresis of 0.05 rad, which is 1.5 % of the torque under both orders."""
+    """Exchanged joints are named although friction has a hysteresis of 0.05 rad.
+
+    The hysteresis is 1.5 % of the torque in both orders of the joints.
+    """
     arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
     log = recorded(arm, seed, noise=0.005)
     log = replace(log, tau=log.tau + 0.3 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
@@ -446,13 +470,13 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
 
 
 def lifted(arm):
-    """Return a log with friction that has a hysteresis of 0.05 m and 0.05 rad."""
+    """Return a log of the lift, whose friction has a hysteresis of 0.05 m and 0.05 rad."""
     log = recorded(arm, 0, lifting)
     return replace(log, tau=log.tau + 0.7 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
 
 
 def test_a_lift_whose_position_runs_the_other_way_is_named(lift):
-    """The load by gravity is the same in both senses: limits and friction are the evidence."""
+    """A vertical slide of opposite sense is found by its limits and friction, as its gravity torque is the same."""
     log = lifted(lift)
     assert check_logs([log], lift).errors == ()
     assert "'joints: {slide: {sign: -1, gain: -1}}'" in told(lift, flipped(log, 0, True, False))

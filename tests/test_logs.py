@@ -28,7 +28,10 @@ JOINTS = ("a", "b")
 
 
 def swing(name="swing", samples=200, dt=0.01, jitter=0.0, seed=0) -> Trajectory:
-    """Two joints that swing at 0.5 and 0.8 Hz, under a made-up torque."""
+    """Return a log of two joints that swing at 0.5 and 0.8 Hz, with arbitrary torques.
+
+    dt: sampling interval [s]. jitter: largest relative change of an interval.
+    """
     random = np.random.default_rng(seed)
     t = np.concatenate([[0.0], np.cumsum(dt * (1 + jitter * random.uniform(-1, 1, samples - 1)))])
     frequency = 2 * np.pi * np.array([0.5, 0.8])
@@ -86,8 +89,8 @@ class TestTrajectory:
         assert "&lt;script&gt;" in hostile._repr_html_() and "<script>" not in hostile._repr_html_()
 
 
-def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
-    """Rows of 3000 recordings in turn; time and memory grow with the rows, not with rows times recordings."""
+def test_alternating_rows_of_recordings_are_separated(tmp_path):
+    """Alternating rows of 3000 recordings are separated, in time and memory that grow with the number of rows only."""
     names = [f"r{k % 3000}" for k in range(12_000)]
     t, values = np.arange(12_000) // 3000 * 0.1, np.arange(12_000.0)
     columns = {"trajectory": names, "t": t, "q_a": values, "qd_a": values, "tau_a": values}
@@ -99,7 +102,7 @@ def test_recordings_are_told_apart_wherever_their_rows_lie(tmp_path):
 
 @pytest.mark.parametrize(("step", "few"), [("read", 500), ("check", 60)])
 def test_many_short_recordings_take_time_by_their_number(tmp_path, step, few):
-    """Two samples each: sixteen times as many took 256 times as long."""
+    """The time of reading and checking recordings of two samples is proportional to their number."""
     random, seconds = np.random.default_rng(0), []
     for count in (few, 16 * few):
         logs = [Trajectory([0, 0.01], *random.standard_normal((3, 2, 2)), name=f"r{k}") for k in range(count)]
@@ -268,7 +271,7 @@ DEGREES = {
 
 @pytest.mark.parametrize("case", DEGREES)
 def test_degrees_are_refused(case):
-    """One error about all joints, with the line for all of them."""
+    """Positions in degrees are one error about all joints, with one line that corrects all joints."""
     trajectory, message, units = DEGREES[case]
     with pytest.raises(LogError) as caught:
         check([trajectory], JOINTS, ("revolute", "revolute"))
@@ -279,7 +282,10 @@ def test_degrees_are_refused(case):
 
 
 def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
-    """Counts of encoders and speeds in units of 0.229 rpm are in no unit of a table, and not late by a slow clock."""
+    """Encoder counts and speeds in units of 0.229 rpm match no common unit by chance, and no slow clock is reported.
+
+    With the mapping that states these units, the log is read in rad and rad/s.
+    """
     log = swing()
     registers = replace(
         log, q=np.round(2048 + log.q * 4096 / 2 / np.pi), qd=np.round(log.qd * 60 / 2 / np.pi / 0.229)
@@ -349,7 +355,10 @@ def test_a_velocity_of_the_motors_of_a_coupled_wrist_is_named(matrix, formula):
 
 
 def test_times_that_contradict_all_velocities_get_the_rate_of_the_velocities(tmp_path):
-    """Frames recorded at 100 Hz and stamped with another rate: the line in the error gives the velocities back."""
+    """If all velocities contradict the times, the advised `sample_rate` restores the right times.
+
+    The log was recorded at 100 Hz, and its time stamps have another rate.
+    """
     sound = swing()
     write_logs(tmp_path / "x.csv", [replace(sound, t=2.5 * sound.t)], JOINTS)
     with pytest.raises(LogError, match=r"'a', 'b': got q that changes 0.4 times as fast as qd") as caught:
@@ -361,7 +370,7 @@ def test_times_that_contradict_all_velocities_get_the_rate_of_the_velocities(tmp
 
 
 def changed(q=None, qd=None, tau=None) -> Trajectory:
-    """The swing, with columns of some joints set to a constant."""
+    """Return the log `swing` with columns of some joints, {joint: value}, set to constants or arrays."""
     arrays = {name: getattr(swing(), name).copy() for name in ("q", "qd", "tau")}
     for array, values in zip(arrays.values(), (q, qd, tau), strict=True):
         for joint, value in (values or {}).items():
@@ -402,7 +411,7 @@ def test_what_never_changes_in_any_trajectory_is_said():
 
 
 def test_noise_of_a_joint_at_rest_is_no_motion():
-    """The encoder and the velocities of the joint have noise, which no derivative of the positions explains."""
+    """Noise of the encoder and of the velocities of a joint at rest is no error, although no motion explains it."""
     rng, length = np.random.default_rng(0), len(swing().t)
     noisy = changed(q={1: 0.5 + 1e-6 * rng.normal(size=length)}, qd={1: 1e-4 * rng.normal(size=length)})
     notes = check([noisy], JOINTS, ("revolute", "revolute"))
@@ -468,7 +477,7 @@ def test_logs_may_begin_at_any_time(rate, first):
     t = first + np.arange(41) / rate
     line = np.stack([t, 2 * t], axis=1)
     regular = regular_times(t, 100.0)
-    assert regular[-1] > t[-1]  # by rounding
+    assert regular[-1] > t[-1]  # the last regular time is later than the log's end by rounding
     np.testing.assert_allclose(resampled(t, line, regular, rate)[:, 1], 2 * regular, atol=1e-12)
 
 
@@ -479,12 +488,12 @@ def test_the_filter_has_no_delay_and_takes_out_noise():
     noisy = Trajectory(clean.t, *(x + e for x, e in zip((clean.q, clean.qd, clean.tau), noise, strict=True)))
     smooth = low_pass(noisy, 5.0)
     np.testing.assert_array_equal(smooth.t, clean.t)
-    middle = slice(50, -50)  # the ends have neighbours on one side only
+    middle = slice(50, -50)  # the ends are omitted, at which the filter has neighbours on one side only
     for quantity in ("q", "qd", "tau"):
         error = getattr(smooth, quantity)[middle] - getattr(clean, quantity)[middle]
         assert (
             np.sqrt(np.mean(error**2)) < 0.045
-        )  # 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms costs 0.009
+        )  # the expected error is 0.1 sqrt(2 cutoff / rate) = 0.032; a delay of 1 ms would add 0.009
     np.testing.assert_allclose(low_pass(clean, 8.0).q[middle], clean.q[middle], atol=2e-5)
 
 
@@ -503,7 +512,7 @@ def test_only_dense_logs_are_filtered_unasked():
     assert automatic.resolved([100.0, 20.0]).cutoff is None
     assert filtered.resolved([100.1]).decimation == 4
     assert Preprocessing(cutoff=0.0).resolved([1000.0]).decimation == 1
-    # an offset of a logger's clock has no effect
+    # rates that differ by the error of a logger's clock have the same decimation
     for nominal in (50.0, 60.0, 100.0, 120.0, 500.0):
         rates = nominal * np.array([0.999, 1.0, 1.001])
         assert len({filtered.resolved([rate]).decimation for rate in rates}) == 1
@@ -519,7 +528,7 @@ def test_the_rate_ignores_gaps():
 def test_windows_hold_the_log_own_times_and_inputs(every):
     trajectory = swing(jitter=0.4)
     windows = cut_windows([trajectory], 4, 2, every, measured=False)
-    start = 2 * 7  # the eighth window starts at sample 14
+    start = 2 * 7  # windows start at every second sample: the eighth at sample 14
     rows = start + every * np.arange(4)
     np.testing.assert_array_equal(windows.q[7], trajectory.q[rows])
     np.testing.assert_array_equal(windows.qd[7], trajectory.qd[rows])

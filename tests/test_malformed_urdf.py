@@ -1,4 +1,4 @@
-"""28 malformed or unusual URDF files are read correctly or refused by a message that names the defect."""
+"""28 malformed or uncommon URDF files are read correctly, or refused by a message that names the defect."""
 
 import csv
 import re
@@ -11,7 +11,7 @@ from spelgen.errors import SpelgenError
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
-# file -> a part of every line of the refusal
+# refused files, and a pattern that each line of the error must match
 REFUSED = {
     "microtaur_rpy_4_numbers": r"origin rpy: got 4 numbers \('.*'\), expected three numbers",
     "spherical_joint_type": r":28: joint 'neck': got the type 'spherical', expected one of revolute, "
@@ -27,7 +27,7 @@ REFUSED = {
     "quadrotor_namespaced_root": r":7: got <robot> in the namespace 'http://drake.mit.edu'",
 }
 
-# file -> the default chain (a space in a name as "_"), codes of the warnings on the robot, and on the arm
+# accepted files: joints of the default chain (a space in a name as "_"), codes of warnings on robot and on arm
 READ = {
     "koch_limit_without_effort": (
         "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6",
@@ -91,7 +91,7 @@ READ = {
 }
 
 
-# file -> joints, outputs, constants, joints that V depends on, base parameters; each proved by numbers below
+# per file: numbers of joints, outputs, constants, joints that V depends on, and base parameters
 FACTS = {
     "koch_limit_without_effort": (6, 18, 3, 5, 36),
     "so100_link_joint_same_name": (5, 12, 3, 4, 29),
@@ -146,7 +146,7 @@ def test_read(nasty, name):
 
 @pytest.mark.parametrize("name", READ)
 def test_accepted_files_are_read_correctly(nasty, name):
-    """Derived, and found again by Pinocchio and by another reader of the file."""
+    """Accepted files have the known structure; numerical verification, Pinocchio and another URDF reader confirm it."""
     robot = read_urdf(nasty / f"{name}.urdf")
     arm = make_arm(robot)
     found = derive(arm)

@@ -1,4 +1,4 @@
-"""A run keeps the mapping of its logs: it is adapted and reproduced without it; trained gains have intervals."""
+"""A run keeps the mapping of its logs, and is adapted and reproduced by it; trained gains have intervals."""
 
 import re
 import shlex
@@ -16,7 +16,7 @@ from spelgen.emission.build import build
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.run_facts import commands
 
-GAINS = np.array([1.6, 0.7, 1.4])  # joint torque per logged torque
+GAINS = np.array([1.6, 0.7, 1.4])  # true joint torque per logged torque, of joints 1 and 3
 SIDECAR = """torque: motor
 joints: {joint1: {gear: 1, gain: trained}, joint2: {gear: 1}, joint3: {gear: 1, gain: trained}}
 """
@@ -36,7 +36,7 @@ def invoke(*words):
 
 @pytest.fixture(scope="module")
 def folder(robots, tmp_path_factory):
-    """Folder with an arm, a log that needs its mapping, and a run."""
+    """Return a folder with an arm, a log whose columns need a mapping, and a run that was trained on it."""
     folder = tmp_path_factory.mktemp("mapped")
     (folder / "rpr.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     (folder / "rpr.yaml").write_text(SIDECAR)
@@ -46,7 +46,7 @@ def folder(robots, tmp_path_factory):
     q, qd, qdd = (0.4 * x for x in smooth_motion(3, 8.0, random))
     with torch.no_grad():
         force = model.inverse_dynamics(*map(torch.from_numpy, (q, qd, qdd))).numpy()
-    # without trained gains input and joint torque are equal
+    # joint 2 has no trained gain: its logged torque is the joint torque
     tau = force / np.where([True, False, True], GAINS, 1.0)
     tau += 0.01 * tau.std(axis=0) * random.normal(size=tau.shape)
     unit = np.array([-180 / np.pi, 1e3, 180 / np.pi])
@@ -69,7 +69,7 @@ def test_trained_gains_are_stated_with_intervals_by_training_and_report(folder):
     for (_, *numbers), gain in zip(found, GAINS[[0, 2]], strict=True):
         value, low, high = map(float, numbers)
         assert low < gain < high and low < value < high
-    # nothing but inertia and friction of the last joint, both unknown, determines its gain
+    # the last joint's torque is inertia and friction only, both unknown, so that its gain is not determined
     assert message.endswith("; the gain of joint3 is not determined: friction and inertia scale with it")
     output = " ".join((folder / "output.txt").read_text().split())
     assert found[0][1] in output
@@ -91,7 +91,8 @@ def test_the_lines_that_reproduce_a_run_give_the_same_model(folder, monkeypatch)
     run = RunFolder(folder / "run")
     (work := folder / "again").mkdir()
     monkeypatch.chdir(work)
-    monkeypatch.setattr("spelgen.evaluation.evaluate.SECONDS", ())  # no long predictions
+    # states are not predicted for seconds ahead, to save time
+    monkeypatch.setattr("spelgen.evaluation.evaluate.SECONDS", ())
     for line in commands(run, run.read_spec(), run.read_record()):
         program, *words = shlex.split(
             line.replace("RUN/", f"{run.path}/").replace("LOGS", str(folder / "log.csv"))

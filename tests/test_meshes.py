@@ -1,4 +1,4 @@
-"""Meshes are drawn or replaced by tubes within bounds of time and memory; pipes are never opened."""
+"""Meshes are drawn, or replaced by tubes, within bounds of time and memory; pipes are never opened."""
 
 import base64
 import contextlib
@@ -24,11 +24,11 @@ from spelgen.urdf.geometry import mesh_file
 ARM = """<robot name="r"><link name="a"/><link name="b"><visual><geometry><mesh filename="FILE"/></geometry></visual>
 </link><joint name="j" type="continuous"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/></joint></robot>"""
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
-MANY = 400_000_000  # 4.8 GB as corners of three numbers
+MANY = 400_000_000  # number of vertices, which would take 4.8 GB
 
 
 def test_triangles_without_common_corners_stay_one_surface(tmp_path):
-    """A file may give each triangle corners of its own, as STL does: a simplified ball has no holes."""
+    """A mesh whose triangles have vertices of their own, as in STL, is simplified without holes."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
     apart = trimesh.Trimesh(
         ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3), process=False
@@ -44,7 +44,8 @@ def test_triangles_without_common_corners_stay_one_surface(tmp_path):
 
 
 def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
-    trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")  # 327,680 faces
+    # the mesh has 327,680 faces
+    trimesh.creation.icosphere(subdivisions=7, radius=0.1).export(tmp_path / "m.stl")
     visual = '<visual><geometry><mesh filename="m.stl"/></geometry></visual>'
     links = [f"l{k}" for k in range(6)]
     urdf = tmp_path / "arm.urdf"
@@ -56,7 +57,10 @@ def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
-    """A mesh of positions in a buffer; view None: ``count`` zeros."""
+    """Return a glTF file with one mesh, whose vertex positions are in a buffer.
+
+    view: index of the view of the buffer; None: the vertices are ``count`` zeros.
+    """
     positions = {"componentType": 5126, "count": count, "type": "VEC3"}
     if view is not None:
         positions["bufferView"] = view
@@ -152,7 +156,7 @@ def gltf_of_triangles_without_corners(folder: Path) -> str:
     content["accessors"].append({"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"})
     content["bufferViews"].append(
         {"buffer": 0, "byteOffset": 12, "byteLength": 6}
-    )  # the second corner: 0, 16256, 0
+    )  # the indices of the second vertex are 0, 16256, 0
     (folder / "m.gltf").write_text(json.dumps(content))
     return "m.gltf"
 
@@ -177,19 +181,20 @@ OMITTED = (
 
 @contextlib.contextmanager
 def bounds() -> Iterator[None]:
-    """Check the time and the memory of the child processes that the block runs."""
+    """Assert that child processes within the block take at most 10 s and 1.1 GB."""
     begin, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     yield
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert in_time(after.ru_utime + after.ru_stime - used.ru_utime - used.ru_stime, 10)
-    # kB, of the largest process so far: another test's may have been larger, and each begins as a copy of this one
+    # the peak memory [kB] is the largest of all children so far, and a child begins as a copy of this process
     copied = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert after.ru_maxrss <= max(used.ru_maxrss, copied, 1_100_000)
-    assert time.monotonic() - begin < 60  # a process that waits for a pipe uses no processor time
+    # a bound of wall time too, as a process that waits for a pipe uses no processor time
+    assert time.monotonic() - begin < 60
 
 
 def test_meshes_of_all_formats_are_drawn_within_bounds(tmp_path):
-    """One arm has a link per format, as an arm is drawn only if all of its meshes can be read."""
+    """Meshes of all formats in one arm are drawn, which requires that each of them can be read."""
     links, joints = [], []
     for make in DRAWN:
         name = make.__name__
@@ -230,7 +235,10 @@ def test_meshes_are_found_by_each_form_of_path(tmp_path, name):
 
 @pytest.mark.parametrize("printed", [b"", b"a warning\n", b"PK\x03\x04", None])
 def test_no_answer_of_the_process_is_an_error(tmp_path, monkeypatch, printed):
-    """Tubes are drawn; printed None: it is not even started, for a mesh that is missing."""
+    """Without a usable answer of the mesh process, tubes are drawn instead of an error.
+
+    printed: output of the process; None: it must not be started, since the mesh does not exist.
+    """
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(ARM.replace("FILE", "m.obj"))
     answers = []

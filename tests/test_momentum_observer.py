@@ -18,17 +18,20 @@ from spelgen.logs.trajectory import Trajectory
 from spelgen.logs.windows import cut_windows
 
 RATE = 100.0
-OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # Nm that are not logged
+OFFSET = torch.tensor([0.6, -0.4], dtype=torch.float64)  # [Nm] external torques that are not in the log
 UNFILTERED = Preprocessing(cutoff=0, decimation=1)
 
 
 def motions(count=4, seconds=3.0, offset=OFFSET, after=0.0) -> list[Trajectory]:
-    """Simulate the substitute under smooth torques, and from a time on [s] an offset that is not logged."""
+    """Simulate the planar model under smooth torques, plus `offset` [Nm] from time `after` [s] on; return the logs.
+
+    The offset is not in the logged torques.
+    """
     model = Model()
     generator = torch.Generator().manual_seed(0)
     t = torch.arange(round(seconds * RATE) + 1) / RATE
     phases, speeds = (torch.rand(count, 1, 2, generator=generator, dtype=torch.float64) for _ in "ab")
-    tau = 2 * torch.sin(6.28 * (phases + (0.5 + speeds) * t[:, None]))  # (count, T, 2)
+    tau = 2 * torch.sin(6.28 * (phases + (0.5 + speeds) * t[:, None]))  # torques of each log, (count, T, 2)
     start = 2 * phases[:, 0] - 1
     driven = tau[:, :-1] + offset * (t[:-1, None] >= after)
     with torch.no_grad():
@@ -46,7 +49,10 @@ def test_a_constant_torque_is_found():
 
 @pytest.mark.parametrize("time_constant", [0.02, 0.05])
 def test_a_step_is_followed_with_the_time_constant(monkeypatch, time_constant):
-    """Some time after a torque begins the observer, long at work, has found 1 - exp(-time / time constant) of it."""
+    """A constant torque that began t seconds ago is estimated as 1 - exp(-t / time constant) of its value.
+
+    The observer has run for two seconds before.
+    """
     tuning = EvaluationTuning(observer_time_constant=time_constant)
     monkeypatch.setattr(horizons, "TUNING", tuning)
     model, log = Model(), motions(count=1, after=2.0)[0]
@@ -69,7 +75,7 @@ def test_it_depends_only_on_past_samples():
 
 
 class InVelocities:
-    """The arm as dynamics without momenta."""
+    """The planar model with the interface of dynamics without momenta."""
 
     def __init__(self) -> None:
         self.model = Model()
@@ -109,7 +115,7 @@ def test_a_diverged_window_affects_no_other():
     solver = Solver(model, windows)
     sound = solver(windows)
     disturbance = torch.zeros_like(windows.q[:, 0])
-    disturbance[3] = 1e12  # a force that no arm withstands
+    disturbance[3] = 1e12  # a disturbance torque at which the rollout diverges
     q, qd = solver(windows, disturbance)
     others = torch.arange(len(windows)) != 3
     assert q[3].isnan().all() and qd[3].isnan().all()

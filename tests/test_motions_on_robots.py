@@ -1,6 +1,6 @@
-"""`spelgen excite` for a robot: approach, message of ROS 2, and no contact with itself, a floor or boxes.
+"""`spelgen excite` for a robot: approach, ROS 2 message, and no contact with itself, the floor or boxes.
 
-The arm has spheres on its links and moves in a plane, so distances follow from sines and cosines only.
+The arm has spheres on its links and moves in a plane, so that exact distances follow from sines and cosines.
 """
 
 import json
@@ -46,13 +46,13 @@ def urdf(tmp_path):
 
 
 def centres(q):
-    """The centres of the spheres of b, c and d, (..., 3, 2) [m]: x and z."""
+    """Return the centres of the spheres of links b, c and d at q (..., 3), (..., 3, 2) [m]: x and z."""
     angle = np.cumsum(q, axis=-1)
     return LENGTH * np.cumsum(np.stack([np.sin(angle), np.cos(angle)], axis=-1), axis=-2)
 
 
 def clearances(q):
-    """Distances a-c, a-d, b-d, then of b, c, d to the floor, then to the wall, (..., 9) [m]."""
+    """Return exact distances at q (..., 3), (..., 9) [m]: a-c, a-d, b-d; b, c, d to the floor; b, c, d to the wall."""
     b, c, d = np.moveaxis(centres(q), -2, 0)
     own = [np.linalg.norm(x, axis=-1) - BASE - RADIUS for x in (c, d)]
     own.append(np.linalg.norm(d - b, axis=-1) - 2 * RADIUS)
@@ -65,7 +65,7 @@ def to_floor(centre):
 
 
 def to_wall(centre):
-    """The wall is in reach of its face only."""
+    """Return the distance of spheres from the face of the wall, which is the only side within reach."""
     return 1.0 - centre[..., 0] - RADIUS
 
 
@@ -76,7 +76,8 @@ def collisions(urdf, surroundings=CELL):
 
 def test_distances_and_their_gradient_are_those_of_spheres(urdf):
     found, q = collisions(urdf), np.random.default_rng(0).uniform(-2.5, 2.5, (40, 3))
-    free = clearances(q)[:, 6:].min(axis=1) > 0  # in front of the wall
+    # only configurations in front of the wall, where `to_wall` is exact
+    free = clearances(q)[:, 6:].min(axis=1) > 0
     np.testing.assert_allclose([found.distances(x) for x in q[free]], clearances(q[free]), atol=2e-6)
     value, gradient = found.penalty(q)
     assert value > 1
@@ -87,7 +88,10 @@ def test_distances_and_their_gradient_are_those_of_spheres(urdf):
 
 
 def test_motion_and_approach_keep_the_clearance_at_all_times(urdf):
-    """A motion that knows nothing of floor and wall hits them; one that does keeps away between samples, too."""
+    """A motion that is planned with a floor and a wall never touches the floor or the wall, between samples either.
+
+    A motion that is planned without them hits them.
+    """
     blind = excite(load_arm(urdf), **QUICK, start=[0, 0.5, 0.5])
     assert clearances(blind.motion.q).min() < -0.05
     assert blind.collisions == "Checked: 3 pairs of links, approach included; all keep 10 mm."
@@ -103,14 +107,18 @@ def test_motion_and_approach_keep_the_clearance_at_all_times(urdf):
 
 @pytest.mark.parametrize("angle", [2.5, 2.0, 1.5])
 def test_a_contact_between_two_samples_is_found(urdf, angle):
-    """One step of a motion swings c through the base's sphere and beyond; contact, time and distance are named."""
+    """A contact between two samples of a motion is found, with its links, time and distance.
+
+    In one step of the motion, link c swings through a box.
+    """
     q = np.array([[0.0, -2.5, 0.0], [0.0, angle, 0.0]])
     motion = Motion(np.array([0.0, 2.0]), q, 0 * q, 0 * q)
     assert collisions(urdf, Surroundings()).contact(motion) is None
     wall = Surroundings(boxes={"post": Box(size=(0.05, 0.05, 0.05), xyz=(0, 0, 1.0))})
     contact = collisions(urdf, wall).contact(motion)
     assert contact is not None and {contact.first, contact.second} == {"c", "box 'post'"}
-    reached = np.interp(contact.time, motion.t, q[:, 1])  # before the centre is below the corner of the box
+    # at the first contact, link c has not yet reached the position below the box
+    reached = np.interp(contact.time, motion.t, q[:, 1])
     assert -0.3 < reached < 0 and 0 < contact.distance < 0.01
 
 
@@ -138,7 +146,7 @@ def test_accelerations_are_bounded_in_motion_and_approach(urdf):
 
 
 def test_the_message_is_a_joint_trajectory_of_ros_2(urdf):
-    """Fields and types by the message definition of ROS 2 in rosbags; JSON and YAML readers agree on the numbers."""
+    """An exported motion has the fields and types of a ROS 2 JointTrajectory; JSON and YAML readers agree on it."""
     rosbags = pytest.importorskip("rosbags.typesys")
     store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
     found = excite(load_arm(urdf), **QUICK, start=[0.1, 0.2, 0.3])
@@ -167,7 +175,7 @@ def test_the_message_is_a_joint_trajectory_of_ros_2(urdf):
     np.testing.assert_allclose(
         np.array([x.positions for x in received.points])[-601:], found.motion.q, atol=1e-9
     )
-    # controllers interpolate by position, velocity and acceleration: they agree across the end of the approach
+    # velocities and accelerations are the derivatives of positions, also across the end of the approach
     velocity = np.array([x.velocities for x in received.points])
     position = np.array([x.positions for x in received.points])
     np.testing.assert_allclose(np.gradient(position, times, axis=0)[1:-1], velocity[1:-1], atol=5e-3)
@@ -176,13 +184,14 @@ def test_the_message_is_a_joint_trajectory_of_ros_2(urdf):
 def test_pairs_and_links_that_cannot_be_checked_are_named(urdf, monkeypatch):
     arm = ARM.replace(
         SPHERE.format(LENGTH, RADIUS), SPHERE.format(LENGTH, 1.2), 1
-    )  # b contains a's neighbour d
+    )  # the sphere of b is so large that it contains link d
     urdf.write_text(arm.replace("</link><link name=\"d\">", '<collision><geometry><mesh filename="c.stl"/></geometry>'
                                 '</collision></link><link name="d">'))  # fmt: skip
     text = collisions(urdf, Surroundings()).statement
     assert "Not checked, since their shapes overlap in most positions: b and d." in text
     assert text.endswith("Not checked, since their shapes cannot be read: c (c.stl).")
-    urdf.write_text(ARM.replace("collision", "visual", ARM.count("collision") - 2))  # one shape remains
+    # only one link keeps its collision shape
+    urdf.write_text(ARM.replace("collision", "visual", ARM.count("collision") - 2))
     assert collisions(urdf, Surroundings()).statement.startswith(
         "Not checked: collisions (there are no pairs of"
     )
@@ -195,7 +204,7 @@ def test_pairs_and_links_that_cannot_be_checked_are_named(urdf, monkeypatch):
 
 
 def test_an_arm_that_cannot_move_freely_gets_no_motion(urdf, monkeypatch):
-    """A shell of boxes around the upright arm: the errors name links, times and remedies."""
+    """An arm that is enclosed by boxes gets no motion: the error names links, times and remedies."""
     side = {"size": (0.1, 4, 4)}
     near = Surroundings(
         boxes={"left": Box(**side, xyz=(-0.15, 0, 2.3)), "right": Box(**side, xyz=(0.15, 0, 2.3))}
@@ -219,7 +228,7 @@ def test_an_arm_that_cannot_move_freely_gets_no_motion(urdf, monkeypatch):
         ({"acceleration": -1}, "acceleration: got -1, expected one positive number per joint: j1, j2, j3"),
     ],
 )
-def test_values_that_cannot_be_are_refused(urdf, changes, message):
+def test_values_out_of_range_are_refused(urdf, changes, message):
     with pytest.raises(SettingsError) as caught:
         excite(load_arm(urdf), **QUICK | changes)
     assert str(caught.value) == f"excite: {message}"

@@ -20,12 +20,12 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """Where pip installed a wheel of the checkout."""
+    """Return the folder into which pip installed a wheel of the checkout."""
     return pip_install(ROOT, tmp_path_factory.mktemp("wheel") / "site")
 
 
 def pip_install(source: Path, site: Path) -> Path:
-    """Install a checkout, a wheel or an sdist, without its dependencies."""
+    """Install a checkout, a wheel or an sdist without its dependencies into a folder; return the folder."""
     pytest.importorskip("hatchling", reason="building the package needs hatchling")
     options = ["-qq", "--no-deps", "--no-build-isolation", "--no-compile", "--target", str(site)]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, str(source)], check=True)
@@ -33,7 +33,7 @@ def pip_install(source: Path, site: Path) -> Path:
 
 
 def files_of(site: Path) -> set[str]:
-    """The files of an installation, except pip's notes about the source."""
+    """Return the files of an installation, without pip's records of the source."""
     files = [path for path in site.rglob("*") if path.is_file() and path.parent.name != "bin"]
     return {str(path.relative_to(site)) for path in files if path.name not in ("direct_url.json", "RECORD")}
 
@@ -55,7 +55,8 @@ def test_wheel_holds_all_that_the_package_needs(installed):
 
 
 def test_installed_command_builds_the_same_module(installed, robots, tmp_path):
-    for path in robots.glob("rpr.*"):  # a module names a URDF elsewhere by its way there
+    # the URDF is copied to the working folder, as a module states the path of a URDF elsewhere
+    for path in robots.glob("rpr.*"):
         shutil.copy(path, tmp_path)
     command = [sys.executable, "-m", "spelgen", "build", "rpr.urdf", "-o", "module.py"]
     subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(installed)}, check=True)
@@ -97,7 +98,7 @@ def test_objects_are_short_to_read(robots):
 
 
 def pinned(name: str) -> dict[str, str]:
-    """Versions of a file of requirements, each with a hash where the file has one."""
+    """Return the pinned version of each package in a requirements file; each must have hashes, except torch."""
     text = (ROOT / name).read_text()
     blocks = re.findall(r"^([\w.-]+)==(\S+)((?: \\\n +--hash=sha256:[0-9a-f]{64})*)$", text, re.MULTILINE)
     if name != "requirements-torch.txt":
@@ -110,7 +111,10 @@ def canonical(name: str) -> str:
 
 
 def test_every_package_is_pinned_by_hash():
-    """`make demo` installs the dependencies of the package, Pinocchio and CasADi (for C), and no other extra."""
+    """The pinned requirements contain each dependency of the package, with hashes.
+
+    `make demo` installs these, Pinocchio and CasADi (for C), and no other extra.
+    """
     demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
     assert demo.items() <= tools.items()
     assert not {"ray", "mujoco", "onnx", "mkdocs", "mypy"} & set(demo)
@@ -122,7 +126,7 @@ def test_every_package_is_pinned_by_hash():
 
 
 def licence(package: str) -> str | None:
-    """The licence that a package states; None if it is not installed."""
+    """Return the licence that an installed package states; None if it is not installed."""
     try:
         about = metadata(package)
     except PackageNotFoundError:
@@ -138,7 +142,7 @@ def licence(package: str) -> str | None:
 
 
 def test_licences_of_dependencies_are_listed(request):
-    """`pytest --update` rewrites the list."""
+    """docs/licences.md lists the licence of each dependency, none of which conflicts; `pytest --update` rewrites it."""
     packages = sorted({*pinned("requirements.txt"), *pinned("requirements-torch.txt")})
     page = ROOT / "docs" / "licences.md"
     if request.config.getoption("--update"):
@@ -150,7 +154,7 @@ def test_licences_of_dependencies_are_listed(request):
     assert sorted(listed) == packages
     for package, text in listed.items():
         assert text == (licence(package) or text)
-        # licences that conflict with the Apache licence of this package, or that forbid use
+        # no licence conflicts with the Apache licence of this package, or forbids commercial use
         assert (
             not re.search(r"\b(A?GPL|AGPL|proprietary|non-?commercial)", text, re.IGNORECASE)
             or "LGPL" in text

@@ -39,7 +39,7 @@ def browser(tmp_path_factory):
 
 @pytest.fixture
 def pages(run, robots, tmp_path):  # noqa: F811
-    """The report of a run whose folder has its URDF, and the page of `inspect` of a longer arm."""
+    """Return the pages under test: the report of a run with its URDF, and the page of `inspect` for the Panda."""
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
     panda = load_arm(robots / "panda.urdf")
     (tmp_path / "panda.html").write_text(
@@ -55,7 +55,7 @@ def test_pages_have_no_console_messages_requests_or_overflow(browser, pages, wid
         browser.open(path, width=width, dark=dark)
         assert browser.run("document.documentElement.scrollWidth") <= width, path
         assert browser.run("document.querySelector('canvas.arm').width") > 0
-        # on a phone rows become lists: no table of results is scrolled sideways
+        # at the width of a phone, tables of results are lists, none of which is scrolled sideways
         wide = "[...document.querySelectorAll('.wide:has(td[data-head])')]"
         assert path != pages[0] or browser.run(f"{wide}.length") > 0
         overflow = browser.run(f"Math.max(0, ...{wide}.map(x => x.scrollWidth - x.clientWidth))")
@@ -76,7 +76,8 @@ def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages)
     plain = pages[0].with_name("plain.html")
     text = pages[0].read_text(encoding="utf-8")
     plain.write_text(text.replace("script-src 'sha256", "script-src 'sha512"), encoding="utf-8")
-    browser.open(plain)  # the policy lets no script run whose digest it does not name
+    # the content security policy allows only scripts whose digest it names, so that no script runs
+    browser.open(plain)
     assert browser.run(shown) == ["block", "none", "none"]
 
 
@@ -109,7 +110,8 @@ def test_the_arm_fills_its_frame(browser, pages):
         browser.open(path)
         left, right, top, bottom = browser.run(EXTENT)
         assert 0.0 < left < right < 1.0 and 0.0 < top < bottom < 1.0
-        assert max(right - left, bottom - top) > 0.3  # the frame is as large as the whole motion needs
+        # the frame shows the whole motion, and is not much larger
+        assert max(right - left, bottom - top) > 0.3
 
 
 def test_keys_turn_the_arm_and_play_its_motion(browser, pages):

@@ -1,4 +1,4 @@
-"""Posterior of torque fits: intervals against known arms, sampled parameters and exact combinations."""
+"""Intervals of the posterior of torque fits, compared with known arms, sampled parameters and exact combinations."""
 
 import json
 import pickle
@@ -52,7 +52,8 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     arm = load_arm(urdf)
     exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
     count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
-    common = exact.columns < count  # friction and offsets follow
+    # base parameters of friction and offsets, which come last, are not compared
+    common = exact.columns < count
     model = build(arm, "closed-form")
     names, combination = base_combinations(model.chain, motors_of(model))
     assert names == tuple(np.array(exact.names)[common])
@@ -63,19 +64,20 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
 
 
 def test_base_parameters_are_equal_in_every_bit(robots):
-    """Intervals in reports are the same bytes each time, for all contents of the memory."""
+    """The matrix of base parameters is bitwise equal in each call, so that reports are, too."""
     model = build(robots / "rpr.urdf", "closed-form")
     draw = torch.Generator().manual_seed(0)
     results = set()
     for size in range(1, 40):
-        torch.randint(-9, 9, (size, 50), generator=draw)  # memory that is freed, and used again
+        # allocate and free memory, so that its contents differ between calls
+        torch.randint(-9, 9, (size, 50), generator=draw)
         results.add(base_combinations(model.chain, motors_of(model))[1].numpy().tobytes())
     assert len(results) == 1
 
 
 def test_the_larger_covariance_bounds_both():
     draw = torch.Generator().manual_seed(0)
-    scale = torch.logspace(-3, 3, 5).double()  # units differ
+    scale = torch.logspace(-3, 3, 5).double()  # parameters of different magnitudes, as of different units
     roots = torch.randn(2, 5, 5, generator=draw).double() * scale.unsqueeze(-1)
     first, second = roots @ roots.mT
     both = larger_covariance(first, second)
@@ -87,19 +89,22 @@ def test_the_larger_covariance_bounds_both():
 
 
 def arm_like(robots, seed):
-    """An arm with the kinematics of rpr.urdf and other parameters."""
+    """Return a model with the kinematics of rpr.urdf and random other parameters."""
     return drawn(SimpleNamespace(Model=lambda: build(robots / "rpr.urdf", "closed-form")), seed, 0.3)
 
 
 def base_values(model):
-    """Base parameters of a model."""
+    """Return the values of the base parameters of a model's bodies and armatures."""
     with torch.no_grad():
         constants = torch.cat([model.inertial_parameters.flatten(), model.armature])
     return (base_combinations(model.chain, motors_of(model))[1] @ constants).tolist()
 
 
 def logged(model, seconds, seed, correlation=0.98, noise=0.05):
-    """Samples with torque errors that last; correlation: of successive errors at 100 Hz."""
+    """Return samples of a smooth motion with a model's torque and autocorrelated torque errors.
+
+    correlation: of successive errors at 100 Hz. noise: standard deviation, relative to the torque's.
+    """
     rng = np.random.default_rng(seed)
     motion = smooth_motion(model.n, seconds, rng)
     with torch.no_grad():
@@ -108,9 +113,15 @@ def logged(model, seconds, seed, correlation=0.98, noise=0.05):
     return DynamicsSamples("known", *motion, tau + noise * tau.std(axis=0) * errors)
 
 
-def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(robots, monkeypatch):
-    """Errors of 0.5 s: intervals of the posterior covariance, which assumes 0.2 s, are too narrow."""
-    estimates, ratios, ratios_by_posterior = [], [], []  # errors divided by half intervals
+def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fit_assumes(
+    robots, monkeypatch
+):
+    """Reported intervals contain the truth even if torque errors are correlated longer than the fit assumes.
+
+    With errors correlated over 0.5 s, intervals of the posterior covariance, which assumes 0.2 s, are too narrow.
+    """
+    # errors divided by half intervals, of reported intervals and of intervals by the posterior covariance
+    estimates, ratios, ratios_by_posterior = [], [], []
     measured = torque_fit.jackknife
 
     def kept(estimate):
@@ -127,12 +138,16 @@ def test_intervals_hold_the_truth_if_errors_last_longer_than_the_fit_assumes(rob
             for interval, value in zip(intervals, base_values(true), strict=True):
                 result.append(abs(interval.value - value) / interval.half)
     print(np.quantile(ratios, (0.9, 0.95, 1)), np.quantile(ratios_by_posterior, (0.9, 0.95, 1)))
-    assert 0.4 < np.quantile(ratios, 0.95) < 1.0  # wide enough, and not much wider
+    # intervals are wide enough, and not much too wide
+    assert 0.4 < np.quantile(ratios, 0.95) < 1.0
     assert np.max(ratios_by_posterior) > 1.0 > 0.9 * np.max(ratios)
 
 
 def test_least_squares_counts_friction_that_changes_during_a_log(robots):
-    """Coulomb friction rises by half: the standard deviation of its mean is the one of ten values."""
+    """Intervals of least squares include changes of friction during a log.
+
+    Coulomb friction rises by half in a minute: the standard deviation of its mean is the one of ten independent values.
+    """
     arm = load_arm(robots / "rpr.urdf").chain
     q, qd, qdd = smooth_motion(3, 60.0, np.random.default_rng(0))
     bodies, friction = urdf_parameters(arm), np.linspace(0.8, 1.2, len(q))[:, None]
@@ -140,17 +155,17 @@ def test_least_squares_counts_friction_that_changes_during_a_log(robots):
     found = least_squares(arm, [DynamicsSamples("rising", q, qd, qdd, tau)])
     of_ten = (
         1.15 * np.linspace(0.82, 1.18, 10).std(ddof=1) / np.sqrt(10)
-    )  # 1.15: Student's t instead of normal
+    )  # 1.15: factor of Student's t relative to the normal distribution
     interval = next(x for x in found.intervals if x.name == "coulomb3")
     assert interval.low < 1.0 < interval.high
     assert interval.std == pytest.approx(
         of_ten, rel=0.4
-    )  # 0.018, if errors of a log were the same all along it
+    )  # with the standard deviation of constant friction it would be 0.018
 
 
 @pytest.fixture(scope="module")
 def fitted(robots):
-    """A fit to two recordings of a known arm, with the arm."""
+    """Return a fit to two recordings of a known arm, and the arm."""
     true, logs = arm_like(robots, 3), []
     for seed in range(3):
         x = logged(true, 10.0, seed, correlation=0.5)
@@ -160,7 +175,10 @@ def fitted(robots):
 
 
 def test_standard_deviations_agree_with_sampled_parameters(fitted):
-    """M, g, torques and drives of models with random parameters, from a small multiple of the covariance."""
+    """Standard deviations of M, g, torques and drives agree with models whose parameters are sampled.
+
+    Parameters are sampled from a small multiple of the posterior covariance.
+    """
     result, _ = fitted
     posterior, shrink = result.posterior, 1e-3
     small = replace(posterior, covariance=shrink**2 * posterior.covariance, torque_std=np.zeros(3))
@@ -213,7 +231,8 @@ def test_torque_intervals_hold_the_torques_of_another_motion(fitted):
     result, logs = fitted
     tau, std = result.predict(logs[2], std=True)
     np.testing.assert_allclose(tau, result.predict(logs[2]), rtol=1e-9)
-    inner = slice(100, -100)  # without transients of the filter, which the measured torque passes, too
+    # the ends are omitted: the low-pass filter of the measured torque has transients there
+    inner = slice(100, -100)
     measured = low_pass(logs[2], result.preprocessing.acceleration_cutoff).tau[inner]
     held = np.abs(measured - tau[inner]) <= QUANTILE * std[inner]
     assert 0.9 < held.mean() < 0.995

@@ -1,4 +1,4 @@
-"""A prepared model equals its model; its derivatives and steps are correct."""
+"""The results of a prepared model equal the model's; its derivatives and steps are correct."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_momentum_rate_is_the_derivative_of_momentum(pair):
 
 def test_linearize_is_the_derivative_of_rate_and_step(pair):
     _, prepared = pair
-    given = torch.cat(states(3), dim=-1)  # q, qd, tau
+    given = torch.cat(states(3), dim=-1)  # inputs of the derivative: q, qd, tau
     z = prepared.memory(given[..., 3:6])
 
     def rate(x):
@@ -97,7 +97,7 @@ def test_rollout_is_steps_and_converges_to_the_fourth_order():
     q, qd = (
         torch.tensor([0.3, -0.5]).double(),
         torch.tensor([2.0, 1.5]).double(),
-    )  # friction is smooth at speed
+    )  # initial velocities at which friction is smooth
     tau = torch.zeros(4, 2, dtype=torch.float64)
     found = prepared.rollout(q, qd, tau, 0.01)
     assert found.q.shape == found.qd.shape == (5, 2)
@@ -121,7 +121,7 @@ def test_kinematics_of_the_tip(pair):
 
 
 def test_zero_terms_are_removed():
-    """Without residual terms hybrid is prepared as rigid bodies; preparation never changes the model."""
+    """If residual terms are zero, the prepared model of hybrid omits them, and the model itself is unchanged."""
     model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
     assert residual_terms(model.prepared()._model) is None

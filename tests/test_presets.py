@@ -1,4 +1,4 @@
-"""Each preset is the model that its paper writes down; see test_contracts.py for properties that all presets share."""
+"""Each preset is the model of its paper; test_contracts.py has the properties that all presets share."""
 
 import math
 from dataclasses import replace
@@ -33,7 +33,7 @@ each_robot = pytest.mark.parametrize("robot", ROBOTS)
 
 
 def states(n: int, count: int = 20) -> list[torch.Tensor]:
-    """Random q, qd, qdd and tau."""
+    """Return random q, qd, qdd and tau, (count, n) each."""
     generator = torch.Generator().manual_seed(0)
     return [1.5 * torch.randn(count, n, dtype=torch.float64, generator=generator) for _ in range(4)]
 
@@ -66,7 +66,10 @@ def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
 @pytest.mark.parametrize("preset", ["spel", "spel-kan"])
 @each_robot
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
-    """Its networks depend on all joints, as in the paper; zeros, constants and relations of the structure remain."""
+    """M of spel has the zeros, constants and relations of the derived structure.
+
+    Its networks depend on all joints, as in the paper.
+    """
     model = random_model(robot, tmp_path, seed=1, preset=preset)
     for weight in model.mass.network.parameters():
         weight.data *= 0.5
@@ -83,7 +86,10 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
-    """Layer by layer as in the papers, on the varying entries of the 9 numbers of R and the 3 of r."""
+    """Networks of phnode equal the paper's, evaluated layer by layer on rotation matrices.
+
+    Inputs are the varying entries of the 9 numbers of R per turning joint, and of the 3 of r per sliding joint.
+    """
     owner = random_model("rpr", tmp_path, seed=5, design=replace(load_design("phnode"), net=net))
     model, encoding = owner.get_submodule(part), owner.encoding
     q = states(3)[0]
@@ -108,7 +114,10 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
 def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
-    """Eq. 15 and 18 over three axes a joint, all derivatives automatic, against the n x n module."""
+    """The emitted module equals the port-Hamiltonian system on rotation matrices, eq. 15 and 18 of the paper.
+
+    That system has three axes per joint and automatic derivatives; the emitted module has one axis per joint.
+    """
     design = NETWORKS if preset == "hybrid" else None
     model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)
     n = model.n
@@ -129,7 +138,10 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
-    """H = 1/2 p^T M^-1 p over 3 n axes: for motion only along z, p_z is that momentum of the n x n module."""
+    """The kinetic energy of phnode equals the paper's H = 1/2 p^T M^-1 p over three axes per joint.
+
+    For motion only along z, the z entries of p are the momentum of the emitted module.
+    """
     model = frictionless(
         random_model("six_dof", tmp_path, seed=7, design=replace(load_design("phnode"), net=net))
     )
@@ -155,7 +167,10 @@ def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
 
 
 def test_geodesic_distance_is_the_angle_between():
-    """For turns about one axis it is the wrapped difference that training uses, small angles included."""
+    """The geodesic distance of rotations about one axis is the wrapped difference of their angles.
+
+    It is exact for small angles, too.
+    """
     angles = torch.tensor([1e-9, 1e-4, 0.5, 3.0, -3.0, math.pi - 1e-6, 7.0], dtype=torch.float64)
     zero, one = torch.zeros_like(angles), torch.ones_like(angles)
     c, s = angles.cos(), angles.sin()
@@ -170,7 +185,7 @@ def test_geodesic_distance_is_the_angle_between():
 
 
 def test_published_formulation_keeps_its_energy():
-    """The benchmark's baseline conserves energy: without friction and input dH/dt = 0."""
+    """Without friction and input, the energy H of PHNODE in its published formulation is constant: dH/dt = 0."""
     torch.manual_seed(0)
     model = Published(2, 8, 8)
     for network in (model.dissipation.network, model.gains):

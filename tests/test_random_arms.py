@@ -22,12 +22,12 @@ pin = pytest.importorskip(
     "pinocchio", reason="Pinocchio (pip install spelgen[simulate]) reads the other side"
 )
 
-# sizes relative to the largest: above the first is something, below the second is nothing
+# relative to the largest value: above SOMETHING a value is not zero, below NOTHING it is zero
 SOMETHING, NOTHING = 1e-8, 1e-11
 
 
 class Reading:
-    """The arm as Pinocchio reads it: all joints free, followers tied to their leaders, the others at 0."""
+    """Pinocchio's model of a random arm, with mimic joints tied to their leaders and joints off the chain at zero."""
 
     def __init__(self, arm: DrawnArm) -> None:
         self.model = pin.buildModelFromXML(arm.text)
@@ -47,9 +47,10 @@ class Reading:
         return self.model.joints[self.model.getJointId(name)].idx_v
 
     def draw_inertias(self, rng: np.random.Generator) -> None:
-        """Give every joint's body other, physically possible inertial values."""
+        """Give each body of the model random, physically consistent inertial values."""
         for k in range(1, self.model.njoints):
-            points = rng.normal(scale=0.5, size=(4, 3))  # four point masses
+            # the tensor is the one of four point masses, and so physically consistent
+            points = rng.normal(scale=0.5, size=(4, 3))
             tensor = np.eye(3) * (points**2).sum() - points.T @ points
             self.model.inertias[k] = pin.Inertia(rng.uniform(1.0, 4.0), rng.uniform(-0.5, 0.5, 3), tensor)
 
@@ -57,7 +58,7 @@ class Reading:
         return pin.integrate(self.model, self.neutral, self.ties @ q + self.rest)
 
     def mass(self, q: np.ndarray) -> np.ndarray:
-        """The lower triangle of M."""
+        """Return the lower triangle of M at a configuration, as a vector."""
         full = pin.crba(self.model, self.data, self.configuration(q))
         full = np.triu(full) + np.triu(full, 1).T
         return (self.ties.T @ full @ self.ties)[np.tril_indices(len(q))]
@@ -74,7 +75,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Facts:
-    """The compared quantities."""
+    """Facts on a structure, by spelgen or by Pinocchio: entries of M, V, outputs, constants, base parameters."""
 
     entries: tuple[tuple[str, tuple[int, ...]], ...]
     potential: tuple[int, ...]
@@ -84,7 +85,10 @@ class Facts:
 
 
 def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
-    """The facts as Pinocchio shows them at random configurations, with random inertias or the URDF's."""
+    """Return the facts by Pinocchio at random configurations.
+
+    inertials: with the inertial values of the URDF; otherwise random ones.
+    """
     reading = Reading(arm)
     n = len(arm.joints)
     entries = n * (n + 1) // 2
@@ -124,7 +128,7 @@ def _base_parameters(reading: Reading, n: int, rng: np.random.Generator) -> int:
 
 
 def rank(rows: np.ndarray, size: float) -> int:
-    """The rank of rows that hold numbers of this ``size`` where they are not zero."""
+    """Return the numerical rank of rows whose nonzero numbers have the magnitude ``size``."""
     return _count(np.linalg.svd(rows, compute_uv=False) / size / np.sqrt(len(rows) or 1))
 
 
@@ -140,7 +144,7 @@ def _count(sizes: np.ndarray) -> int:
 
 
 def told(structure: Structure) -> Facts:
-    """The facts as spelgen derives them."""
+    """Return the facts by spelgen's derivation."""
     n = len(structure.joints)
     return Facts(
         entries=tuple((entry.kind, entry.joints) for entry in structure.entries),
@@ -177,7 +181,7 @@ def test_structure_agrees_with_pinocchio(tmp_path, drawn):
 @RANDOM
 @given(drawn=arms())
 def test_values_are_those_of_pinocchio(tmp_path, drawn):
-    """The exact geometry and the lumped inertias of the URDF give Pinocchio's M and V."""
+    """M and V of the exact geometry equal Pinocchio's of the URDF, with the bodies' lumped inertial values."""
     arm = read(drawn, tmp_path)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (20, len(drawn.joints)))
     inertias = [[float(x) for x in body.inertia or ()] for body in arm.bodies]
@@ -189,7 +193,7 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 
 
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
-    """Half a right angle has no rational cosine; zeros that several of them cause are recognised nevertheless."""
+    """Rotations by multiples of 45 degrees, which have no rational cosine, keep their zero entries exactly."""
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
         found = exact_rotation(rotation)

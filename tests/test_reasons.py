@@ -84,7 +84,7 @@ def test_words_with_the_inertials_of_the_file(robots):
 
 
 def test_two_turns_about_one_line():
-    """The second turns against the first, so their coupling is minus the inertia."""
+    """If joint 2 turns against joint 1 about the same line, M21 = -M22, with this reason."""
     over = tuple(tuple(Fraction(x) for x in row) for row in ((1, 0, 0), (0, -1, 0), (0, 0, -1)))
     arm = chain([("revolute", STRAIGHT, (0, 0, 0)), ("revolute", over, (0, 0, 0.5))])
     told = {fact.statement: fact.reason for fact in facts(arm, derive(arm))}

@@ -1,4 +1,4 @@
-"""Recordings that benchmarks read: made from clones at their commits, and from nothing that could run."""
+"""Recordings of benchmarks are made from clones at their commits, and no content of a source can be executed."""
 
 import io
 import pickle
@@ -23,7 +23,10 @@ def git(*arguments, folder):
 
 
 def test_a_source_is_read_at_its_commit(tmp_path, monkeypatch, shared):
-    """A later commit of the clone changes nothing; the URDF that is generated is the reference's, byte for byte."""
+    """A source is read at its commit: a later commit of the clone has no effect.
+
+    The generated URDF equals the one of the reference data, byte for byte.
+    """
     source = recordings.SOURCES["xmate3"]
     clone = tmp_path / "clones" / source.repository.name
     data = clone / "filtering" / "data" / "excit"
@@ -65,7 +68,7 @@ def test_a_pickle_names_no_function(tmp_path):
 
 
 def test_the_page_has_the_table():
-    """Every source with its address, commit and licence, as the script reads them."""
+    """docs/real_logs.md lists each source of recordings with address, commit and licence."""
     page = (ROOT / "docs" / "real_logs.md").read_text(encoding="utf-8")
     rows = {line.split("`")[1]: line for line in page.splitlines() if line.startswith("| `")}
     for name, source in recordings.SOURCES.items():

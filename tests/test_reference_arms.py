@@ -1,7 +1,6 @@
-"""The structure of all reference arms is the known one, and its statements and reasons agree with Pinocchio.
+"""The structure of all reference arms is the known one, and Pinocchio confirms its statements and reasons.
 
-The derivation takes most of the time of both tests. A file is run by one process, which derives each arm once for
-both.
+The derivation takes most of the time of both tests, so each arm is derived once per process.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
 REFERENCE_ARMS = {"kinematics": 189, "inertials": 152}
-# expected.json answers these by numerical ranks that hang on its tolerance; see docs/structure.md
+# expected.json has other values for these arms, since its numerical ranks depend on a tolerance (docs/structure.md)
 TOLERANCE_CASES = {
     ("edo", "kinematics"): {"outputs_only_from_joint"},
     ("kuka_iiwa14_lbrstack", "inertials"): {"outputs"},
@@ -32,7 +31,7 @@ TOLERANCE_CASES = {
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 def test_structure_is_the_known_one(shared, assume):
-    """Every arm of the reference set, fact by fact."""
+    """The derived structure of each reference arm equals the known one, fact by fact."""
     wrong, names = {}, set()
     for name, known, _, structure in reference_arms(shared, assume):
         names.add(name)
@@ -46,7 +45,7 @@ def test_structure_is_the_known_one(shared, assume):
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 def test_statements_and_reasons_hold_by_numbers(shared, assume):
-    """On every arm of the reference set; none is missing."""
+    """Each statement about a reference arm holds numerically, and so does each reason; none is omitted."""
     reasons = set()
     for name, _, arm, structure in reference_arms(shared, assume):
         told = facts(arm, structure)
@@ -60,7 +59,10 @@ def test_statements_and_reasons_hold_by_numbers(shared, assume):
 
 
 def assert_statements_hold(arm: Chain, structure: Structure, told: tuple[Fact, ...], name: str) -> None:
-    """Every reason is true in Pinocchio at random configurations, with random inertials or the URDF's."""
+    """Assert by Pinocchio, at random configurations, that the statements about an arm hold and are complete.
+
+    Inertial values are random, or the URDF's if the structure assumes them.
+    """
     keys = triangle(len(structure.joints))
     free = structure.assume == "kinematics"
     samples = draw(arm, 4 if free else 6, np.random.default_rng(0), random_inertials=free)
@@ -104,8 +106,8 @@ def _steady(values: np.ndarray) -> bool:
 
 Check = Callable[[Seen, list[int], list[int]], bool]
 
-# A reason, # for a joint and ## for several -> whether it holds: of the joints in the statement and in it.
-# Entries count as two joints each in the statement: M32 as 3, 2.
+# per reason, with # for a joint and ## for several: function of the arm, of the joints in the statement, and of the
+# joints in the reason, which is True if the reason holds; M32 in a statement counts as joints 3 and 2
 CHECKS: dict[str, Check] = {
     "it moves the whole arm as one rigid body": lambda s, about, _: about == [1],
     "gravity does no work in a rotation about an axis parallel to it": lambda s, about, _: (
@@ -189,7 +191,7 @@ CHECKS: dict[str, Check] = {
 
 
 def holds(seen: Seen, fact: Fact) -> bool:
-    """Whether the reason is one that can be checked, and holds."""
+    """Return True if a fact's reason is one of CHECKS and holds for the arm."""
     about = [int(digit) for digit in re.findall(r"\d", fact.statement)]
     named = [int(number) for number in re.findall(r"\d+", fact.reason)]
     some = r"joints? \d+(?:, \d+)*(?: and \d+)?"

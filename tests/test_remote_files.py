@@ -22,7 +22,7 @@ JOINTS = ("joint1", "joint2")
 
 @pytest.fixture
 def memory():
-    """A file system in memory, empty."""
+    """Return an empty file system in memory."""
     system = fsspec.filesystem("memory")
     system.store.clear()
     return system

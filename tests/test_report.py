@@ -36,7 +36,7 @@ def traces(name):
     wave = [[math.sin(3 * x)] * 3 for x in t]
     near = [[y[0] + 0.05 * x] * 3 for x, y in zip(t, wave, strict=True)]
     both, one = {"model": wave, "URDF": near}, [row[0] for row in wave]
-    entries = [one] * 4 + [[0.0] * len(one), one]  # M32 is always zero
+    entries = [one] * 4 + [[0.0] * len(one), one]  # the entries of M, of which M32 is always zero
     grown = {"low": [0.1, 0.1], "median": [0.2, 0.3], "high": [0.4, None]}
     covered = {"low": -1.0, "high": 1.0, "counts": [1] * 24}
     return {
@@ -82,14 +82,14 @@ EVALUATION["assessment"] = asdict(verdict(Results.from_dict(EVALUATION)))
 
 
 def write_model(folder: Path, model) -> None:
-    """Write spec.json and model.pt."""
+    """Write the files spec.json and model.pt of a run folder."""
     (folder / "spec.json").write_text(model.spec.to_json(), encoding="utf-8")
     torch.save(model.state_dict(), folder / "model.pt")
 
 
 @pytest.fixture
 def run(robots, tmp_path) -> Path:
-    """A complete run folder, but for the training."""
+    """Return a run folder with all files of a run, written without a training."""
     folder = tmp_path / "run"
     folder.mkdir()
     write_model(folder, build(robots / "rpr.urdf"))
@@ -122,7 +122,7 @@ def test_page_is_complete_and_self_contained(run):
     assert "url(" not in path.read_text(encoding="utf-8")
     charts = path.read_text(encoding="utf-8").count('<svg class="chart"')
     loss, growth, torques, energy, states, friction, coverage = 1, 1, 9, 1, 12, 3, 6
-    mass = 5  # entries that are not always zero
+    mass = 5  # number of entries of M that are not always zero
     assert charts == loss + growth + torques + energy + states + mass + friction + coverage
     assert "default-src 'none'" in path.read_text(encoding="utf-8")
 
@@ -308,7 +308,8 @@ def test_warnings_about_the_logs_are_in_the_report(run):
 def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
-    trimesh.creation.icosphere(subdivisions=5, radius=0.1).export(tmp_path / "ball.stl")  # 20480 faces
+    # the mesh has 20480 faces
+    trimesh.creation.icosphere(subdivisions=5, radius=0.1).export(tmp_path / "ball.stl")
     shown = '<visual><geometry><mesh filename="ball.stl"/></geometry></visual></link>'
     text = (robots / "rpr.urdf").read_text()
     (tmp_path / "rpr.urdf").write_text(text.replace("</link>", shown))

@@ -22,7 +22,7 @@ DECORATION = """<gazebo reference="nobody"><sensor type="camera"><rate>abc</rate
 
 @pytest.fixture
 def odd(robots, tmp_path, monkeypatch):
-    """Writes rpr with more in it, and a sidecar."""
+    """Return a function that writes rpr.urdf with additional elements, and its settings file, and returns the path."""
     monkeypatch.chdir(tmp_path)
 
     def write(more="", sidecar=""):
@@ -35,7 +35,7 @@ def odd(robots, tmp_path, monkeypatch):
 
 
 def body(source):
-    """A module without the digests of its sources."""
+    """Return the lines of a module without the digests of its sources."""
     return [line for line in source.splitlines() if "sha256" not in line]
 
 
@@ -58,7 +58,7 @@ def test_unneeded_defects_are_warnings_at_most(odd, more, sidecar, codes):
 
 @pytest.mark.parametrize("group", ["simulation", "tracking"])
 def test_settings_with_errors_are_not_copied(odd, tmp_path, group):
-    """The settings are written for a random robot, and enter the digest of a comparison."""
+    """Settings with an error are refused before a simulated arm copies them or a comparison's digest includes them."""
     urdf = odd(sidecar=f"{group}: {{lenght: 1}}")
     expected = f"{group}: unknown key 'lenght'"
     with pytest.raises(SettingsError, match=expected):

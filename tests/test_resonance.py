@@ -1,7 +1,7 @@
-"""Elastic joints are named with the frequency of their resonance; logs of rigid joints are not doubted.
+"""Elastic joints are named with the frequency of their resonance; logs of rigid joints are accepted.
 
-The link moves as prescribed, torques are the URDF's, and the motor is ahead of the link by the torque divided by
-the stiffness of the spring between them (Spong's model). The log has motor positions and motor torques.
+The link moves as prescribed, torques are the URDF's, and the motor is ahead of the link by the torque divided by the
+stiffness of the spring between them (Spong's model). The log has motor positions and motor torques.
 """
 
 import re
@@ -23,7 +23,7 @@ RATE, SECONDS = 200.0, 20.0
 
 
 def chirped(arm, joint, resonance, seed, stiff=False) -> Trajectory:
-    """Return a log with a chirp of one joint up to 0.95 of the resonance [Hz] of its link, with friction and noise."""
+    """Return a log of a joint's chirp up to 0.95 of its resonance [Hz], with friction and noise; stiff: rigid joint."""
     rng = np.random.default_rng(seed)
     t = np.arange(0, SECONDS, 1 / RATE)
     n = len(arm.chain.coordinates)

@@ -22,8 +22,8 @@ from time_bounds import in_time
 ROOT = Path(__file__).parents[1]
 SECONDS, MEGABYTES = 10, 1000
 
-# One process imports the modules of all commands and forks a process per command. The last line of its output has
-# exit code and largest memory; processor time includes the fork and the imports.
+# a server process imports the modules of all commands and forks a process per command; the last line of its output
+# has exit code and peak memory; processor time includes the fork and the imports
 SERVER = """
 import json, os, resource, signal, sys
 import spelgen.emission.specify
@@ -57,7 +57,7 @@ for line in sys.stdin:
 
 @dataclass(frozen=True)
 class Case:
-    """A file, the options it is read with, and the reason for which it is refused; None where it is built."""
+    """A URDF, the options with which it is read, and a part of the error by which it is refused; None: it is built."""
 
     make: Callable[[], str | bytes]
     refused: str | None
@@ -142,7 +142,7 @@ CASES = {
         lambda: chain(300, general), None, ("--joints", ",".join(f"j{k}" for k in range(50, 301, 50)))
     ),
     "2000 links fixed in a row": Case(
-        lambda: chain(1999, general, kind="fixed"), "no joint that moves by itself"
+        lambda: chain(1999, general, kind="fixed"), "no joint that moves independently"
     ),
     "2000 links around one": Case(lambda: star(2000, "continuous"), "1999 chains of 1 joints"),
     "2000 links fixed around one": Case(
@@ -178,9 +178,10 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def server():
-    """Runs commands."""
+    """Start the server process that runs commands; yield it."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    program = SERVER.replace("{alarm}", str(60 * SECONDS))  # by the clock, on a machine that may be busy
+    # limit of wall time, large enough for a busy machine
+    program = SERVER.replace("{alarm}", str(60 * SECONDS))
     with subprocess.Popen(
         [sys.executable, "-c", program],
         env=environment,
@@ -200,7 +201,8 @@ def test_is_refused_or_built_in_bounds(server, tmp_path, name):
     path = tmp_path / "robot.urdf"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     inspect, build = ("inspect", "--format", "json", "-o", "structure.json"), ("build", "-o", "module.py")
-    for command in (inspect, build) if case.refused is None else (build,):  # both refuse by the same reader
+    # `inspect` is not run for refused files, as it uses the same reader as `build`
+    for command in (inspect, build) if case.refused is None else (build,):
         arguments = command[0], path.name, *case.options, *command[1:]
         code, errors = run_in_bounds(server, *arguments, folder=tmp_path)
         assert code == ("0" if case.refused is None else "1")
@@ -211,7 +213,10 @@ def test_is_refused_or_built_in_bounds(server, tmp_path, name):
 
 
 def run_in_bounds(server: subprocess.Popen, *arguments: str, folder: Path) -> tuple[str, list[str]]:
-    """Exit code and lines of stderr of a command, after its processor time and memory were looked at."""
+    """Run a command in the server; return its exit code and lines of stderr.
+
+    Asserts that processor time and memory are within the bounds.
+    """
     told = folder.parent / f"{folder.name}-{arguments[0]}.stderr"
     print(json.dumps([str(folder), str(told), *arguments]), file=server.stdin, flush=True)
     status, seconds = server.stdout.readline().split()

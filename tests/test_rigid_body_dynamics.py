@@ -1,4 +1,4 @@
-"""Rigid-body dynamics against Pinocchio's own reading of the URDF and against mechanics derived by hand."""
+"""Rigid-body dynamics equal Pinocchio's of the URDF, and mechanics that are derived by hand."""
 
 from fractions import Fraction
 
@@ -58,7 +58,10 @@ def test_rotors_count_by_the_square_of_their_gear(robots):
 
 
 def test_a_telescope_moves_its_second_stage_twice():
-    """Stage 2 slides twice as far on stage 1 as that on the base: v2 = 3 v1, M = m1 + 9 m2."""
+    """The velocity of a telescope's second stage is three times the first one's, so M = m1 + 9 m2.
+
+    Stage 2 mimics stage 1 with the factor 2, and slides on it.
+    """
     first = body(kind="prismatic", rotation=SIDEWAYS, inertia=point(2))
     second = body("b", "prismatic", parent=0, multiplier=Fraction(2), inertia=point(5))
     telescope = arm([coordinate(kind="prismatic")], [first, second], gravity=(-10, 0, 0))
@@ -71,7 +74,9 @@ def test_a_telescope_moves_its_second_stage_twice():
 
 
 def test_a_mimic_elbow_is_a_pendulum_with_a_varying_inertia():
-    """Both points at length L, the elbow at -q/2 + 0.3, so that the angle of the second rod is b = q/2 + 0.3:
+    """A mimic elbow makes a pendulum with varying inertia, equal to the one derived by hand.
+
+    Two point masses at length L; the elbow is -q/2 + 0.3, so that the angle of the second rod is b = q/2 + 0.3:
 
     M = L^2 (m1 + m2 (5/4 + cos(q - b))),  V = g L (m1 sin q + m2 (sin q + sin b)),  M qdd + M' qd^2/2 + V' = tau.
     """
@@ -125,8 +130,8 @@ def test_bodies_without_inertials_are_all_named():
     assert all(isinstance(each, ArmError) for each in error.value.errors)
 
 
-# A lift: a stage that slides twice as far as the one below it, and on it a pendulum whose two rods turn against one
-# another; a finger is locked at its offset, its leader being none of the coordinates.
+# A lift with mimic joints: stage 2 slides twice as far as stage 1, and rod 2 of the pendulum on it turns against
+# rod 1. The leader of the mimic finger is no coordinate of the arm, so the finger is locked at its offset.
 LIFT = """<robot name="lift"><link name="base"/>
   <joint name="low" type="prismatic"><parent link="base"/><child link="stage1"/><axis xyz="0 0 1"/>
     <limit lower="0" upper="1" effort="10" velocity="1"/><dynamics damping="2" friction="0.5"/></joint>
@@ -145,7 +150,7 @@ LIFT += "".join(
     <inertia ixx="0.3" ixy="0.02" ixz="0" iyy="0.2" iyz="0.01" izz="0.25"/></inertial></link>"""
     for k, name in enumerate(("stage1", "stage2", "rod1", "rod2", "finger1", "finger2"), start=1)
 )
-# a colour as Gazebo has it, which other parsers refuse
+# a colour by its name in Gazebo, which other parsers refuse
 LIFT = LIFT.replace(
     '<link name="stage1">', '<link name="stage1"><visual><material>Gazebo/Red</material></visual>', 1
 )
@@ -174,7 +179,7 @@ def same_dynamics(one, other, joints, tolerance):
 
 
 def test_mimic_and_locked_joints_are_the_arms(tmp_path):
-    """Pinocchio's reading of the whole file under the constraint is spelgen's arm, which folds them in exactly."""
+    """Dynamics of an arm with mimic and locked joints equal Pinocchio's of the whole file under these constraints."""
     path = tmp_path / "lift.urdf"
     path.write_text(LIFT)
     lift = make_arm(read_urdf(path), joints=["low", "swing"])

@@ -16,7 +16,7 @@ ROBOTS = Path(__file__).parents[1] / "robots"
 SIX = ("two_link", "rpr", "six_dof", "scara", "panda", "ur10e")
 RIGHT = np.pi / 2
 
-# Denavit-Hartenberg rows (a, alpha, d, theta, prismatic) of the sources that the sidecar files name.
+# Denavit-Hartenberg rows (a [m], alpha [rad], d [m], theta [rad], prismatic) from the sources in the settings files
 STANDARD = {
     "two_link": [(1, 0, 0, 0, False), (1, 0, 0, 0, False)],
     "rpr": [(0, RIGHT, 0.154, 0, False), (0.0203, 0, 0, -RIGHT, True), (0, 0, 0, 0, False)],
@@ -54,7 +54,7 @@ MODIFIED = {
         (0.088, RIGHT, 0, 0, False),
     ],
 }
-# Mass, centre of mass, (xx, yy, zz) or (xx, xy, xz, yy, yz, zz) of each link in its DH frame; same sources.
+# per link, in its DH frame: mass, centre of mass, and (xx, yy, zz) or (xx, xy, xz, yy, yz, zz); same sources
 INERTIALS = {
     "two_link": 2 * [(1, (-0.5, 0, 0), (0.6, 0.6, 1))],
     "rpr": [
@@ -101,7 +101,7 @@ def test_every_inertial_is_one_of_a_real_body(robot):
         assert inertial.mass > 0
         smallest, middle, largest = np.linalg.eigvalsh(symmetric(inertial.tensor))
         assert smallest > 0
-        assert largest <= smallest + middle + 1e-12  # equal for a flat body, as link 3 of rpr
+        assert largest <= smallest + middle + 1e-12  # equality holds for a flat body, such as link 3 of rpr
 
 
 def test_the_sidecar_fits_and_names_its_sources(robot):
@@ -123,7 +123,7 @@ def test_no_file_but_the_urdf_is_needed(robot):
 
 
 def test_it_moves_according_to_its_dh_table(robot):
-    """The last DH frame is fixed in the last joint's frame for all joint positions."""
+    """The pose of the last DH frame relative to the last joint's frame is the same at all positions."""
     model = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     data = model.createData()
     tools = []
@@ -162,7 +162,7 @@ def test_three_parallel_joints_save_outputs():
 
 @pytest.mark.parametrize(("robot", "other"), [("panda", "panda_erd"), ("ur10e", "ur10e_official")])
 def test_its_joints_are_where_the_manufacturers_file_has_them(robot, other, shared):
-    """Without the first joint: the manufacturer's base link is rotated."""
+    """All joints after the first are at the poses of the manufacturer's URDF, whose base link is rotated."""
     ours = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     theirs = pin.buildModelFromUrdf(str(shared / "arms" / f"{other}.urdf"))
     for joint in range(2, ours.njoints):
@@ -193,7 +193,10 @@ def along(axis, distance):
 
 
 def dh_frames(robot, q):
-    """Base and link frames; in the standard convention the link follows its joint, in the modified one not."""
+    """Return the poses of base and links in the DH frames at q.
+
+    In the standard convention a link's frame is at the next joint, in the modified convention at its own joint.
+    """
     frames = [np.eye(4)]
     for (a, alpha, d, theta, prismatic), value in zip(STANDARD.get(robot) or MODIFIED[robot], q, strict=True):
         link = along(0, a) @ about(0, alpha)
@@ -203,7 +206,7 @@ def dh_frames(robot, q):
 
 
 def dh_mass_matrix(robot, q):
-    """M(q) as the sum over links of m Jv^T Jv + Jw^T I Jw (Spong et al., Robot Modeling and Control, 7.2)."""
+    """Return M(q), (n, n): sum over links of m Jv^T Jv + Jw^T I Jw (Spong et al., Robot Modeling and Control, 7.2)."""
     frames = dh_frames(robot, q)
     table = STANDARD.get(robot) or MODIFIED[robot]
     total = np.zeros((len(q), len(q)))
@@ -224,6 +227,6 @@ def dh_mass_matrix(robot, q):
 
 
 def written_inertials(robot):
-    """As in the file: right for modified DH, where a link's frame is its joint's."""
+    """Return the inertials of the URDF, which are in DH frames in the modified convention."""
     links = read_urdf(ROBOTS / f"{robot}.urdf").links
     return [(each.inertial.mass, each.inertial.com, each.inertial.tensor) for each in links if each.inertial]

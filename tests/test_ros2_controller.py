@@ -1,4 +1,4 @@
-"""The exported ros2_control controller, compiled against substitutes of the ROS 2 headers, moves a simulated arm."""
+"""The exported ros2_control controller, compiled against substitutes of the ROS 2 headers, controls a simulated arm."""
 
 import re
 import shutil
@@ -25,7 +25,7 @@ EFFORT = np.array([c.effort for c in arm_of("two_link").chain.coordinates])
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    """A model, the library of its controller and the simulated arm."""
+    """Return a model, the library of its controller, the simulated arm, and the folder of the exported package."""
     model, folder = moved_model("two_link", "closed-form"), tmp_path_factory.mktemp("controller")
     export(model, "ros2", folder / "package", arm=arm_of("two_link"))
     library = compiled(folder / "package", folder)
@@ -33,21 +33,27 @@ def arm(tmp_path_factory):
 
 
 def started(arm, **parameters):
-    """A controller that uses its commands as measured efforts, and the simulated arm at START."""
+    """Return a controller that takes its own commands as measured efforts, and the simulated arm, at START.
+
+    parameters: of the controller.
+    """
     _, library, simulated, _ = arm
     simulated.start(START)
     return Controller(library, 2, **{"measured_effort": False} | parameters), simulated
 
 
 def torques(model, q, qd, qdd, friction_of=None):
-    """The torques of the torch model, with the friction state of joints that have moved at ``friction_of``."""
+    """Return the torques of the torch model; friction states are the ones of joints that slide at ``friction_of``.
+
+    friction_of: velocities (n,); None: joints that have not moved.
+    """
     states = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
     moved_at = states[1] * 0 if friction_of is None else torch.as_tensor(friction_of)
     return model.inverse_dynamics(*states, model.memory(moved_at)).numpy()
 
 
 def circle(t, start=START):
-    """A smooth reference: position, velocity and acceleration at t [s]."""
+    """Return a smooth reference motion at time t [s]: position, velocity and acceleration, (2,) each."""
     sign, w = np.array([1.0, -1.0]), 2.0
     return (
         start + 0.4 * sign * (1 - np.cos(w * t)),
@@ -57,7 +63,7 @@ def circle(t, start=START):
 
 
 def publishing(controller, every=10):
-    """A function that publishes the reference in every tenth cycle."""
+    """Return a function of time that publishes the reference `circle` in every tenth control cycle."""
 
     def at_each(t):
         if round(t / PERIOD) % every == 0:
@@ -119,7 +125,7 @@ def test_computed_torque_tracks_references_by_topic(arm):
 
 
 def test_without_the_model_the_same_gains_do_not_track(arm):
-    """The bound of the test above is due to the model: with an unknown tenth of gravity the same gains lag behind."""
+    """Without the model of a tenth of gravity, the gains of the test above do not keep its bound of the error."""
     controller, simulated = started(arm, mode="computed_torque")
     unknown = torques(arm[0], START, [0, 0], [0, 0]) / 10
     worst = 0.0
@@ -136,12 +142,12 @@ def test_a_preceding_controller_is_tracked(arm):
     controller.call("chain", 1)
     q, _, _ = simulated.run(controller, 1.0, lambda t: controller.write(*circle(t)))
     assert np.abs(q - [circle(k * PERIOD)[0] for k in range(len(q))]).max() < 5e-4
-    # it stops writing: the values that it wrote are used once
+    # after the last write, the interfaces' values are used for one cycle only
     _, qd, _ = simulated.run(controller, 1.5)
     assert controller.text("state") == "damping: no reference within reference_timeout"
     assert np.abs(qd[0]).max() > 0.3
     assert np.abs(qd[-1]).max() < 1e-3
-    # positions only; references by topic are ignored
+    # only positions are written; references on the topic are ignored
     controller.reference(simulated.q + 1.0)
     controller.write(simulated.q, [np.nan] * 4)
     controller.update(simulated.q, simulated.qd)
@@ -156,7 +162,7 @@ def test_a_reference_that_stops_ends_in_damping_and_a_new_one_resumes(arm):
     simulated.run(controller, 0.5, publishing(controller))
     moving = np.abs(simulated.qd).max()
     simulated.run(controller, 0.09)
-    assert controller.text("state") == "computed_torque"  # extrapolated
+    assert controller.text("state") == "computed_torque"  # within the timeout the reference is extrapolated
     simulated.run(controller, 0.02)
     assert controller.text("state") == "damping: no reference within reference_timeout"
     tau = controller.update(simulated.q, simulated.qd)
@@ -212,7 +218,7 @@ def test_states_that_are_not_finite_end_in_damping(arm, mode, bad):
     controller.update(START, qd)
     before = controller.text("state")
     tau = controller.update([bad, START[1]], qd)
-    # at the last valid position; velocities are still known
+    # the controller damps at the last valid position of the joint, with valid velocities
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], -5 * qd), rtol=1e-12)
     tau = controller.update(START, [bad, -0.1])
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0.5]), rtol=1e-12)
@@ -227,7 +233,7 @@ def test_a_state_that_stays_invalid_is_latched_until_the_next_activation(arm):
     for _ in range(int(0.1 / PERIOD) + 2):
         tau = controller.update([np.nan, np.nan], [np.nan, np.nan])
         np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0]), rtol=1e-12)
-    # a valid state again: damping at this state
+    # after the next valid state, the controller damps at this state
     tau = controller.update(START + np.array([0.01, 0.02]), [0.1, -0.2])
     expected = torques(arm[0], START + np.array([0.01, 0.02]), [0, 0], [-0.5, 1.0])
     np.testing.assert_allclose(tau, expected, rtol=1e-12)
@@ -253,7 +259,7 @@ def test_interfaces_in_use_by_another_thread_are_an_invalid_state(arm):
 
 
 def test_a_frozen_state_ends_in_damping(arm):
-    """The hardware repeats its last sample of a moving arm: it must not be damped by a velocity of the past."""
+    """If the hardware repeats the last state of a moving arm, damping does not use the velocity of that state."""
     controller, _ = started(arm, mode="computed_torque")
     qd = np.array([0.3, 0.0])
     for cycle in range(300):
@@ -268,8 +274,8 @@ def test_an_arm_at_rest_and_a_slow_encoder_are_not_frozen(arm):
     controller, _ = started(arm)
     random = np.random.default_rng(0)
     for cycle in range(2000):
-        noise = 0.02 * random.standard_normal(2) + [0.03, 0.0]  # and an offset
-        q = START + np.floor(cycle / 50) * 1e-3  # 0.02 rad/s by an encoder of 1 mrad
+        noise = 0.02 * random.standard_normal(2) + [0.03, 0.0]  # the velocity has noise and an offset
+        q = START + np.floor(cycle / 50) * 1e-3  # the joints move at 0.02 rad/s, in encoder steps of 1 mrad
         controller.update(q if cycle < 1000 else START + 0.02, noise + (0.02 if cycle < 1000 else 0))
         assert controller.text("state") == "gravity_compensation"
 
@@ -383,7 +389,7 @@ def test_joints_without_effort_limits_need_a_parameter(tmp_path):
     with pytest.raises(ValueError, match="torque_limits: got 0 for joint wrist, expected 1e-06 to 100000"):
         Controller(library, 3, measured_effort=False)
     controller = Controller(library, 3, measured_effort=False, torque_limits=[50.0, 50.0, 9.0])
-    turns = 4 * np.pi  # the wrist is continuous: turns do not count
+    turns = 4 * np.pi  # the wrist is continuous: whole turns between reference and position are no error
     controller.set("mode", "computed_torque")
     controller.reference([0.1, 0.2, 0.3 + turns])
     controller.update([0.1, 0.2, 0.3], [0, 0, 0])

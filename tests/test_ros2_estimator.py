@@ -1,4 +1,4 @@
-"""The exported controller with the estimator: a simulated UR10e with a load, contacts, published messages."""
+"""The exported controller with its estimator controls a simulated UR10e: loads, contacts and published messages."""
 
 import shutil
 
@@ -22,7 +22,8 @@ pytestmark = pytest.mark.skipif(
 
 N, PERIOD = 6, 2e-3
 STIFF = {"mode": "computed_torque", "kp": [400.0] * N, "kd": [40.0] * N, "max_position_error": [1.0] * N}
-MASS, CENTER = 2.5, np.array([0.02, -0.03, 0.06])  # in the frame of the last link
+# mass [kg] and centre [m] of the load, in the frame of the last link
+MASS, CENTER = 2.5, np.array([0.02, -0.03, 0.06])
 START = np.array([0.0, -1.2, 1.4, -0.8, 1.2, 0.3])
 FREQUENCIES = 2 * np.pi * np.array([0.21, 0.17, 0.25, 0.33, 0.29, 0.37])
 LOAD = f"""<link name="load"><inertial><origin xyz="{" ".join(map(str, CENTER))}"/><mass value="{MASS}"/>
@@ -31,7 +32,7 @@ LOAD = f"""<link name="load"><inertial><origin xyz="{" ".join(map(str, CENTER))}
 
 
 def arm_in(folder, *, loaded=False):
-    """The UR10e, with a load if wanted; both have the tip link of the arm without one."""
+    """Return the UR10e, with a load if `loaded`; both arms have the tip link of the arm without load."""
     text = (ROBOTS / "ur10e.urdf").read_text()
     (folder / "ur10e.urdf").write_text(text.replace("</robot>", LOAD) if loaded else text)
     shutil.copy(ROBOTS / "ur10e.yaml", folder)
@@ -39,7 +40,7 @@ def arm_in(folder, *, loaded=False):
 
 
 def levels(arm):
-    """Noise levels of an accurate fit."""
+    """Return the noise levels of an accurate fit of an arm."""
     effort = np.array([c.effort for c in arm.chain.coordinates])
     noise = BlockNoise(white=2e-3 * effort, disturbance=2e-3 * effort, time_constant=np.ones(N))
     ones = np.ones(N)
@@ -52,7 +53,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def ur10e(tmp_path_factory):
-    """The library of the controller, the arm without a load, and with one."""
+    """Return the library of the controller, and the simulated arm without and with a load."""
     folders = [tmp_path_factory.mktemp(name) for name in ("free", "loaded")]
     free, loaded = (arm_in(folder, loaded=k > 0) for k, folder in enumerate(folders))
     model = build(free, "closed-form")
@@ -64,7 +65,7 @@ def ur10e(tmp_path_factory):
 
 
 def moving(t):
-    """A reference that moves all joints, from rest at START."""
+    """Return a reference motion of all joints at time t [s], from rest at START: position, velocity, acceleration."""
     fade = 1 - np.exp(-t)
     wave, rate = np.sin(FREQUENCIES * t), FREQUENCIES * np.cos(FREQUENCIES * t)
     q = START + 0.5 * fade * wave
@@ -74,7 +75,10 @@ def moving(t):
 
 
 def tracked(controller, plant, seconds, start=0.0):
-    """Track the moving reference; return the position errors, (T, n). Topics are published at 50 Hz."""
+    """Run the controller along `moving` on a simulated arm; return the position errors, (T, n) [rad].
+
+    Topics are published at 50 Hz. start: time of the reference at the beginning [s].
+    """
     errors = []
 
     def at_each(t):
@@ -104,7 +108,7 @@ def test_a_payload_is_found_published_and_compensated(ur10e):
         np.testing.assert_allclose(payload[1:4], CENTER, atol=0.02)
         assert controller.allocations == 0
     assert worst["compensate"] < 0.2 * worst["monitor"]
-    # it is held as well: gravity compensation includes it
+    # gravity compensation includes the found load, so that the arm stays where it is
     controller.set("mode", "gravity_compensation")
     controller.set("gravity_damping", 5.0)
     loaded.run(controller, 1.0, period=PERIOD)
@@ -116,9 +120,9 @@ def test_without_a_payload_none_is_published_and_a_push_is_a_contact(ur10e):
     library, free, _ = ur10e
     free.start(START)
     controller = Controller(library, N, measured_effort=True, joint_prefix="left_", **STIFF)
-    controller.commands = np.full(N, np.nan)  # unknown before the first cycle
+    controller.commands = np.full(N, np.nan)  # there are no earlier commands before the first cycle
     tip = tip_kinematics(load_arm(ROBOTS / "ur10e.urdf"))
-    force = np.array([30.0, -20.0, -60.0])  # [N] in root axes
+    force = np.array([30.0, -20.0, -60.0])  # [N] force at the tip, in the root frame
     contacts, external = [], []
     for cycle in range(2500):
         t = cycle * PERIOD
@@ -191,7 +195,7 @@ def test_the_parameter_file_has_the_parameters_and_their_defaults(ur10e):
 
 
 def test_recordings_of_a_robot_cause_no_stop(ur10e, shared):
-    """Checks of jumps, frozen positions and velocities accept the samples of a UR10e."""
+    """The checks of jumps, frozen positions and velocities accept all samples of a recorded UR10e."""
     library, _, _ = ur10e
     joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     recordings = sorted((shared / "logs" / "ur10e").glob("*.parquet"))

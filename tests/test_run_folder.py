@@ -54,7 +54,7 @@ def motions(count: int = 4, samples: int = 25) -> list[Trajectory]:
 
 @pytest.fixture(scope="module", autouse=True)
 def short_epochs():
-    """Two steps per epoch: the files, and the times of writing, do not depend on the number of steps."""
+    """Limit epochs to two steps: files and times of writing do not depend on the number of steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(momentum_objective, "TUNING", FittingTuning(epoch_steps=2))
         yield
@@ -62,7 +62,7 @@ def short_epochs():
 
 @pytest.fixture(scope="module")
 def start(robots, tmp_path_factory) -> Path:
-    """A module, its URDF and a log."""
+    """Return a folder with a module, its URDF and a log."""
     folder = tmp_path_factory.mktemp("start")
     (folder / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
     (folder / "module.py").write_text(generate(folder / "arm.urdf", width=8, depth=1))
@@ -75,7 +75,7 @@ def trained(start: Path, folder: Path, **options) -> Path:
     return folder
 
 
-# ---- nothing of a run is executed
+# ---- no file of a run is executed
 
 
 USES = {
@@ -90,10 +90,10 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp_path, use):
-    """A file with a side effect in a folder with a valid specification."""
+    """A module in a run folder with a valid specification is neither read nor executed."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "module.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
-    if use == "export":  # needs the URDF
+    if use == "export":  # an export needs the URDF
         (run / "robot.urdf").write_bytes((start / "arm.urdf").read_bytes())
     USES[use](run, start / "train.parquet")
     assert not mark.exists()
@@ -101,7 +101,7 @@ def test_a_module_in_a_run_folder_is_neither_read_nor_executed(plain, start, tmp
 
 @pytest.mark.parametrize("use", USES)
 def test_a_run_of_an_earlier_version_is_refused_with_a_remedy(plain, start, tmp_path, use):
-    """It had a module in place of the specification."""
+    """A run of an earlier version, which has no specification, is refused with the advice to train again."""
     run, mark = copied(plain, tmp_path / "run"), tmp_path / "mark"
     (run / "spec.json").unlink()
     (run / "module.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
@@ -131,12 +131,12 @@ def test_a_second_training_names_the_holder_of_the_folder(start, tmp_path):
             "wait for it, or -o another",
             str(caught.value),
         )
-    assert not (tmp_path / "run").exists()  # nothing came of it
+    assert not (tmp_path / "run").exists()  # the refused training has created no folder
     trained(start, tmp_path / "run")
     assert not list((tmp_path / "run").glob(".*"))
 
 
-# ---- whole whenever it is killed
+# ---- a kill at any time leaves a valid folder
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -144,7 +144,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def test_a_training_killed_between_any_two_writes_loses_nothing(start, tmp_path):
-    """Every write of a training, in turn: module, robot, weights, checkpoints, config. Dead before or after it."""
+    """A training that is killed just before or after any of its writes gives equal weights when it is resumed."""
     whole = weights(trained(start, tmp_path / "whole", urdf=start / "arm.urdf"))
     kills, write, resumed = 0, 1, set()
     run = tmp_path / "run"
@@ -172,7 +172,10 @@ def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_pa
 
 
 def test_a_full_disk_is_reported_with_the_file(start, tmp_path):
-    """No file may grow beyond 2000 bytes: it fails as a full disk does, while it is written."""
+    """If the disk is full, the error names the file, and the run is unchanged.
+
+    A limit of 2000 bytes per file fails in the same way.
+    """
     run = trained(start, tmp_path / "run")
     before = weights(run)
     command = ["train", start / "module.py", "--data", start, "-o", run, "--resume", "--set", "epochs=9"]
@@ -188,7 +191,7 @@ def test_a_full_disk_is_reported_with_the_file(start, tmp_path):
     assert trained(start, run, options=RunOptions(resume=True))
 
 
-# ---- the folder may contain anything
+# ---- damaged and foreign files
 
 
 CHANGES = {
@@ -232,7 +235,7 @@ def test_broken_files_and_pipes_are_reported(plain, tmp_path, name, what):
     else:
         (tmp_path / name).write_bytes(what)
     if name == "metrics.jsonl" and what not in (None, b"[]"):
-        load_run(tmp_path)  # an incomplete last line is omitted
+        load_run(tmp_path)  # an incomplete last line of metrics.jsonl is omitted
     else:
         with pytest.raises(spelgen.SpelgenError, match=r"\S"):
             load_run(tmp_path)
@@ -262,7 +265,7 @@ def not_a_number(state):
 
 
 def repeated(state):
-    """A tensor of 4 TB that is one number."""
+    """Return a state whose first tensor has a shape of 4 TB, but the storage of one number."""
     return state | {next(iter(state)): torch.zeros(1).expand(10**12)}
 
 
@@ -326,7 +329,7 @@ SPECS = {
 
 @pytest.mark.parametrize("case", SPECS)
 def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
-    """Every reader reports it in one line that names the file or the defect; nothing is assembled."""
+    """A changed specification is refused by each reader, in one line that names the defect; no model is assembled."""
     change, message = SPECS[case]
     run = copied(plain, tmp_path)
     content = json.loads((run / "spec.json").read_text())
@@ -341,7 +344,7 @@ def test_a_specification_of_another_content_is_refused(plain, tmp_path, case):
 def test_a_huge_file_is_not_read(plain, start, tmp_path):
     run = copied(plain, tmp_path)
     with (run / "notes.bin").open("wb") as file:
-        file.truncate(40 * 10**9)  # takes no space
+        file.truncate(40 * 10**9)  # the file is sparse, and occupies no disk space
     begin = time.process_time()
     render_report(run)
     assert in_time(time.process_time() - begin, 10)

@@ -1,4 +1,4 @@
-"""The page of several runs, the page of an identification, and evaluations as machine-readable tables."""
+"""The pages of several runs and of an identification are complete, and evaluations are machine-readable tables."""
 
 import csv
 import io

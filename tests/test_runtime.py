@@ -1,4 +1,4 @@
-"""Parts of the runtime: derivatives against autograd, units, and the selection of classes that a module contains."""
+"""Parts of the runtime: derivatives equal autograd's, units are right, modules contain the classes that they use."""
 
 import ast
 import json
@@ -29,7 +29,8 @@ from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rows import Constant, Joint, Link, vector
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
-FIRST_STAGE = (  # friction's laws then: |gravity torque|, tanh and exp
+# replacements that restore the first release's formulas of friction: |gravity torque|, tanh and exp
+FIRST_STAGE = (
     ("load = 0.01 * torch.where", "load = 0.0 * torch.where"),
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
     ("slow.square().square().square()", "(-((qd / self.stribeck_velocity) ** 2)).exp()"),
@@ -42,7 +43,7 @@ JOINTS = (
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
-    """Normal numbers."""
+    """Return normal random numbers of this shape."""
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
@@ -94,12 +95,12 @@ def test_hidden_units_are_shared_in_proportion_to_outputs():
 
 
 def entries(f1, f2, c1):
-    """M of two functions and a constant."""
+    """Return M of two functions f1 and f2 and a constant c1, as the rows of an emitted module do."""
     return symmetric([f1], [f1 - 2 * f2, c1], [0, f2, 3 * f2])
 
 
 def residual_terms(joints=JOINTS, size: float = 0.0, *, networks: bool = True) -> ResidualTerms:
-    """Residual terms whose weights are normal numbers of this size."""
+    """Return residual terms whose parameters are normal random numbers of this standard deviation."""
     generator, parts = torch.Generator().manual_seed(0), {}
     if networks:
         scales = [(1.0, 1.0, 1.0)] * 2
@@ -121,7 +122,7 @@ def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
     assert (pose.friction > 0).all()
 
     def added(at: Tensor) -> Tensor:
-        """1/2 qd^T R qd - V."""
+        """Return the residual Lagrangian 1/2 qd^T R qd - V of the terms, summed over states."""
         mass = terms.at(at, weights).mass
         return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(terms.at(at, weights)).sum()
 
@@ -214,7 +215,7 @@ def test_bodies_are_physically_consistent_for_all_parameters():
     about_center = torch.tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=torch.float64)
     c = torch.tensor(center, dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)
-    # S = 1/2 tr(J) 1 - J with J about the origin of the frame (Steiner)
+    # the pseudo-inertia contains S = 1/2 tr(J) 1 - J, where J is the inertia about the frame's origin (Steiner)
     about_origin = about_center + mass * (c.dot(c) * eye - torch.outer(c, c))
     found = (parameters() @ parameters().mT)[0]
     near(found[:3, :3], about_origin.trace() / 2 * eye - about_origin)
@@ -246,7 +247,7 @@ def test_friction_is_dissipative_and_equals_its_formula():
 
 
 def test_a_standalone_module_contains_the_definitions_that_it_uses():
-    """Each is the text of the runtime, is used, and is listed in the contents of the file."""
+    """Each definition in a standalone module is the runtime's text, is used, and is listed in the module's contents."""
     runtime = load_runtime()
     for preset in PRESET_NAMES:
         source = built("rpr", preset=preset, standalone=True)[0]
@@ -264,13 +265,13 @@ def test_a_standalone_module_contains_the_definitions_that_it_uses():
 
 
 def test_a_thin_module_is_short_and_shows_the_entries():
-    longest = {"hybrid": 120, "spel": 100}  # lines, of rpr
+    longest = {"hybrid": 120, "spel": 100}  # largest number of lines of a thin module of rpr
     for robot in SIX:
         for preset in PRESET_NAMES:
             lines = built(robot, preset=preset)[0].splitlines()
             most = (
                 longest.get(preset, 110) if robot == "rpr" else 325
-            )  # spel of panda: 27 functions of 7 joints
+            )  # spel of the Panda has the longest module: 27 functions of 7 joints
             assert len(lines) <= most, f"{robot}, {preset}: {len(lines)} lines"
     assert "return symmetric([f3], [f1, c2], [f2, 0, c1])" in built("rpr")[0]
     assert "m22 = f9 + 2 * f12 - f5" in built("six_dof")[0]
@@ -286,9 +287,10 @@ def test_values_are_in_units(tmp_path):
 
 
 def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
-    """Factors of inertial parameters with as many digits as modules stated then.
+    """Return the Cholesky factors of inertial parameters, rounded to the digits that modules of the first release had.
 
-    The inertia of link3 of rpr is at the limit of physical consistency: the nearest consistent one had six digits.
+    The inertia of link3 of rpr is at the limit of physical consistency: it was replaced by a consistent one of six
+    digits.
     """
     digits = [6 if (robot, index) == ("rpr", 2) else 10 for index in range(len(ten))]
     rounded = [[float(f"{x:.{k}g}") for x in row] for row, k in zip(ten.tolist(), digits, strict=True)]
@@ -297,7 +299,10 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Weights of the bodies whose Cholesky factors, lower triangular then, had exp(0.01) and 0.01 as entries."""
+    """Return the parameters of bodies that equal the first release's after 0.01 was added to its parameters.
+
+    The first release had lower triangular Cholesky factors, with the entries exp(0.01) and 0.01 relative to nominal.
+    """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
     root = torch.linalg.cholesky(nominal) @ (entries + math.exp(0.01) * torch.eye(4).double())
@@ -306,7 +311,11 @@ def weights_of_first_stage(bodies):
 
 
 def rotation_inputs(joint_types, axes):
-    """By input of the first stage's networks: its joint, the input that it is now and its sign, or a constant."""
+    """Return, for each input of the first release's networks, how it is made from today's inputs.
+
+    The first release had nine numbers per rotation. A tuple is: joint, index of today's input, its sign (0: none), and
+    a constant.
+    """
     n, inputs = len(joint_types), []
     for joint, kind in enumerate(joint_types):
         cos, sin = (joint, 1.0, 0.0), (n + joint, 1.0, 0.0)
@@ -319,7 +328,10 @@ def rotation_inputs(joint_types, axes):
 
 
 def network_of_first_stage(network, inputs, generator):
-    """Give a network the weights of one that read nine numbers of each rotation, and that 0.01 was added to."""
+    """Give a network the parameters that make it equal to a network of the first release.
+
+    That network read nine numbers per rotation, and 0.01 was added to each of its parameters.
+    """
     sensitivity = network.mask0[0].flatten()
     for index, weight in enumerate(network.weights):
         first = index == 0
@@ -337,7 +349,7 @@ def network_of_first_stage(network, inputs, generator):
             weight.zero_()
             for (joint, now, sign, constant), column in zip(inputs, drawn.unbind(1), strict=True):
                 if sign:
-                    # the bumps of -x are the bumps of x in reverse
+                    # basis functions of -x are the ones of x in reverse order
                     weight[:, now] += column.flip(-1) if grid and sign < 0 else column * (1 if grid else sign)
                 elif grid:
                     bumps = torch.exp(-((constant / (2 / 3) - network.grid) ** 2))
@@ -350,7 +362,10 @@ def network_of_first_stage(network, inputs, generator):
 
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
 def test_numbers_equal_those_of_the_first_release(case, tmp_path):
-    """Modules of the first stage, made by templates, gave these with the same seed and the same change of weights."""
+    """Models give the numbers of the first release, for equal seeds and equal changes of their parameters.
+
+    Modules of the first release were made by templates.
+    """
     robot, preset, _ = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
     design = design and replace(design, memory="none")
@@ -387,7 +402,10 @@ def test_numbers_equal_those_of_the_first_release(case, tmp_path):
 
 
 def test_every_parameter_has_a_kind():
-    """Fits, exports and reports find parameters by kind; without a kind they would be treated as networks."""
+    """Each parameter of each preset belongs to a group, by which fits, exports and reports find it.
+
+    A parameter without a group would be treated as one of networks.
+    """
     networks = (
         "network.",
         "residuals.mass.",
@@ -412,7 +430,7 @@ def test_every_parameter_has_a_kind():
 
 @pytest.mark.parametrize("preset", ["closed-form", "minimal"])
 def test_invalid_states_are_refused_with_a_remedy(preset):
-    """Arrays, another precision and inconsistent shapes, in every method."""
+    """All methods refuse arrays, another precision and inconsistent shapes, with advice."""
     model = build(arm_of("rpr"), preset)
     q = draw(5, 3)
     for call in (model.inverse_dynamics, model.forward_dynamics):

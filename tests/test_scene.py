@@ -16,7 +16,7 @@ from spelgen.templates import json_data
 
 
 def frames(links, q):
-    """Rotation (3, 3) and position (3,) of each link at q, as the page's script places them."""
+    """Return the rotation (3, 3) and position (3,) of each link at q, by the algorithm of the page's script."""
     placed = []
     for link in links:
         rotation, position = placed[link.parent] if link.parent >= 0 else (np.eye(3), np.zeros(3))
@@ -59,7 +59,7 @@ def test_the_shapes_of_the_file_are_drawn_where_all_are_there(tmp_path):
     assert not found.tubes and [len(link.shape.faces) for link in found.links] == [12, 12]
     np.testing.assert_allclose(np.ptp(found.links[1].shape.vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-3)
     path.write_text(text.replace("BOX", mesh))
-    found = scene(path, ["j"])  # a tube for the link without its mesh, the box for the other
+    found = scene(path, ["j"])  # link b, without its mesh, is drawn as a tube, the other link as its box
     assert found.tubes == " Drawn as tubes, since meshes were not read: b (not_there.stl)."
     assert len(found.links[0].shape.faces) == 12 and len(found.links[1].shape.faces) > 12
 
@@ -70,7 +70,8 @@ def test_tubes_are_closed_and_look_outward():
     for face in shape.faces:
         first, *rest = shape.vertices[list(face)]
         volume += sum(first @ np.cross(a, b) / 6 for a, b in pairwise(rest))
-    assert volume == pytest.approx(2 * 0.5**2 * np.pi, rel=0.1)  # negative were it inside out
+    # the volume would be negative if the faces were inside out
+    assert volume == pytest.approx(2 * 0.5**2 * np.pi, rel=0.1)
 
 
 def test_every_cell_states_its_kind_and_the_reason(robots):

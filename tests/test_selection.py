@@ -1,4 +1,4 @@
-"""Acceptance of residual terms, friction effects and figures: each test fails without its criterion."""
+"""Acceptance of residual terms, friction effects and figures: each test fails without the criterion it names."""
 
 import re
 from dataclasses import replace
@@ -34,7 +34,7 @@ from spelgen.settings.fits import Rollout, TorqueFit
 
 
 class Alone:
-    """Rigid bodies and a friction model that absorb none of the added torque."""
+    """Projection of a model whose rigid bodies and friction can absorb no added torque."""
 
     @staticmethod
     def orthogonalize(joint, torque):
@@ -46,7 +46,7 @@ ALONE = Alone()
 
 @pytest.fixture
 def hybrid(robots):
-    """A model of bodies with functions of joints, and no networks: these take longer."""
+    """Return a hybrid model with functions of single joints and without networks, whose fits take longer."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     return model
@@ -58,21 +58,27 @@ def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
 
 
 def data(correlation_length: float, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Correlation length, recordings and torque of one recording of two joints."""
+    """Return correlation lengths (2,), recording numbers (T,), and torque standard deviations (2,) of one recording."""
     return torch.full((2,), correlation_length), torch.zeros(count).long(), torch.full((2,), 4.0).double()
 
 
-def test_what_the_samples_of_one_stretch_say_is_judged_on_others(hybrid):
-    """The first joint moves slowly through its range, and the residual is another constant in each direction."""
+def test_a_function_is_selected_by_held_out_blocks(hybrid):
+    """A function is selected by held-out blocks: a residual that is constant in each block selects no function of q.
+
+    Joint 1 moves slowly through its range once, so that q is different in each block.
+    """
     levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
-    # a function of q explains nearly all of it, and nothing where it was not fitted
+    # a function of q explains nearly all of the residual where it is fitted, and nothing in held-out blocks
     assert select_functions(hybrid, samples(missing, q), ALONE, [], *data(1.0, len(q))) == []
 
 
-def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
-    """As above, but each constant lasts over the border of two tenths: the half on one side tells of the other."""
+def test_samples_next_to_a_held_out_block_are_not_fitted(hybrid):
+    """Gaps are left on both sides of held-out blocks: a residual that is constant across borders selects no function.
+
+    Otherwise the half of a constant segment on one side of a border would predict the half on the other side.
+    """
     levels = torch.randn(11, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0)[100:2100] * torch.tensor([[1.0, 0.0]]).double()
     q = torch.stack([torch.linspace(-2, 2, 2000), torch.zeros(2000)], dim=1).double()
@@ -83,8 +89,11 @@ def test_neighbours_of_what_is_held_out_are_not_fitted_to(hybrid):
     assert select_functions(hybrid, missed, ALONE, [], *data(40.0, len(q))) == []
 
 
-def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
-    """All tenths gain by the mean of both halves; the last loses by the data of the first half."""
+def test_a_function_must_lower_the_error_of_the_last_half(hybrid):
+    """A function that is fitted to the first half must also lower the error in the last half.
+
+    The mean of both halves would lower the error in all ten blocks.
+    """
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     missing = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
@@ -94,8 +103,11 @@ def test_what_the_first_half_shows_has_to_hold_in_the_last(hybrid):
         assert len(found) == selected
 
 
-def test_the_first_half_is_judged_where_it_has_been(hybrid):
-    """Beyond, splines fitted to it are far off, which says nothing against them."""
+def test_the_last_half_counts_only_within_the_range_of_the_first(hybrid):
+    """A function that is fitted to the first half is not evaluated at positions that only the last half has.
+
+    Splines extrapolate badly there, which is no evidence against the function.
+    """
     t = torch.linspace(0, 100, 4000).double()
     early, late = 1.0 + 0.7 * torch.sin(t[:2000]), -0.7 + 1.2 * torch.sin(t[2000:])
     q = torch.stack([torch.cat([early, late]), torch.zeros_like(t)], dim=1)
@@ -111,37 +123,37 @@ def test_the_first_half_is_judged_where_it_has_been(hybrid):
     assert [(residual.name, residual.joint) for residual in selected] == [("raw_torque_splines", 0)]
 
 
-def test_a_gain_in_one_of_ten_stretches_is_luck(hybrid):
+def test_an_error_reduction_in_one_of_ten_blocks_is_not_significant(hybrid):
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
     everywhere = torch.stack([torch.sin(q[:, 0]), torch.zeros_like(t)], dim=1)
     noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     noise[:, 1] = 0.0
     found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], *data(1.0, len(q)))
-    # of the functions that explain it the best one is selected, and none of the joint that misses nothing
+    # the best of the functions that explain the residual of joint 1 is selected, and none for joint 2, which has none
     assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
-    # in one stretch it is so, in the others the torque is nearly nothing: held out it gains in one at most
+    # the same torque in only one of ten blocks is not selected: it lowers the held-out error of one block at most
     once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
     assert select_functions(hybrid, samples(0.3 * once + noise, q), ALONE, [], *data(1.0, len(q))) == []
 
 
-def test_a_stretch_without_torque_hides_no_gain():
-    """Where a joint rests with no torque at all, a function may err by next to nothing."""
+def test_a_block_without_torque_does_not_prevent_selection():
+    """A block at rest without torque does not prevent the selection, although a function has a small error there."""
     squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
     squares[3], missed[3] = 0.0, 1e-9
-    # nine of ten stretches fall to a tenth
+    # the error falls to a tenth in nine of ten blocks
     assert selection.significant_reduction(squares, missed) == pytest.approx(0.85, abs=0.01)
 
 
-def test_a_stretch_that_goes_farther_than_all_others_hides_no_gain():
-    """Splines of a spring know nothing of where a joint has been once, and that is where its torque is largest."""
+def test_a_block_beyond_the_range_of_others_does_not_prevent_selection():
+    """A block beyond the range of all others does not prevent the selection, although splines extrapolate badly."""
     squares, missed = torch.full((10,), 50.0), torch.full((10,), 1.0)
     squares[0], missed[0] = 400.0, 2e6
     assert selection.significant_reduction(squares, missed) > 0.8
 
 
-def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypatch):
-    """Both networks are to explain the residual of the functions of joints."""
+def test_a_network_is_fitted_to_the_residual_of_functions_of_joints(robots, monkeypatch):
+    """Networks are fitted to the residual that functions of single joints leave, not to the whole residual."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
     left = []
@@ -157,20 +169,23 @@ def test_a_network_is_fitted_to_what_functions_of_joints_leave(robots, monkeypat
         torch.testing.assert_close(missing, q.sin())
 
 
-def test_gains_have_to_be_beyond_their_own_scatter():
+def test_an_error_reduction_must_exceed_its_scatter():
     squares = torch.ones(10).double()
     steady = torch.full((10,), 0.9).double()
     assert selection.significant_reduction(squares, steady + 0.001 * torch.arange(10)) == pytest.approx(
         0.0955, rel=2e-3
     )
-    # as sure as can be, and next to nothing: no function is worth that
+    # a reduction by 0.01 % is significant, but too small for any term
     assert selection.significant_reduction(squares, 0.9999 * squares) is None
     lucky = torch.tensor([0.1] + [1.0] * 9).double()
     assert selection.significant_reduction(squares, lucky) is None
 
 
-def test_samples_that_err_alike_count_once():
-    """Each sample twenty times, with equal errors, has the evidence of one."""
+def test_repeated_samples_count_once():
+    """Repeated samples with equal errors are counted once by the Bayesian ridge regression.
+
+    Twenty copies of each sample, with this correlation length, give the estimate of one copy.
+    """
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(300, 4, generator=draw).double()
     y = x @ torch.tensor([0.1, 0.0, -0.2, 0.3]).double() + torch.randn(300, generator=draw).double()
@@ -183,11 +198,14 @@ def test_samples_that_err_alike_count_once():
     torch.testing.assert_close(weights(20), weights(1), rtol=1e-6, atol=1e-9)
     assert (
         weights(1) - torch.linalg.lstsq(x, y).solution
-    ).abs().max() > 1e-3  # drawn to nothing by the prior
+    ).abs().max() > 1e-3  # the prior shrinks the estimate, which is therefore not the least-squares solution
 
 
 def test_bayesian_ridge_maximizes_the_marginal_likelihood():
-    """Two groups of weights, one of them without effect, against a numerical maximum over the prior's precisions."""
+    """Hyperparameters of the Bayesian ridge regression are a numerical maximum of the marginal likelihood.
+
+    There are two groups of parameters, one of which has no effect.
+    """
     rng = np.random.default_rng(0)
     x = rng.normal(size=(2000, 12))
     y = x[:, :6] @ rng.normal(scale=0.3, size=6) + 0.5 * rng.normal(size=2000)
@@ -208,14 +226,14 @@ def test_bayesian_ridge_maximizes_the_marginal_likelihood():
     assert found.converged and found.n_iter > 1
     assert found.alpha == pytest.approx(np.exp(best.x[0]), rel=0.01)
     assert float(found.lambda_[0]) == pytest.approx(np.exp(best.x[1]), rel=0.01)
-    # of the group without effect only a lower bound is known: its weights are near zero
+    # for the group without effect only a lower bound of the precision is known, as its coefficients are near zero
     assert found.gamma[0] > 5.9 and found.gamma[1] < 2.0
     expected = np.linalg.solve(x.T @ x + np.diag(found.penalty.numpy()), x.T @ y)
     np.testing.assert_allclose(found.coef.numpy(), expected, rtol=1e-9)
 
 
-def test_intervals_of_errors_that_last_are_wider():
-    """White errors, each of which stays for ten samples: the standard deviation counts as sqrt(10) times that."""
+def test_intervals_of_correlated_errors_are_wider():
+    """Correlated errors count with a larger standard deviation: sqrt(10) times, if each error lasts ten samples."""
     white = np.random.default_rng(0).normal(size=(4000, 2))
     lasting = white.repeat(10, axis=0)
     np.testing.assert_allclose(deviations([white], 2), 1.0, rtol=0.15)
@@ -224,14 +242,16 @@ def test_intervals_of_errors_that_last_are_wider():
 
 @pytest.mark.parametrize("correlation", [1.0, 5.0])
 def test_the_first_noise_is_that_of_least_squares(correlation):
-    """Of two joints, one with three weights of its own: the residual, with a sample fewer for every weight, and with
-    more where errors last.
+    """The initial noise is the residual of least squares per joint, corrected for its degrees of freedom.
+
+    Joint 1 has three parameters of its own, joint 2 none; with correlated errors fewer samples are independent.
     """
     draw = torch.Generator().manual_seed(0)
     count, deviations = 400, torch.tensor([0.5, 0.01]).double()
     x = torch.randn(count, 3, generator=draw).double()
     measured = deviations * torch.randn(count, 2, generator=draw).double()
-    measured[:, 0] += 7.0 * x[:, 1]  # nothing of it is missed
+    # this part of the torque is a multiple of a regressor column, and so no noise
+    measured[:, 0] += 7.0 * x[:, 1]
     jacobian = object.__new__(torque_jacobian.TorqueJacobian)
     slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
     jacobian.joint_rows = lambda _: slopes
@@ -247,8 +267,11 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
     torch.testing.assert_close(problem.noise, (correlation * expected).sqrt(), rtol=1e-6, atol=0)
 
 
-def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
-    """A dead zone that lowers the cost by 1, which a chance does once in six times, is not selected; one of 10 is."""
+def test_a_dead_zone_of_a_servo_must_be_significant(monkeypatch):
+    """A dead zone is selected if it lowers the cost significantly: by 10, but not by 1, which happens by chance.
+
+    The chance of a decrease by 1 is one in six.
+    """
     without = ServoParameters(torch.ones(1, 1), torch.zeros(0), 0.0, torch.zeros(1, 1, dtype=torch.bool))
     problem = SimpleNamespace(parameters=SimpleNamespace(row=lambda name: 0), reweighted=lambda x: problem)
     with_zone = replace(without, joints=2 * torch.ones(1, 1))
@@ -259,8 +282,11 @@ def test_a_dead_zone_of_a_servo_is_worth_more_than_luck(monkeypatch):
         assert bool(laws.select_dead_zones(problem, without).active.any()) == selected
 
 
-def test_straying_from_the_urdf_costs_what_the_docs_say(robots, monkeypatch):
-    """Mean squared deviations of M's variation and of gravity, relative to their sizes, times the weight: once."""
+def test_the_regularizer_towards_the_urdf_equals_its_definition(robots, monkeypatch):
+    """The regularizer towards the URDF equals its definition in the documentation.
+
+    It is the weight times the mean squared differences of M's variation and of gravity, relative to their magnitudes.
+    """
     draw = torch.Generator().manual_seed(0)
     mass = torch.randn(50, 2, 2, generator=draw).double()
     gravity = torch.randn(50, 2, generator=draw).double()
@@ -295,16 +321,19 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
 
 
-def test_noise_is_what_each_joint_misses():
-    """Ten times the squares are sqrt(10) times the noise, and no joint's noise is another's."""
+def test_noise_is_estimated_per_joint():
+    """The noise of a joint is proportional to the root of its own squared residual."""
     estimator = torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double())
     noise = [estimator.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
     torch.testing.assert_close(noise[1], 10**0.5 * noise[0])
 
 
-def test_weights_that_samples_determine_leave_fewer_errors():
-    """Of ten independent errors four weights leave six, and twenty leave one."""
+def test_noise_is_corrected_for_degrees_of_freedom():
+    """The noise is corrected for the degrees of freedom of the fit.
+
+    Of ten independent errors, four determined parameters leave six, and twenty leave one.
+    """
     estimator, squares = (
         torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
         torch.tensor([2.0, 8.0]),
@@ -314,8 +343,11 @@ def test_weights_that_samples_determine_leave_fewer_errors():
     torch.testing.assert_close(noise[2], noise[0] * 10)
 
 
-def test_a_joint_of_servos_goes_no_step_uphill():
-    """Residuals arctan 10 x of two joints: a step from 0.3 goes far beyond zero, and is not taken."""
+def test_no_step_of_a_servo_joint_raises_its_cost():
+    """A step of a servo joint that raises the joint's cost is not taken.
+
+    The residual of each of two joints is arctan(10 x): from x = 0.3 a Gauss-Newton step goes far beyond zero.
+    """
     seen = []
 
     def residual(x):
@@ -336,13 +368,16 @@ def test_a_joint_of_servos_goes_no_step_uphill():
     )
     found, costs = laws._joint_minima(problem, start)
     tried = (10 * torch.cat(seen)).atan().square() / 2
-    assert (tried[1:] > tried[0]).any()  # such steps were tried
+    assert (tried[1:] > tried[0]).any()  # steps that raise the cost were tried
     torch.testing.assert_close(costs, (10 * found.joints[0]).atan().square() / 2)
     assert (costs < 1e-3).all()
 
 
 def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
-    """1 Nm forward and 3 Nm backward: a file that has one figure for both says 2."""
+    """MJCF has one friction loss per joint: the mean of the magnitudes in both directions.
+
+    Of 1 Nm forward and 3 Nm backward it is 2 Nm.
+    """
     arm = load_arm(robots / "two_link.urdf")
     learned = rigid_body_projection(build(arm, "closed-form"), arm)
     friction = learned.friction._replace(forward=np.array([1.0, 0.5]), backward=np.array([-3.0, -0.5]))
@@ -351,8 +386,8 @@ def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
     assert re.findall(r'frictionloss="([^"]*)"', text) == ["2", "0.5"]
 
 
-def test_the_tip_is_missed_by_millimetres():
-    """A joint is predicted 0.003 rad too far, at a radius of 2 m."""
+def test_the_tip_error_is_radius_times_angle_error():
+    """The tip error of a joint angle error of 0.003 rad at a radius of 2 m is 6 mm."""
     q = torch.zeros(4, 3, 1).double()
     windows = Windows(torch.full((4, 2), 0.01).double(), q, q, torch.zeros(4, 2, 1).double())
     predicted = torch.full((4, 2, 1), 0.003).double()
@@ -368,12 +403,15 @@ def test_the_tip_is_missed_by_millimetres():
     ("evidence", "unlikely"),
     [((-1.0, -20.0), [True, True]), ((-1.0, 20.0), [False, False]), ((9.0, -20.0), [False, True])],
 )
-def test_weak_evidence_of_a_joint_yields_to_that_of_all(evidence, unlikely):
+def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
 
 
-def test_a_residual_that_is_smaller_in_one_part_of_a_log_is_no_evidence_of_another_friction():
-    """A third of the squared residual in each block of joint 1; of joint 2 a hundredth, but in two blocks only."""
+def test_a_friction_state_must_lower_the_residual_in_most_blocks():
+    """A friction state must lower the squared residual in most blocks of a log.
+
+    For joint 1 it is a third in each block; for joint 2 a hundredth, but in two of ten blocks only.
+    """
     other = torch.ones(1000, 2).double()
     residual = other.clone()
     residual[:, 0] /= 3**0.5
@@ -381,8 +419,11 @@ def test_a_residual_that_is_smaller_in_one_part_of_a_log_is_no_evidence_of_anoth
     assert stages._smaller_in_most_blocks(residual, other).tolist() == [True, False]
 
 
-def test_freedom_that_samples_narrow_speaks_against_memory():
-    """Of two joints with two elements each: samples narrow one fraction of the second to a tenth."""
+def test_the_occam_factor_of_bristle_fractions():
+    """The Occam factor of bristle fractions is the log ratio of prior to posterior standard deviations, per joint.
+
+    Of two joints with two elements each, samples narrow one fraction of joint 2 to a tenth.
+    """
     rigid = SimpleNamespace(
         names=lambda group: ["fractions"],
         unflatten=lambda x: {"sizes": x[:1], "fractions": x[1:].view(2, 2)},
@@ -398,9 +439,12 @@ def test_freedom_that_samples_narrow_speaks_against_memory():
     torch.testing.assert_close(narrowed, torch.tensor([0.0, 2 * np.log(10)]).double())
 
 
-def test_energy_that_only_changes_its_kind_is_no_rise(robots, monkeypatch):
-    """Links that swing upwards gain height and lose speed; with friction the sum falls."""
-    # of the ten seconds one shows it: speed and height alone rise by a thousandth in a step
+def test_exchange_of_kinetic_and_potential_energy_is_no_rise(robots, monkeypatch):
+    """Exchange of kinetic and potential energy is not counted as a rise of energy.
+
+    Links that swing upwards gain height and lose speed; with friction the sum decreases.
+    """
+    # one of the ten seconds is enough: kinetic or potential energy alone would rise by a thousandth in a step
     monkeypatch.setattr(rollout, "TUNING", replace(rollout.TUNING, free_steps=1000))
     model = build(robots / "two_link.urdf", "closed-form")
     q, qd = torch.full((4, 2, 2), 0.3).double(), torch.full((4, 2, 2), 2.0).double()

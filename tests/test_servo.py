@@ -1,4 +1,4 @@
-"""Arms under position servos: parameters relative to kp are recovered, and replayed commands track the logs."""
+"""Fits to arms under position servos recover parameters relative to kp; predictions from commands track the logs."""
 
 import json
 import re
@@ -70,7 +70,7 @@ def fitted(arm, logs, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(fitted, logs):
-    """The evaluation of the fit on the log that was not fitted."""
+    """Return the evaluation of the fit on the log that was not in the training."""
     return spelgen.evaluate(fitted, logs[5:])
 
 
@@ -110,7 +110,7 @@ def test_a_standalone_module_of_servos(arm, tmp_path):
         assert model.servo(u, q, torch.zeros_like(q)).tolist() == [[pytest.approx(0.2 * 12.0), 0.0]]
         assert float(model.servo.stored_energy(u, q)) == pytest.approx(0.5 * 12.0 * 0.04)
         far = model.servo(u + 9, q, torch.zeros_like(q))
-    assert far.tolist() == [[6.0, 6.0]]  # the URDF's effort
+    assert far.tolist() == [[6.0, 6.0]]  # far from the command, the torque is the effort limit of the URDF
     assert "in ratio to kp only" in " ".join(spelgen.inspect(arm).text().split())
 
 
@@ -131,7 +131,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # its velocity belongs to another form of the curve: the curves are compared relative to kp
+    # the curves are compared relative to kp: the model's Stribeck velocity belongs to another form of the curve
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -146,7 +146,7 @@ def test_intervals_count_correlated_errors_once():
     found, told = [], []
     for _ in range(300):
         slopes = torch.ones(20, 50, 1).double() + 0.3 * torch.randn(20, 50, 1, generator=rng).double()
-        errors = torch.randn(20, 1, generator=rng).double().expand(20, 50)  # a window errs as a whole
+        errors = torch.randn(20, 1, generator=rng).double().expand(20, 50)  # all errors of a window are equal
         curvature, descent = slopes.mT @ slopes, -(slopes.mT @ errors.unsqueeze(-1)).squeeze(-1)
         step = torch.linalg.solve(curvature.sum(dim=0), descent.sum(dim=0))
         left = (slopes.mT @ (errors.unsqueeze(-1) + slopes * step)).squeeze(-1)
@@ -155,7 +155,7 @@ def test_intervals_count_correlated_errors_once():
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
-    )  # a fiftieth of it, if samples were all new
+    )  # the variance would be a fiftieth if all errors of a window were independent
 
 
 def test_blocks_of_intervals_are_whole_motions():
@@ -165,8 +165,8 @@ def test_blocks_of_intervals_are_whole_motions():
         stretches = windows.blocks(4, 6).tolist()
         numbers[count] = len(set(stretches))
         by_log = {(log.name, stretch) for (log, _), stretch in zip(windows.rows, stretches, strict=True)}
-        assert len(by_log) == numbers[count]  # none is of two logs
-    # three logs are too few for the differences between motions: each is cut in two
+        assert len(by_log) == numbers[count]  # no block contains parts of two logs
+    # with three logs, each is cut in two, as three blocks are too few for a variance
     assert numbers == {1: 5, 3: 6, 4: 4, 5: 5}
 
 
@@ -180,7 +180,7 @@ def test_a_known_kp_stays(tmp_path, logs, monkeypatch):
     assert [x["kp"]["known"] for x in fit.record.servo["joints"]] == [True, False]
 
 
-def test_commands_are_held_and_late():
+def test_commands_are_constant_between_samples_and_delayed():
     t = np.arange(5) * 0.02
     u = np.array([[0.0], [1.0], [2.0], [3.0], [4.0]])
     log = Trajectory(t, u, u, np.zeros((5, 0)), u=u)
@@ -227,15 +227,15 @@ def test_reported_intervals_cover_the_truth(fitted):
             ("static_error", TRUTH.coulomb[k] / TRUTH.kp[k] + TRUTH.dead_zone[k]),
         ):
             assert joint[what]["determined"]
-            # friction of the simulated elbow falls as a Gaussian, friction of the model from rest on
+            # tolerance for the different Stribeck curves: only the simulator's falls as a Gaussian
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
-    # with the elbow's small weight dry friction and a dead zone are confounded
+    # small gravity of the elbow does not separate dry friction from a dead zone
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
 def servo_truth(servos, q):
-    """True values of `servo_values`."""
+    """Return the true gravity torque / kp at q (T, 2), and the elbow's true inertia / kp, of simulated servos."""
     first, second = (np.sin(q[:, 0]), np.sin(q[:, 0] + q[:, 1]))
     weight = GRAVITY * np.array([MASS[0] * COM[0] + MASS[1] * LENGTH, MASS[1] * COM[1]])
     gravity = np.stack([weight[0] * first + weight[1] * second, weight[1] * second], axis=1)
@@ -245,7 +245,7 @@ def servo_truth(servos, q):
 
 
 def servo_values(q):
-    """Return the function of gravity / kp at q (T, 2) and of the elbow's inertia / kp of a model."""
+    """Return the function from a model to gravity / kp at q (T, 2) and the elbow's inertia / kp."""
 
     def values(model):
         kp, position = model.servo.kp(), torch.from_numpy(q)
@@ -255,8 +255,11 @@ def servo_values(q):
     return values
 
 
-def test_the_posterior_of_a_servo_fit_holds_the_truth(fitted, arm):
-    """Also of an arm with other servos, of which the masses of the URDF are 20 % wrong."""
+def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
+    """Intervals of a servo fit contain the true values, also if the URDF's masses are 20 % wrong.
+
+    The second arm has other servos, too.
+    """
     other = Servos((10.0, 6.0), (0.5, 0.6), (0.02, 0.02), (0.08, 0.1), delay=0.015)
     heavy = spelgen.build(arm, "closed-form")
     with torch.no_grad():
@@ -278,7 +281,7 @@ def test_the_posterior_of_a_servo_fit_holds_the_truth(fitted, arm):
         value, std = posterior.uncertain(servo_values(q))
         error = np.abs(value - servo_truth(servos, q))
         held += (error <= QUANTILE * std).tolist()
-        assert np.median(std / np.abs(value)) < 0.05  # relative to kp, masses are determined
+        assert np.median(std / np.abs(value)) < 0.05  # relative to kp, gravity and inertia are determined
     assert len(held) == 34 and np.mean(held) >= 0.9, np.mean(held)
 
 
@@ -297,7 +300,7 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             stated = posterior.drives[name][k]
             value, high = joint[ratio]["value"], joint[ratio]["high"]
             assert stated.value == pytest.approx(value)
-            # The interval of the record is in the logarithm, and includes 3 % of the delay in the lag.
+            # the recorded interval is of the logarithm, and includes 3 % of the delay in the lag
             assert 0.5 < (stated.high - value) / (high - value) < 1.05
     with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
         posterior.torque(*np.zeros((3, 1, 2)))
@@ -317,13 +320,13 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             "ur10e",
             (tuple(range(6)),),
             {("armature", 0), ("armature", 1)},
-        ),  # as of motors in Khalil and Dombre, ch. 12
+        ),  # the identifiable ratios agree with those for motors of this arm in Khalil and Dombre, ch. 12
         ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
     ],
 )
 def test_identifiable_ratios_of_servo_logs(robots, tmp_path, robot, groups, left):
     path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
-    if robot == "sliders":  # at right angles, of which each moves by itself
+    if robot == "sliders":  # the arm has two prismatic joints at right angles, whose motions do not interact
         path.write_text(SLIDERS)
     found = servo_rank(spelgen.load_arm(path).chain)
     assert found.groups == groups and {*found.open} == left
@@ -339,7 +342,7 @@ def test_simulated_commands_and_positions(tmp_path):
     assert late < np.abs(logs[0].q - logs[0].u).mean() < 0.1
 
 
-def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
+def test_exports_contain_the_servos(fitted, arm, tmp_path, monkeypatch):
     kp, kd = (x.detach().numpy() for x in fitted.model.servo.prepare()[:2])
     xml = spelgen.export(fitted, to="mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
@@ -351,12 +354,12 @@ def test_exports_hold_the_servos(fitted, arm, tmp_path, monkeypatch):
     assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()
     files = spelgen.export(
         fitted, to="c"
-    ).files  # checked against the module when exported, where there is a compiler
+    ).files  # the export compares the C with the model, where there is a compiler
     assert b"servo_arm_servo_torque(\n    const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
 
 
 def dataset(folder, logs, motors):
-    """A data set of LeRobot 3: an episode for each log, in degrees."""
+    """Write a LeRobot 3 data set with an episode per log, in degrees."""
     (folder / "meta").mkdir(parents=True)
     feature = {"dtype": "float32", "shape": [len(motors)], "names": motors}
     features = {"action": feature, "observation.state": feature}
@@ -405,11 +408,11 @@ def test_incompatible_models_and_logs_are_reported(arm, logs, robots):
 
 
 def moved(model, seconds, count=1):
-    """Logs of the whole arm in small steps, where the commands of both joints jump at once."""
+    """Simulate logs of a model in which the commands of both joints jump at the same time, with small steps."""
     with torch.no_grad():
         model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)
-    t, every = np.arange(0.0, seconds, 0.0025), 8  # logs have one of `every` samples
+    t, every = np.arange(0.0, seconds, 0.0025), 8  # logs contain one of `every` integration steps
     u = np.random.default_rng(0).uniform(-0.4, 0.4, (count, int(2 * seconds), 2)).repeat(200, axis=1)
     nothing = np.zeros((len(t), 0))
     logs = [Trajectory(t, x, np.zeros_like(x), nothing, u=x) for x in u]
@@ -425,12 +428,12 @@ def test_presets_are_not_compared_under_servos(tmp_path):
     assert "servo_arm.yaml: input: got position servos, expected torques" in " ".join(result.stderr.split())
 
 
-def test_joints_by_themselves_move_as_the_arm_does(arm):
+def test_the_motion_of_single_joints_equals_the_motion_of_the_arm(arm):
     model = spelgen.build(arm, "closed-form")
     windows = replace(servo_windows(moved(model, 3.0), Preprocessing()), steps=24)
     rollouts = ServoRollouts.of(model, windows)
     x = rollouts.parameters.prior_mean
-    # all friction effects, as the logs have
+    # all friction effects are active, as in the simulated logs
     x = replace(x, active=torch.ones_like(x.active))
     for _ in range(2):
         rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))

@@ -1,4 +1,4 @@
-"""`spelgen logs` on logs of commanded positions."""
+"""`spelgen logs` reports the tracking of servos, and faults of logs with commanded positions."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def logs():
 
 
 def changed(logs, **columns):
-    """The logs, with columns replaced by functions of a trajectory."""
+    """Return the logs with columns replaced: a function of the trajectory per column."""
     return [replace(x, **{name: made(x) for name, made in columns.items()}) for x in logs]
 
 
@@ -45,9 +45,10 @@ def test_the_report_of_logs_of_a_servo_arm(arm, logs):
     assert shoulder.steps["u"] is None
     assert shoulder.low["u"] == min(x.u[:, 0].min() for x in logs)
     assert shoulder.high["u"] == max(x.u[:, 0].max() for x in logs)
-    assert 0.05 < shoulder.following.lag < 0.15  # the delay, and kd/kp
+    assert 0.05 < shoulder.following.lag < 0.15  # the lag is the delay plus kd/kp [s]
     assert shoulder.following.saturated < 0.02 and elbow.following.saturated is None
-    assert shoulder.following.steady_state_error is None  # its command never rests
+    # the command never stays constant, so that no steady state exists
+    assert shoulder.following.steady_state_error is None
     for text in ("Ranges [rad]", "Following", "No findings."):
         assert text in found.text()
     told = json.loads(json.dumps(found.to_dict()))
@@ -72,7 +73,7 @@ def test_the_command_prints_the_report(arm, logs, tmp_path):
         ({"u": lambda x: np.diff(x.u, axis=0, prepend=x.u[:1])}, r"'elbow': got increments: the position follows"),
     ],
 )  # fmt: skip
-def test_commands_that_cannot_be_these_are_errors(arm, logs, columns, text):
+def test_impossible_commands_are_errors(arm, logs, columns, text):
     found = spelgen.check_logs(changed(logs, **columns), arm)
     assert any(re.search(text, str(each)) for each in found.errors)
 
@@ -86,7 +87,7 @@ def test_exchanged_commands_are_one_error_with_one_line(arm, logs):
 
 
 def only(column, values):
-    """A mapping that names other columns for the commands."""
+    """Return a function that gives a log's commands, (T, n), with one column replaced by `values`."""
 
     def made(x):
         u = x.u.copy()
@@ -114,12 +115,12 @@ def test_anomalous_commands_are_reported(arm, logs, columns, code):
 
 def test_errors_at_rest_are_reported(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
-    # dry friction and the links' weight hold that much, in ratio to kp
+    # largest errors at rest that dry friction and gravity cause, in ratio to kp
     assert 0.3 * 0.15 / 14 < shoulder.following.steady_state_error < (0.15 + 0.9) / 14
     assert 0.3 * 0.08 / 9 < elbow.following.steady_state_error < (0.08 + 0.16) / 9
 
 
-def test_servos_that_give_all_they_can_are_counted(arm):
+def test_saturated_servos_are_counted(arm):
     far = [replace(x, u=x.u + np.array([6 / 14 + 0.2, 0.0])) for x in servo_logs(1, 8.0)]
     shoulder = spelgen.check_logs(far, arm).joints[0]
     assert 0.5 < shoulder.following.saturated <= 1.0
@@ -131,7 +132,7 @@ def test_sparse_logs_are_reported(arm, logs):
 
 
 @pytest.mark.parametrize("samples", [1, 5, 13, 400])
-def test_any_logs_are_told(arm, samples):
+def test_logs_with_any_commands_have_a_report(arm, samples):
     t = np.arange(samples) * 0.02
     ramp = np.stack([0.5 * t, np.full_like(t, 0.1)], axis=1)
     for u in (ramp, 0 * ramp, 1e8 * ramp):
@@ -160,8 +161,9 @@ DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}}
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_normalised_positions_that_are_declared_as_degrees_are_told_by_their_steps(arm, logs, seed):
-    counts = np.random.default_rng(seed).integers(1100, 2600, 2)  # of each motor's calibrated range
+def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, logs, seed):
+    # encoder counts of each motor's calibrated range
+    counts = np.random.default_rng(seed).integers(1100, 2600, 2)
     step = np.radians(200 / counts)
     wrong = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
     (error,) = spelgen.check_logs(wrong, arm).errors
@@ -182,7 +184,7 @@ def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm
 
 
 def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
-    # both converted from degrees: such commands look constant
+    # positions and commands are both converted from degrees, so that the commands look nearly constant
     small = changed(logs, u=lambda x: np.radians(x.u))
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     assert len(errors) == 2
@@ -204,7 +206,7 @@ def test_a_unit_of_servos_that_is_stated_wrongly_is_named_with_the_line(arm, log
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     if (
         stated == "rad" and counts is None
-    ):  # without steps of an encoder, positions of many turns show the unit
+    ):  # without encoder steps, a wrong unit of positions is found by their many turns
         assert all("jump" in error or f"units: {{q: {logged}" in error for error in errors)
         return
     assert any(f"write 'units: {{q: {logged}}}' under 'logs'" in error for error in errors), errors

@@ -25,7 +25,7 @@ from spelgen.fitting.train import train
 
 @pytest.fixture(scope="module", autouse=True)
 def few_steps():
-    """Outer iterations of two steps: that a resumed fit repeats the same bytes does not depend on their number."""
+    """Limit outer iterations to two steps: the equality of resumed fits does not depend on their number."""
     with pytest.MonkeyPatch.context() as patch:
         for module in (objective, laws):
             patch.setattr(module, "TUNING", replace(module.TUNING, steps=2, joint_steps=2))
@@ -34,7 +34,7 @@ def few_steps():
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory) -> Path:
-    """A module, its URDF and logs of two short windows."""
+    """Return a folder with a module, its URDF, and logs of two short windows."""
     folder = tmp_path_factory.mktemp("start")
     urdf = write_servo_arm(folder)
     (folder / "module.py").write_text(spelgen.generate(urdf, "closed-form"))
@@ -50,7 +50,7 @@ def trained(start: Path, folder: Path, **options) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(start, tmp_path_factory) -> Path:
-    """A run that was not interrupted."""
+    """Return the folder of a run that was not interrupted."""
     return trained(start, tmp_path_factory.mktemp("whole") / "run")
 
 

@@ -1,4 +1,4 @@
-"""The settings file: valid values are read, wrong ones are refused with line, expectation and remedy."""
+"""The settings file: valid values are read, wrong ones are refused with line, expectation and advice."""
 
 import re
 import subprocess
@@ -19,7 +19,7 @@ from spelgen.simulation.protocol import make_friction
 
 @pytest.fixture
 def urdf(tmp_path, monkeypatch):
-    """Write a sidecar and return the relative path of the URDF it belongs to (which need not exist)."""
+    """Return a function that writes a settings file and returns the relative path of its URDF, which need not exist."""
     monkeypatch.chdir(tmp_path)
 
     def write(text):
@@ -31,7 +31,7 @@ def urdf(tmp_path, monkeypatch):
 
 
 def told(path):
-    """Errors of a file after every group was read."""
+    """Return the text of the errors of a settings file, after each group of keys is read."""
     with pytest.raises(SettingsError) as error:
         settings = load_settings(path)
         for group in OF_A_STEP:
@@ -275,7 +275,7 @@ def test_a_list_of_boxes_is_refused_with_an_example(tmp_path):
 
 @pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])
 def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
-    """The file changes nothing as written, nor with every comment activated."""
+    """The file that `init` writes has the default values, both as written and with all comments activated."""
     urdf = tmp_path / "arm.urdf"
     urdf.write_bytes((robots / f"{name}.urdf").read_bytes())
     assert CliRunner().invoke(app, ["init", str(urdf)]).stdout == f"wrote {tmp_path}/arm.yaml\n"

@@ -21,7 +21,7 @@ from tests.hand_built import arm, body, coordinate, coupled_urdf, pendulum, poin
 
 @pytest.fixture(scope="module")
 def settings():
-    """A short protocol."""
+    """Return settings of a short simulation."""
     return Settings().model_copy(update={"simulation": protocol(Settings(), trajectories=6, duration=0.2)})
 
 
@@ -41,7 +41,10 @@ def run(arm, settings, start, t, tau):
 
 class TestMotion:
     def test_a_pendulum_swings_by_its_elliptic_function(self):
-        """From rest at angle A from the vertical: angle = 2 asin(k cd(w t, k^2)), k = sin(A/2), w^2 = g/length."""
+        """A pendulum released at angle A moves as the Jacobi elliptic function: angle = 2 asin(k cd(w t, k^2)).
+
+        k = sin(A/2), w^2 = g / length; the angle is measured from the vertical.
+        """
         amplitude, t = 2.0, np.linspace(0, 3, 31)
         k, w = np.sin(amplitude / 2), np.sqrt(9.81 / 0.7)
         _, cn, dn, _ = ellipj(w * t, k**2)
@@ -49,7 +52,10 @@ class TestMotion:
         np.testing.assert_allclose(states[:, 0] + np.pi / 2, 2 * np.arcsin(k * cn / dn), atol=1e-11)
 
     def test_a_slider_under_held_forces_and_viscous_friction(self):
-        """m v' = F - b v with F held: v = F/b + (v0 - F/b) exp(-b t/m), each interval from where the last ended."""
+        """A slider under constant forces F and viscous friction b has the exact velocity in each interval.
+
+        v = F/b + (v0 - F/b) exp(-b t/m), with v0 at the end of the interval before.
+        """
         m, b, dt = 2.0, 0.5, 0.1
         force = np.array([[3.0], [-1.0], [0.0], [4.0], [100.0]])
         settings = Settings(joints={"a": JointSettings(viscous=b)})
@@ -82,11 +88,14 @@ class TestMotion:
         np.testing.assert_allclose(energies, energies[0], atol=1e-10)
 
     def test_energy_balance_of_motors_and_friction(self, robots):
-        """dE/dt = qd (tau - friction(qd)), integrated with the motion by another solver at other steps."""
+        """The change of energy is the work of motors minus friction: dE/dt = qd (tau - friction(qd)).
+
+        The reference is integrated by another solver with other steps.
+        """
         rpr, settings = load(robots / "rpr.urdf")
         engine, friction = arm_dynamics(rpr, settings), make_friction(rpr, settings)
         tau = np.array([2.0, -1.0, 1.0])
-        start = np.array([0.3, 0.8, 1.0, 0.0, 0.2, -0.5, 0.0])  # the last entry is the work
+        start = np.array([0.3, 0.8, 1.0, 0.0, 0.2, -0.5, 0.0])  # initial q, qd and work
 
         def derivative(_, state):
             q, qd = state[:3], state[3:6]
@@ -114,7 +123,8 @@ class TestFriction:
         np.testing.assert_allclose(friction(qd), [[1.0 + 0.4], [-1.0 - 0.9], [0.0]], atol=1e-14)
 
     def test_it_never_drives_and_has_no_kink(self):
-        joint = JointSettings(coulomb=(0.0, -1.0))  # the most lopsided there is
+        # the largest possible difference between both directions of motion
+        joint = JointSettings(coulomb=(0.0, -1.0))
         friction = make_friction(slider(), Settings(joints={"a": joint}))
         qd = np.linspace(-0.5, 0.5, 100_001)[:, None]
         torque = friction(qd)
@@ -123,13 +133,17 @@ class TestFriction:
         assert np.abs(np.diff(torque[:, 0], 2)).max() < 1e-6
 
     def test_where_two_motors_move_two_joints_friction_is_that_of_the_motors(self):
-        """A differential: motors turn by the sum and the difference, and brake by their own directions."""
+        """Friction of coupled motors acts at motor speeds.
+
+        In a differential, the motors turn by the sum and the difference of both joint velocities.
+        """
         joints = [coordinate(damping=0.3, friction=0.2), coordinate("b", damping=0.1, friction=0.4)]
         bodies = [
             body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")
         ]
         friction = make_friction(arm(joints, bodies), Settings(), np.array([[1.0, 1.0], [1.0, -1.0]]))
-        first, second = 0.3 * 5.0 + 0.2, 0.1 * -1.0 - 0.4  # of the motors, at 5 and -1 rad/s
+        # friction torques of both motors, at 5 and -1 rad/s
+        first, second = 0.3 * 5.0 + 0.2, 0.1 * -1.0 - 0.4
         np.testing.assert_allclose(
             friction(np.array([2.0, 3.0])), [first + second, first - second], rtol=1e-12
         )
@@ -258,7 +272,10 @@ class TestIntegration:
             np.testing.assert_allclose(states[k + 1], end, atol=1e-9)
 
     def test_no_reversal_goes_unseen_between_the_stages_of_a_step(self):
-        """A slider thrown against friction, fast through a narrow jump: exact but for the jump's width."""
+        """A reversal of velocity within an integration step is not skipped; the error is only the smoothing width.
+
+        A slider moves against friction so fast that it passes the narrow jump of friction within one step.
+        """
         settings = Settings.model_validate(
             {
                 "joints": {"a": {"coulomb": [1.0, -3.0]}},
@@ -287,13 +304,16 @@ class TestInMemory:
             simulate(load_arm(robots / "two_link.urdf"), sample_rate=-1)
         assert str(error.value) == "simulate: sample_rate: got -1, expected greater than 0"
 
-    def test_settings_of_other_steps_are_not_looked_at(self, robots, tmp_path):
+    def test_settings_of_other_steps_are_not_read(self, robots, tmp_path):
         (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())
         (tmp_path / "arm.yaml").write_text("training: {nonsense: 1}\nlogs: {units: {q: furlongs}}\n")
         assert len(simulate(load_arm(tmp_path / "arm.urdf"), trajectories=1, duration=0.1)) == 2
 
     def test_a_mimic_joint_moves_along(self, tmp_path):
-        """Both joints by Pinocchio, the second driven along: tau = K^T rnea(K q + offset, K qd, K qdd)."""
+        """The logged torque of an arm with a mimic joint is tau = K^T rnea(K q + offset, K qd, K qdd), by Pinocchio.
+
+        K: (2, 1) velocities of both joints per velocity of the leader.
+        """
         coupled = coupled_urdf(tmp_path / "coupled.urdf")
         coupled.with_suffix(".yaml").write_text("simulation: {protocol: random-inputs}")
         logs = simulate(load_arm(coupled), trajectories=2, duration=0.2, sample_rate=200.0)
@@ -306,5 +326,6 @@ class TestInMemory:
             jacobian @ pin.rnea(model, data, jacobian * q + [0, -0.1], jacobian * qd, jacobian * qdd)
             for q, qd, qdd in states
         ]
-        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2  # the slope at a sample is the mean of both intervals
+        # the difference quotient at a sample is the mean of both intervals, and so is the torque
+        held = (log.tau[1:-2, 0] + log.tau[:-3, 0]) / 2
         np.testing.assert_allclose(needed[1:-2], held, atol=0.02)

@@ -17,7 +17,7 @@ SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
 
 
 def places(entries):
-    """The files of a nav of any nesting."""
+    """Return the files of the navigation of the site, at any depth."""
     if isinstance(entries, str):
         return [entries]
     return [x for each in entries for x in places(each.values() if isinstance(each, dict) else each)]

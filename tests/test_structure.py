@@ -13,7 +13,7 @@ from spelgen.structure.sampling import float_samples
 from spelgen.structure.structure import derive
 from spelgen.urdf.read import read_urdf
 
-COUNTS = {  # outputs, constants, zero entries
+COUNTS = {  # per robot: numbers of network outputs, constants, and zero entries of M
     "two_link": (1, 2, 0),
     "rpr": (3, 2, 1),
     "scara": (3, 4, 3),
@@ -44,7 +44,7 @@ def test_rpr_has_the_structure_of_the_paper(robots):
 
 
 def test_a_planar_chain_separates_shared_functions():
-    """M_11 of a planar 3R arm mixes q2, q3 and q2 + q3; the smallest form reads them apart."""
+    """The outputs of a planar 3R arm are separate functions of q2, q3 and q2 + q3, although M_11 is their sum."""
     structure = derive(planar(3))
     assert [output.joints for output in structure.outputs] == [(2,), (1,), (1, 2)]
     assert len(structure.constants) == 3
@@ -52,7 +52,10 @@ def test_a_planar_chain_separates_shared_functions():
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
-    """sum c A + sum f B equals M, with c and f taken from the entries of M that the structure names."""
+    """M equals the sum over outputs and constants, times their matrices.
+
+    Values of outputs and constants are the weighted entries of M that the structure states.
+    """
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.chain)
     keys = triangle(len(structure.joints))
@@ -66,26 +69,28 @@ def test_smallest_form_is_exact(robots, robot):
 
 
 def test_factors_are_exact_fractions(robots):
-    """two_link is eq. 20 of the paper: M_11 contains twice the functions of M_21."""
+    """Factors in M are exact fractions: by eq. 20 of the paper, M_11 of two_link has twice the function of M_21."""
     structure = derive(load_arm(robots / "two_link.urdf").chain)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """With random geometry every entry except M_nn varies, with one relation: n(n+1)/2 - 1 outputs, one
-    constant.
+    """An arm with random geometry has n(n+1)/2 - 1 outputs and one constant.
+
+    All entries of M except M_nn vary, with one linear relation between them.
     """
     structure = derive(random_arm(joints, seed))
     assert (len(structure.outputs), len(structure.constants)) == (joints * (joints + 1) // 2 - 1, 1)
-    # Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, section 9.4: 7 n - 4, axis 1
-    # not along gravity
+    # Khalil and Dombre, Modeling, Identification and Control of Robots, 2002, section 9.4: 7 n - 4 base parameters if
+    # axis 1 is not along gravity
     assert structure.base_parameter_count == 7 * joints - 4
 
 
 def test_edo_by_singular_values(shared):
-    """Joints 1-3 of edo change M in 11 ways, the eleventh of which is 1e-10 small; the file's tolerance
-    counts ten.
+    """Joints 1-3 of edo have eleven outputs, as singular values show, of which the eleventh is 1e-10 small.
+
+    The tolerance of the reference data counts ten.
     """
     joints = [f"joint_{k}" for k in range(1, 7)]
     arm = make_arm(read_urdf(shared / "arms" / "edo.urdf"), joints=joints)
@@ -96,5 +101,6 @@ def test_edo_by_singular_values(shared):
     sizes = np.linalg.svd(changes, compute_uv=False)
     sizes /= sizes[0]
     assert sizes[9] > 1e-2
-    assert 1e-11 < sizes[10] < 1e-9  # far above rounding, just below the tolerance
+    # the eleventh singular value is far above rounding errors, and just below the tolerance of the reference data
+    assert 1e-11 < sizes[10] < 1e-9
     assert sizes[11] < 1e-15

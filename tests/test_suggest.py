@@ -1,4 +1,4 @@
-"""A mapping suggested from column names reads the log with its original values."""
+"""A mapping that is suggested from column names reads the log with its original values."""
 
 import csv
 
@@ -26,7 +26,7 @@ def scara(robots):
 
 
 def suggested(path, arm):
-    """The trajectory as the mapping reads it, and the mapping's text."""
+    """Return the log that is read with the suggested mapping, and the text of the mapping."""
     found = suggest_mapping(path, [x.name for x in arm.chain.coordinates])
     assert not found.missing
     path.with_suffix(".yaml").write_text(found.text)
@@ -43,7 +43,8 @@ def written(path, head, rows):
 def require_same(found, rtol=1e-9, qd=QD):
     for values, expected in ((found.q, Q), (found.qd, qd), (found.tau, TAU)):
         np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9)
-    np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)  # a double of 1.7e9 s has no more
+    # the tolerance is the resolution of a double at 1.7e9 s
+    np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)
 
 
 def test_lists_of_joint_states_with_times_in_milliseconds(scara, tmp_path):
@@ -81,7 +82,10 @@ PUBLIC = {
 
 @pytest.mark.parametrize("source", PUBLIC)
 def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_taken(scara, tmp_path, source):
-    """Names of public recordings, whose set points, tool forces and estimates have similar names."""
+    """If a log has several signals of a quantity, the mapping takes the measured one of the joints.
+
+    Column names are the ones of public recordings, with set points, tool forces and estimates of similar names.
+    """
     clock, *measured, others = PUBLIC[source]
     names = [*measured, *others.split()]
     head = [*clock.split(), *(name.format(k) for name in names for k in range(4))]

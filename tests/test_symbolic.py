@@ -15,7 +15,7 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """Every number of the structure once more, from the polynomials' coefficients over the rationals."""
+    """Outputs, constants and relations of the structure equal the ones of the exact polynomials' coefficients."""
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
 
@@ -45,7 +45,7 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
 
 
 def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
-    """{(joints, monomial and parameter): {entry: coefficient}}."""
+    """Return coefficients by joints, monomial and parameter: a dict of coefficients by entry of M."""
     vectors: dict = {}
     for index, key in enumerate(triangle(n)):
         for exponents, coefficient in poly.mass[key].terms():
@@ -55,7 +55,7 @@ def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
 
 
 def _rank(vectors: list[dict]) -> int:
-    # most monomials come with one of few vectors: distinct ones are enough for the rank
+    # many monomials have equal coefficient vectors, and distinct vectors are enough for the rank
     distinct = {tuple(sorted((index, str(value)) for index, value in v.items())): v for v in vectors}
     if not distinct:
         return 0
@@ -68,8 +68,9 @@ def _joints_of(polynomial, n: int) -> set[int]:
 
 
 def test_two_link_is_the_papers_equation_20(robots):
-    """M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]] for links of one metre, half a metre to the
-    mass.
+    """The polynomials of two_link are eq. 20 of the paper: M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]].
+
+    Links have one metre, and the mass is at half of it.
     """
     true = polynomials(load_arm(robots / "two_link.urdf").chain, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {
@@ -80,7 +81,7 @@ def test_two_link_is_the_papers_equation_20(robots):
 
 
 def test_every_sine_is_reduced_under_mimic_joints(shared):
-    """Two bodies that turn with one angle still give polynomials with s to the first power."""
+    """Polynomials have sines to the first power only, even if a mimic joint makes two bodies turn by one angle."""
     arm = load_arm(shared / "arms" / "abb_irb5400.urdf").chain
     poly = polynomials(arm)
     sines = [3 * k + 1 for k in range(len(arm.coordinates))]

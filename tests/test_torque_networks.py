@@ -25,8 +25,8 @@ def missed(model, samples):
         return float((model.inverse_dynamics(q, qd, qdd) - tau).square().mean() / tau.var(dim=0).mean())
 
 
-def test_another_arms_torques_are_met(tmp_path):
-    """Of an arm with other masses, rotors and friction, on positions that were not seen."""
+def test_networks_predict_the_torques_of_another_arm(tmp_path):
+    """Networks fitted to the torques of an arm with other masses, rotors and friction predict them at new positions."""
     source = generate(ROBOTS / "two_link.urdf", NETWORKS, width=16)
     module = import_source(source, tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=1)
@@ -44,7 +44,7 @@ def test_another_arms_torques_are_met(tmp_path):
 
 
 def test_penalised_parameters_stay(tmp_path):
-    """A strong penalty keeps the constants at their initial values against the torques."""
+    """A strong penalty keeps parameters at their initial values, although the torques support other ones."""
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true, model = module.Model(seed=0), module.Model(seed=0)
     constants = model.mass.raw_constants
@@ -57,7 +57,10 @@ def test_penalised_parameters_stay(tmp_path):
 
 
 def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
-    """The loss and its gradient are compared, as many steps would amplify rounding."""
+    """The loss and its gradient over blocks of samples equal the loss and gradient of a single batch.
+
+    A whole fit is not compared, as many steps would amplify rounding errors.
+    """
     module = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py")
     true = module.Model(seed=0)
     samples = TorqueSamples.of([recorded(true, 5), recorded(true, 6)])
@@ -70,7 +73,7 @@ def test_blocks_equal_a_single_batch(tmp_path, monkeypatch):
         torch.testing.assert_close(parts.state_dict()[name], value, rtol=1e-5, atol=1e-7)
 
 
-def test_networks_are_fitted_to_torques_only_where_that_is_asked_for(tmp_path):
-    """Without a word on it windows are predicted."""
+def test_networks_are_fitted_to_torques_only_on_request(tmp_path):
+    """The default objective of networks is to predict windows; they are fitted to torques only by request."""
     model = import_source(built("two_link", design=NETWORKS)[0], tmp_path / "two_link_spel.py").Model()
     assert default_objective(model, lambda: [1000.0]) == "rollout"

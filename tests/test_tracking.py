@@ -1,4 +1,4 @@
-"""Logs of a controlled arm: tracking error, encoder steps and logged torques are as specified."""
+"""Simulated logs of a controlled arm have the specified tracking error, encoder steps and torques."""
 
 from dataclasses import replace
 
@@ -35,7 +35,10 @@ def changed(settings, tracking=None, **protocol):
 
 @pytest.fixture(scope="module")
 def recordings(loaded):
-    """Whole periods with the softest and with the hardest controller, and the logs made of them."""
+    """Return settings, simulated motions and logs under the softest and the hardest controller, over whole periods.
+
+    The motions are pairs of the desired path and the true states.
+    """
     ends = min(loaded.settings.tracking.bandwidths), max(loaded.settings.tracking.bandwidths)
     settings = changed(loaded.settings, {"bandwidths": ends}, trajectories=2)
     kept, inner = [], tracking.record
@@ -48,7 +51,10 @@ def recordings(loaded):
 
 
 def test_the_protocol_is_the_papers(loaded):
-    """500 Hz samples, 125 Hz control, sines of 30 deg at 1/8 Hz, 6 PID settings, 24,000 samples, 70/30."""
+    """The protocol is the paper's: six PID controllers on sines of 30 degrees at 1/8 Hz.
+
+    There are 24,000 samples at 500 Hz, 70 % of them for training; the controller has 125 Hz.
+    """
     protocol, motion = loaded.settings.simulation, loaded.settings.tracking
     assert (protocol.sample_rate, motion.control_rate, motion.frequency) == (500, 125, 1 / 8)
     assert motion.amplitude == pytest.approx(np.radians(30))
@@ -69,7 +75,7 @@ def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
 
 @pytest.mark.parametrize("choice", ["same", "own"])
 def test_trajectories_follow_one_path_or_each_its_own(loaded, choice):
-    """On one path, trajectories overlap, so that the whole path is trained on."""
+    """Trajectories follow one path with different starts, so that they overlap, or each its own path."""
     settings = changed(loaded.settings, {"paths": choice})
     period = 1 / settings.tracking.frequency
     begun = paths(loaded.chain, settings, np.array([0.0, 2 / 6 * period]))
@@ -91,7 +97,7 @@ def test_paths_of_excitation_go_from_rest_to_rest_within_range_and_speed(loaded)
 
 
 def test_options_of_sines_are_refused_for_excitation():
-    with pytest.raises(ValueError, match="amplitude and frequency of sines, beside paths: excitation"):
+    with pytest.raises(ValueError, match="amplitude and frequency of sines, with paths: excitation"):
         TrackingSettings(paths="excitation", amplitude=0.2, frequency=0.5)
 
 
@@ -103,7 +109,7 @@ def test_sines_have_the_stated_frequency():
     np.testing.assert_allclose(path.q[3], path.q[1], atol=1e-12)
 
 
-def test_encoders_count_in_whole_steps_and_miss_less_than_half_a_step(recordings):
+def test_positions_are_whole_encoder_steps_within_half_a_step(recordings):
     settings, kept, _ = recordings
     step = settings.tracking.resolution
     for _, recording in kept:
@@ -126,7 +132,10 @@ def test_logs_approximate_the_true_motion(recordings):
 
 
 def test_the_filter_does_not_delay(recordings):
-    """The error of the logged velocity knows no acceleration: a delay of d would add d times it."""
+    """The filter of logged velocities has no delay: their error does not correlate with the acceleration.
+
+    A delay d would add d times the acceleration.
+    """
     settings, kept, _ = recordings
     _, recording = kept[0]
     log = measured(recording, settings.tracking, "x")
@@ -138,7 +147,10 @@ def test_the_filter_does_not_delay(recordings):
 
 
 def test_torques_are_held_between_ticks_and_explain_the_motion(recordings, loaded):
-    """Another integrator, from the true state at a tick under the logged torque, ends at the next."""
+    """Logged torques are constant between control ticks, and explain the motion.
+
+    Another integrator, from the true state at a tick under the logged torque, gives the state at the next tick.
+    """
     settings, kept, logs = recordings
     _, recording = kept[1]
     np.testing.assert_array_equal(np.concatenate([logs.train[1].tau, logs.test[1].tau]), recording.tau)
@@ -175,7 +187,7 @@ def test_the_seed_decides_everything(loaded):
 
 
 def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
-    """G = diag(20, 0): the logged torque is the motor's, a twentieth of the joint's; the second joint swings free."""
+    """With G = diag(20, 0) the logged torque is a twentieth of joint 1's; the passive joint 2 swings freely."""
     joints = [coordinate(), coordinate("b", continuous=True, passive=True)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     two = arm(joints, bodies, gravity=(0, -9.81, 0))
@@ -190,7 +202,7 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
-    """Without gains and without a sine, the initial torque of the controller keeps the arm at rest."""
+    """Without gains and without a sine, the controller's initial torque keeps the arm at rest under gravity."""
     friction = make_friction(loaded.chain, loaded.settings)
     engine = arm_dynamics(loaded.chain, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
@@ -205,7 +217,7 @@ def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
     [
         (
             {"control_rate": 150.0},
-            "tracking.control_rate: got 150 Hz beside samples at 500 Hz, expected a rate of which "
+            "tracking.control_rate: got 150 Hz with samples at 500 Hz, expected a rate of which "
             "simulation.sample_rate is a multiple",
         ),
         (
@@ -229,7 +241,10 @@ def test_every_joint_whose_range_is_too_small_is_reported():
 
 
 def test_by_default_an_arm_is_controlled(shared):
-    """An arm of seven joints without friction that would fall within a second, and one that friction stops at once."""
+    """By default, simulated arms are under a controller.
+
+    One of the two arms would fall within a second, the other would be stopped by friction at once.
+    """
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")
         logs = simulate(loaded, trajectories=1, duration=1.0)

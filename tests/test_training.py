@@ -52,7 +52,7 @@ QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
 
 
 def quick(**changed) -> Rollout:
-    """`QUICK` with other options; an option of AdamW goes with it."""
+    """Return the options `QUICK` with changes; with another optimizer than AdamW, its options are omitted."""
     options = QUICK.model_dump(exclude_unset=True) | changed
     if options["optimizer"] != "adamw":
         options = {name: x for name, x in options.items() if name not in ("batch", "learning_rate")}
@@ -60,7 +60,7 @@ def quick(**changed) -> Rollout:
 
 
 def motions(count=6, samples=21, seed=0, rate=20.0) -> list[Trajectory]:
-    """Trajectories of the true arm under random held torques, at jittered times."""
+    """Return trajectories of the true arm under random piecewise constant torques, at jittered times."""
     return list(_motions(count, samples, seed, rate))
 
 
@@ -81,7 +81,7 @@ def _motions(count: int, samples: int, seed: int, rate: float) -> tuple[Trajecto
 
 @pytest.fixture(scope="module")
 def module(tmp_path_factory) -> Path:
-    """The module of the arm."""
+    """Write the module of the planar arm; return its path."""
     return write_module(tmp_path_factory.mktemp("module"))
 
 
@@ -93,13 +93,13 @@ def logs(tmp_path_factory) -> Path:
 
 
 def lines(folder: Path) -> list[dict]:
-    """metrics.jsonl without durations."""
+    """Return the lines of metrics.jsonl without durations."""
     records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     return [{key: value for key, value in record.items() if key != "seconds"} for record in records]
 
 
 class Oscillator:
-    """n joints on springs, q'' = -w^2 q + tau: solved exactly by sines and cosines."""
+    """n joints on springs, q'' = -w^2 q + tau, whose exact solution consists of sines and cosines."""
 
     joint_types = ("revolute", "prismatic")
     frequency = torch.tensor([2.0, 5.0], dtype=torch.float64)
@@ -143,7 +143,8 @@ def test_a_rollout_is_the_exact_solution_at_jittered_times():
         pairs = zip(roll_out(Oscillator(), windows, substeps), Oscillator().solve(windows), strict=True)
         errors.append(max((got - exact).abs().max().item() for got, exact in pairs))
     assert errors[2] < 1e-7
-    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)  # rk4: fourth order
+    # halving the step divides the error of rk4, of fourth order, by 16
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
     assert errors[1] / errors[2] == pytest.approx(16, rel=0.3)
 
 
@@ -165,7 +166,7 @@ def test_the_true_model_has_no_loss():
 
 
 def test_the_weak_form_tends_to_zero_with_the_step():
-    """Of the true model: the trapezium rule's error is of second order in dt."""
+    """The momentum loss of the true model decreases with the square of dt, the error of the trapezium rule."""
     losses = []
     for rate in (200.0, 100.0):
         windows = cut_windows(motions(rate=rate), 2, measured=False)
@@ -175,7 +176,7 @@ def test_the_weak_form_tends_to_zero_with_the_step():
     assert losses[0] / losses[1] < 0.4
 
 
-def test_standing_still_has_loss_one(monkeypatch):
+def test_a_prediction_of_no_motion_has_the_loss_one(monkeypatch):
     def still(model, windows, substeps, solver):
         return tuple(x[:, :1].expand_as(x[:, 1:]) for x in (windows.q, windows.qd))
 
@@ -189,7 +190,8 @@ def test_stiff_friction_gets_more_substeps():
     windows = cut_windows(motions(), 5, measured=False)
     scales = loss_scales(windows, model.joint_types)
     gentle = choose_substeps(model, windows, scales)
-    model.friction.log += 5.0  # decays within a few milliseconds, samples are 50 ms apart
+    # friction with a time constant of a few milliseconds, for samples that are 50 ms apart
+    model.friction.log += 5.0
     stiff = choose_substeps(model, windows, scales)
     assert gentle < stiff
     once, twice, fine, finer = (probed(model, windows, scales, k) for k in (1, 2, stiff, 2 * stiff))
@@ -197,7 +199,7 @@ def test_stiff_friction_gets_more_substeps():
 
 
 def test_training_finds_the_true_parameters():
-    """Of a user's own model, which has no specification."""
+    """Training a user's own model, without a specification, finds the true parameters."""
     model = Model()
     result = fit(model, motions(), quick(epochs=15, momentum_steps=200))
     assert result.status == "finished"
@@ -229,7 +231,7 @@ def test_the_run_folder_records_the_training(module, logs, tmp_path):
 
 
 class Interrupted(TrainingProgress):
-    """Presses Ctrl-C after three epochs."""
+    """Progress that raises KeyboardInterrupt after three epochs, as Ctrl-C does."""
 
     def epoch(self, record, epochs):
         if record["epoch"] == 3:
@@ -259,7 +261,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 
 
 def equal(first, second) -> bool:
-    """Whether two nested states are the same to the last bit."""
+    """Return True if two nested states are bitwise equal."""
     if isinstance(first, torch.Tensor):
         return torch.equal(first, second)
     if isinstance(first, dict):
@@ -273,12 +275,13 @@ def equal(first, second) -> bool:
 def test_resuming_drops_epochs_after_the_checkpoint(module, logs, tmp_path):
     train(module, [logs], tmp_path / "run", QUICK)
     with (tmp_path / "run" / "metrics.jsonl").open("a") as file:
-        file.write('{"epoch": 7, "step')  # killed while writing
+        # the last line is incomplete, as of a process that was killed while writing
+        file.write('{"epoch": 7, "step')
     train(module, [logs], tmp_path / "run", QUICK, options=RunOptions(resume=True))
     assert [record["epoch"] for record in lines(tmp_path / "run")] == [1, 2, 3, 4, 5, 6]
 
 
-def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp_path, monkeypatch):
+def test_a_diverging_training_is_rolled_back_at_half_the_rate(module, logs, tmp_path, monkeypatch):
     calls = []
 
     def blown_up_once(model, windows, scales, substeps, solver):
@@ -297,7 +300,7 @@ def test_numbers_that_blow_up_are_rolled_back_at_half_the_rate(module, logs, tmp
 
 @pytest.mark.usefixtures("short_epochs")
 @pytest.mark.parametrize("optimizer", ["adamw", "lbfgs"])
-def test_numbers_that_never_recover_end_the_run(module, logs, tmp_path, monkeypatch, optimizer):
+def test_a_training_that_never_recovers_ends(module, logs, tmp_path, monkeypatch, optimizer):
     def blown_up(model, windows, scales, substeps, solver):
         loss = rollout_loss(model, windows, scales, substeps)
         return loss * math.nan if torch.is_grad_enabled() else loss
@@ -357,8 +360,12 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end in a process of its own, and write the way it ended to `told`."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs the tests may ignore it
+    """Run a training without end until a signal stops it, and write its status to the file `told` next to the folder.
+
+    It is run in a process of its own.
+    """
+    # the tests may run with SIGINT ignored, which the process inherits
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with folder.with_name("told").open("w") as told:
         os.dup2(told.fileno(), 2)
         config = Rollout(epochs=100000, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
@@ -384,7 +391,7 @@ def test_a_run_is_usable_after_a_signal(module, logs, tmp_path, number):
     epoch = torch.load(folder / "checkpoint.pt", weights_only=True)["epoch"]
     config = Rollout(epochs=epoch + 1, batch=32, patience=100000, momentum_steps=0, optimizer="adamw")
     assert train(module, [logs], folder, config, options=RunOptions(resume=True)).epochs == epoch + 1
-    assert not list(folder.glob(".*"))  # no partial file remains
+    assert not list(folder.glob(".*"))  # no temporary file remains
 
 
 def test_a_run_is_not_overwritten_unasked(module, logs, tmp_path):
@@ -489,7 +496,10 @@ def test_the_learning_rate_rises_and_falls(logs, tmp_path):
 
 
 def test_few_windows_are_taken_all_at_once():
-    """L-BFGS has a lower loss after equally many steps, and a weight decay of its own."""
+    """By default, L-BFGS trains on few windows as one batch, and AdamW on many windows.
+
+    L-BFGS has a weight decay of its own.
+    """
     config = Rollout(momentum_steps=0, epochs=6)
     assert config.resolved(100).record(rigid_bodies=False).keys() & {"batch", "learning_rate"} == set()
     assert (config.resolved(100).optimizer, config.resolved(100).weight_decay) == ("lbfgs", 2e-5)
@@ -505,7 +515,10 @@ def test_few_windows_are_taken_all_at_once():
 
 
 def test_the_line_search_turns_back_from_numbers_that_blow_up():
-    """A loss that ends at x = 2, of which the first step would reach 4."""
+    """The line search of L-BFGS shortens a step to a point at which the loss is NaN.
+
+    The loss is finite below x = 2, and the first step would reach x = 4.
+    """
     model = torch.nn.Module()
     model.x = torch.nn.Parameter(torch.tensor([0.0], dtype=torch.float64))
     tried = []
@@ -564,7 +577,10 @@ def test_progress_on_a_terminal_is_one_line_of_80_columns(monkeypatch):
 
 
 def test_the_allowed_time_is_kept_within_an_epoch(logs, monkeypatch):
-    """An epoch of a million steps of 20 ms would take hours: by a clock that only steps move."""
+    """The time limit of a training ends it within an epoch.
+
+    By a clock that advances 20 ms per step, an epoch of a million steps would take hours.
+    """
     now = [100.0]
     monkeypatch.setattr(
         "spelgen.fitting.momentum_objective.time", types.SimpleNamespace(monotonic=lambda: now[0])

@@ -89,7 +89,7 @@ def csv_of_a_long_name(folder: Path) -> Path:
 
 
 COUNTS = np.arange(SAMPLES)
-DATES = "column t: got dates beyond what nanoseconds count"
+DATES = "column t: got dates beyond the range of nanosecond stamps"
 LARGE = r"row \d+, column t: got 1e\+300 in SI units .* expected a number below 1e\+24"
 VANISHING = r"t: got \S+ s after 0 s, expected increasing times"
 REFUSED = {
@@ -107,7 +107,7 @@ REFUSED = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("case", REFUSED)
-def test_logs_that_are_none_are_told_in_our_words(tmp_path, arm, case):
+def test_files_that_are_no_logs_are_spelgen_errors(tmp_path, arm, case):
     make, message = REFUSED[case]
     with pytest.raises(LogError, match=message) as caught:
         check_logs(read_logs(make(tmp_path), arm), arm)
@@ -201,7 +201,7 @@ def test_an_arm_of_1e_12_kg_gives_numbers(robots, tmp_path, preset, robot):
         assert model.forward_dynamics(q, q, q).isfinite().all()
 
 
-# up to which standard deviation of all weights M stays positive definite, in double and in single precision
+# per preset: largest standard deviation of parameters at which M is positive definite, in double and single precision
 DEFINITE = {
     "spel": (100.0, 30.0),
     "minimal": (100.0, 30.0),
@@ -234,7 +234,10 @@ def test_the_mass_matrix_is_positive_definite_as_far_as_the_docs_say(robots, pre
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux alone")
 def test_a_bag_that_unpacks_to_no_end_is_refused(tmp_path, monkeypatch):
-    """A chunk of 400 MB of zeros, which zstd packs to 40 kB, where the process may take 200 MB more."""
+    """A compressed chunk of a bag that would exceed the memory is refused.
+
+    It has 400 MB of zeros, which zstd compresses to 40 kB; the process may take 200 MB more.
+    """
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     writer = rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
     writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)

@@ -1,4 +1,4 @@
-"""A URDF is read with its exact values; each defect is reported with its line; external files are not opened."""
+"""A URDF is read with its exact values, each defect is reported with its line, and external files are not opened."""
 
 import hashlib
 import time
@@ -25,7 +25,7 @@ INERTIAL = (
 
 @pytest.fixture
 def write(tmp_path):
-    """Write the inside of a <robot>, or a whole document, and return its path."""
+    """Return a function that writes the inside of a <robot>, or a whole document, and returns its path."""
 
     def make(inside, whole=False):
         path = tmp_path / "robot.urdf"
@@ -37,7 +37,7 @@ def write(tmp_path):
 
 
 def joint(inside="", *, name="j", kind="revolute", parent="base", child="arm"):
-    """A joint in three lines; the second holds ``inside``."""
+    """Return a joint of three lines, the second of which is ``inside``."""
     ends = f'<parent link="{parent}"/><child link="{child}"/>'
     limit = "" if "<limit" in inside else '<limit lower="-1" upper="1" effort="2" velocity="3"/>'
     return f'<joint name="{name}" type="{kind}">{ends}\n{inside}\n{limit}</joint>\n'
@@ -111,7 +111,10 @@ class TestValues:
         assert "missing-robot-name" in [each.code for each in robot.diagnostics]
 
     def test_values_equal_those_of_yourdfpy(self, shared):
-        """Limits, axes, mimics and masses; not origins (matrices there), nor absent inertias (1.0 there)."""
+        """Limits, axes, mimic relations and masses equal the ones of yourdfpy.
+
+        Its origins are matrices, and its absent inertias are 1.0: both are not compared.
+        """
         yourdfpy = pytest.importorskip("yourdfpy")
         options = {"load_meshes": False, "build_scene_graph": False}
         for path in sorted((shared / "arms").glob("*.urdf"))[::5]:
@@ -174,7 +177,7 @@ DOCUMENTS = {
         '\n<?xml version="1.0"?>\n<robot name="r"/>',
         "FILE:2: got text or blank lines before the XML declaration, expected <?xml ...?> at the very "
         "start of the "
-        "file; delete what stands before it",
+        "file; delete the text before it",
     ),
     "unbound prefix": (
         '<robot name="r">\n<sensor:camera/></robot>',

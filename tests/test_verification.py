@@ -33,7 +33,7 @@ def test_the_derived_structure_is_confirmed(robots, name, assume):
 
 
 def entry(structure, row, column, kind, joints=()):
-    """The structure with one entry changed."""
+    """Return the structure with one entry of M changed to another kind."""
     entries = tuple(
         MassEntry(row, column, kind, joints) if (x.row, x.column) == (row, column) else x
         for x in structure.entries
@@ -45,7 +45,7 @@ def halved(weights):
     return tuple((row, column, value / Fraction(2)) for row, column, value in weights)
 
 
-# false statement about rpr -> words of the check that must report it
+# false statements about rpr, and a word of the check that must report each
 LIES = {
     "a zero that is none": (lambda s: entry(s, 2, 0, "zero"), "M31"),
     "a constant that varies": (lambda s: entry(s, 0, 0, "constant"), "M11"),

@@ -1,4 +1,4 @@
-"""Texts for users are plain technical English; docstrings and comments may only get closer to it."""
+"""Texts for users are plain technical English; counts of unclear constructions in docstrings and comments only fall."""
 
 import ast
 import inspect
@@ -17,13 +17,13 @@ UNUSED = re.compile(
     re.IGNORECASE,
 )
 FRAGMENT = re.compile(r"^(What|Of|By|Whoever|Whether) ")
-# terms of mechanics, the name of an option, and a cell of tables of results
+# allowed uses: terms of mechanics, the name of an option, and a cell of tables of results
 ALLOWED = re.compile(
     r"\b(at|from|to) rest\b|\|rest\||--trust|trust=True|`trust`|hold(s|ing)? the arm|leaves? out|held samples"
     r"|zero-order hold"
 )
 CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t)[^\n]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
-# texts for developers: the meaning of the numbers of a table
+# package whose texts are for developers only: the meaning of the numbers of a table
 INTERNAL = ("runtime",)
 
 
@@ -33,12 +33,12 @@ def wrong(text: str) -> list[str]:
 
 
 def documented(tree: ast.Module) -> set[ast.AST]:
-    """The constants that are docstrings, of modules, classes, functions and names."""
+    """Return the constants of a syntax tree that are docstrings, of modules, classes, functions and names."""
     return {x.value for x in ast.walk(tree) if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant)}
 
 
 def messages(path: Path) -> list[str]:
-    """Strings of several words in the code; values in f-strings become a mark."""
+    """Return the strings of several words in the code of a file; values in f-strings are replaced by "_"."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     skipped = documented(tree)
     texts = []

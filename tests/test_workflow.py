@@ -26,7 +26,7 @@ def spelgen(*arguments):
 
 
 def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
-    """Build, simulate, train and evaluate in another folder than the URDF's, without any option."""
+    """Run build, simulate, train and evaluate without options, in another folder than the URDF's."""
     elsewhere = folder / "robots of others"
     elsewhere.mkdir()
     copied = elsewhere / urdf.name
@@ -48,7 +48,7 @@ def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
 @pytest.mark.parametrize("name", OWN)
 def test_every_command_works_for_the_robots_here(name, robots, tmp_path, monkeypatch):
     settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
-    # with its own inputs, for a shorter time
+    # the simulated inputs are the ones of the settings, for a shorter time
     settings.pop("tracking", None)
     driven = "inputs" in settings["simulation"]
     settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT
@@ -65,7 +65,7 @@ def test_every_command_works_for_reference_arms(name, shared, tmp_path, monkeypa
 
 
 def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkeypatch):
-    """The arm has the first two joints, as `tip` in arm.yaml states, instead of the default three."""
+    """`tip` in the settings file shortens the arm in every command: here to two joints instead of the default three."""
     settings = yaml.safe_load((robots / "rpr.yaml").read_text())
     settings |= {"tip": "link2", "training": FEW_STEPS}
     settings["simulation"]["trajectories"] = 2
@@ -74,7 +74,7 @@ def test_a_tip_in_the_settings_applies_to_every_command(robots, tmp_path, monkey
 
 
 def test_the_commands_of_the_readme_work(robots, tmp_path, monkeypatch):
-    """The block of commands, unchanged; a reader provides arm.urdf and two folders of logs."""
+    """The block of commands in the README runs unchanged, with the user's files: arm.urdf and two folders of logs."""
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings |= {"simulation": SHORT | {"duration": 10.0}, "training": FEW_STEPS}
     (tmp_path / "arm.urdf").write_bytes((robots / "two_link.urdf").read_bytes())

@@ -1,4 +1,4 @@
-"""*.xacro files are expanded by the package xacro and read like the expanded text; other files are never run."""
+"""*.xacro files are expanded by the package xacro and read like the expanded text; other files are never expanded."""
 
 import importlib.util
 import shutil
@@ -61,7 +61,7 @@ installed = pytest.mark.skipif(
 
 @pytest.fixture
 def arm(tmp_path):
-    """An arm with a macro in a file of its own."""
+    """Write an arm in xacro with a macro in a file of its own; return its path."""
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "segment.xacro").write_text(SEGMENT)
     path = tmp_path / "arm.urdf.xacro"
@@ -105,7 +105,7 @@ class TestExpansion:
         assert warning.message == "redefining global symbol: pi"
 
     def test_simulated_arms_are_of_the_expanded_document(self, arm):
-        """`compare` and `simulate --as-built` write URDFs without some elements, and without comments."""
+        """URDFs that `compare` and `simulate --as-built` write are made from the expanded document."""
         root = urdf_without(arm, "inertial")
         assert {element.tag for element in root.iter()} == {
             "robot", "link", "joint", "parent", "child", "origin", "axis",
@@ -186,7 +186,7 @@ def test_time_and_memory_are_bounded(arm, monkeypatch):
     arm.write_text(ARM.replace('"0.5"', '"${9**9**9}"'))
     started = time.monotonic()
     assert refusal(arm).startswith(f"{arm}: xacro still running after 2 s; expand it where that works")
-    assert time.monotonic() - started < 30  # it would never end by itself
+    assert time.monotonic() - started < 30  # the expansion is stopped, which would never end by itself
     arm.write_text(ARM.replace('"0.5"', "\"${'x' * 2**31}\""))
     assert "xacro cannot expand it (" in refusal(arm)
 
@@ -209,7 +209,7 @@ def test_without_the_package_one_error_states_how_to_install_it(arm, tmp_path, m
 
 @pytest.mark.parametrize("name", ["arm.urdf", "arm.xml", "arm.xacro.urdf", "xacro"])
 def test_content_never_causes_expansion(arm, name, monkeypatch):
-    """Only the suffix .xacro does; the content of a downloaded URDF does not."""
+    """Only the suffix .xacro causes an expansion; the content of a file, which may be from elsewhere, does not."""
     monkeypatch.setattr("subprocess.run", lambda *_, **__: pytest.fail("it was run"))
     path = arm.rename(arm.with_name(name))
     lines = refusal(path).splitlines()
@@ -231,7 +231,10 @@ def refusal(path) -> str:
 
 @installed
 def test_a_module_built_from_xacro_trains_with_its_robot(arm, tmp_path):
-    """The run keeps the URDF that it expands to, and the regularizer reads that too."""
+    """A module that is built from xacro is trained with the expanded URDF, which the run keeps.
+
+    The regularizer towards the URDF reads it as well.
+    """
     (tmp_path / "module.py").write_text(generate(arm, width=8, depth=1))
     t = np.arange(40) / 40.0
     q = np.stack([np.sin(3 * t), np.cos(2 * t)], axis=1)

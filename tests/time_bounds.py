@@ -1,7 +1,7 @@
 """Bounds of processor time that are valid on machines of any speed.
 
-A bound is stated in seconds of a reference machine (a laptop of 2024), on which ``_loop`` takes REFERENCE seconds. On a
-slower or busy machine the bound grows in proportion to the current duration of ``_loop``.
+A bound is stated in seconds of a reference machine (a laptop of 2024), on which the loop ``_loop`` takes REFERENCE
+seconds. On a slower or busy machine the bound grows in proportion to the current duration of ``_loop``.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ from __future__ import annotations
 import statistics
 import time
 
-REFERENCE = 0.04  # s
+REFERENCE = 0.04  # [s] duration of ``_loop`` on the reference machine
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """True if ``seconds`` of processor time, just measured, are below ``bound`` of the reference machine."""
+    """Return True if ``seconds`` of processor time are less than ``bound`` seconds of the reference machine."""
     return seconds < bound or seconds < bound * slowness()
 
 
 def slowness() -> float:
-    """Return the duration of the loop relative to the reference machine; at least 1."""
+    """Return the current duration of ``_loop`` relative to the reference machine; at least 1."""
     return max(1.0, statistics.median(_loop() for _ in range(5)) / REFERENCE)
 
 

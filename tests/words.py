@@ -73,7 +73,7 @@ def constructions(text: str) -> Counter[str]:
 
 
 def files() -> list[tuple[str, Path]]:
-    """Return all files except this one, whose table consists of the words, each with its package."""
+    """Return the package and the path of each file; this file is omitted, as its table consists of the words."""
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
     kept = [path for path in paths if path != Path(__file__) and "golden" not in path.parts]
     return [(path.parent.relative_to(ROOT).as_posix(), path) for path in kept]
@@ -93,7 +93,7 @@ def bounds() -> dict[str, dict[str, int]]:
 
 
 def lowered(found: dict[str, Counter[str]], old: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
-    """Return the bounds, each lowered to the current count; bounds of zero are omitted."""
+    """Return the bounds of counts, each lowered to the current count; bounds of zero are omitted."""
     smaller = {
         package: {name: min(found.get(package, Counter())[name], count) for name, count in row.items()}
         for package, row in old.items()

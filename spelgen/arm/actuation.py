@@ -20,7 +20,7 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 
 @dataclass(frozen=True)
 class InputEntry:
-    """A nonzero entry of G, with 0-based row and column.
+    """A nonzero entry of the input matrix G, joint torques per logged torque; row and column are 0-based.
 
     ``kind``: ``fixed`` for the known gear of a motor of one joint; ``coupled`` for a known entry of a motor that moves
     several joints; ``gain`` for an entry that is trained, with the initial value ``value``.
@@ -36,7 +36,7 @@ class Drives(NamedTuple):
     """Matrices (n, n) of the motors of n joints.
 
     Attributes:
-        inputs: the matrix G; the joint torques are G times the logged torques.
+        inputs: the input matrix G; the joint torques are G times the logged torques.
         speeds: the matrix C; the motor speeds, measured on the output side of the gears, are C qd (see `motor_speeds`).
             Friction and rotor inertia act at the motor speeds.
     """
@@ -47,7 +47,7 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """The nonzero entries of the input matrix G, (n, n), and diagnostics; ``joints`` is the number n of joints.
+    """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
     couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
     the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
@@ -61,21 +61,21 @@ class Actuation:
 
     @property
     def direct(self) -> bool:
-        """Whether G is the identity, except for zero rows of passive joints."""
+        """Whether the input matrix G is the identity, except for zero rows of passive joints."""
         return all(entry == InputEntry(entry.row, entry.row, "fixed", 1.0) for entry in self.entries)
 
     def matrix(self) -> np.ndarray:
-        """Return G (n, n), with trained gains at their initial values."""
+        """Return the input matrix G (n, n), joint torques per logged torque, with initial values of trained gains."""
         result = np.zeros((self.joints, self.joints))
         for entry in self.entries:
             result[entry.row, entry.column] = entry.value
         return result
 
     def drives(self) -> Drives:
-        """Return the input matrix G and the matrix C of motor speeds per joint velocity, (n, n) each."""
+        """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, G is the identity for coupled joints. To compute the motor speeds, its rows are
-        # replaced by the couplings.
+        # With logged joint torques, the input matrix G is the identity for coupled joints. To compute the motor speeds,
+        # the rows of these joints are replaced by the couplings.
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -103,12 +103,12 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
-    """Return the input matrix of the arm whose coordinates are the joints named ``joints``.
+    """Return the input matrix G of the arm whose coordinates are the joints named ``joints``.
 
     Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
     has unusable numbers.
     """
-    # Only driven joints have entries of G: the row of a passive joint is zero.
+    # Only driven joints have entries of the input matrix G: the row of a passive joint is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
     remarks = tuple(_undriven(robot, settings, driven))
     couplings = tuple(_couplings(robot, settings, joints))
@@ -116,7 +116,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # The entries of coupled joints are in `couplings`, and include the gears.
+    # Entries of the input matrix G for joints that are driven by several motors are in `couplings`, whose matrices
+    # include the gears.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -132,7 +133,7 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
     driven: names of the joints that are not passive in the settings.
     """
     transmitted = {name for transmission in robot.transmissions for name in transmission.joint_names}
-    # No remarks for a URDF without transmissions: most URDFs have none.
+    # A URDF without transmissions causes no remarks: most URDFs have none.
     if transmitted.isdisjoint(driven):
         return
     for name in driven:
@@ -142,14 +143,14 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
-    """Return the entry of G of a motor that moves only the joint ``name``, with the index ``index``.
+    """Return the entry of the input matrix G of a motor that moves only the joint ``name``, with the index ``index``.
 
     Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
     gain with the initial value 1.
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
-    # An unknown gear is trained: a gear of 1 is not assumed.
+    # An unknown gear ratio is trained: a ratio of 1 is not assumed.
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)
@@ -168,7 +169,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
 
 
 def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[InputEntry]:
-    """Return the entries of G of motors that drive several joints.
+    """Return the entries of the input matrix G of motors that drive several of the moving joints ``joints``.
 
     Couplings in the settings take precedence over differential transmissions in the URDF.
     """
@@ -213,9 +214,9 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 def _block(
     joints: Sequence[str], names: Sequence[str], matrix: Sequence[Sequence[float]]
 ) -> Iterator[InputEntry]:
-    """Yield the nonzero entries of G for ``matrix``, the block of G in the rows and columns of the joints ``names``.
+    """Yield the nonzero entries of a block of the input matrix G: ``matrix`` (k, k) couples the k joints ``names``.
 
-    Row and column of an entry are positions in ``joints``.
+    Row and column of an entry are positions in ``joints``, the names of all n joints.
     """
     for row, values in zip(names, matrix, strict=True):
         for column, value in zip(names, values, strict=True):

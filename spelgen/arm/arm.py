@@ -51,7 +51,8 @@ class Coordinate(NamedTuple):
         revolution, or 1 m, about zero.
         """
         is_revolute, limits = self.joint_type == "revolute", self.limits
-        # Huge or equal limits are not usable: exporters write +-1e16, or equal limits, for a joint without limits.
+        # Huge or equal limits are not usable as a range: exporters write +-1e16, or equal limits, for a joint without
+        # limits.
         if limits is None or not 0 < limits[1] - limits[0] < 1e3:
             half_range = pi if is_revolute else 0.5
             return -half_range, half_range
@@ -100,12 +101,12 @@ class Chain:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the coordinates, as in the URDF."""
+        """Names of the joints that are the n coordinates, as in the URDF."""
         return tuple(coordinate.name for coordinate in self.coordinates)
 
     @property
     def joint_types(self) -> tuple[JointType, ...]:
-        """Types of the coordinates."""
+        """Types of the joints that are the n coordinates, "revolute" or "prismatic"."""
         return tuple(coordinate.joint_type for coordinate in self.coordinates)
 
     @property
@@ -115,7 +116,7 @@ class Chain:
 
 
 class MovingJoint(NamedTuple):
-    """A moving joint, its body, and the links of this body that have an inertial."""
+    """A moving joint of the URDF, its body in the chain, and the links of this body that have an inertial."""
 
     joint: UrdfJoint
     links: tuple[UrdfLink, ...]
@@ -125,8 +126,8 @@ class MovingJoint(NamedTuple):
 class LumpedLinks(NamedTuple):
     """Result of `lump_links`: moving joints with their bodies, locked joints, and the frames of all links by name.
 
-    ``moved`` lists the joints of the chain before their mimic joints on other branches; ``locked`` includes fixed
-    joints.
+    ``moved``: the joints on the path to the tip, followed by mimic joints on other branches. ``locked`` includes fixed
+    joints. ``frames``: poses of the links at zero position, in the frames of their bodies.
     """
 
     moved: tuple[MovingJoint, ...]
@@ -165,7 +166,7 @@ def make_arm(
     _require_small(robot, chain)
     lumped = lump_links(robot, chain, angle_tolerance)
     locked = {joint.name for joint in lumped.locked if joint.type != "fixed"}
-    # Fractions in place of floats, so that the gravity torque about a vertical axis is 0 and not 1e-17.
+    # The gravity vector is converted to fractions, so that the gravity torque about a vertical axis is 0 and not 1e-17.
     x, y, z = map(exact, map(float, gravity))
     return Chain(
         name=robot.name,
@@ -179,7 +180,7 @@ def make_arm(
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
     """Raise ArmError for an arm whose structure would take more than some seconds to derive."""
-    # The time of the derivation increases with about the fifth power of the number of joints.
+    # The time to derive the structure of an arm increases with about the fifth power of the number of joints.
     moving, largest, most_followers = len(chain.joints), 16, 48
     if moving > largest:
         do = "choose fewer with --joints or --tip"
@@ -204,9 +205,11 @@ def _joint_type(joint: UrdfJoint) -> JointType:
 
 
 def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
-    """Return the bodies of the joints of the chain and of their mimic joints; all other joints are locked.
+    """Lump links that move together into bodies: one per joint of the chain and per mimic joint of such a joint.
 
-    angle_tolerance: see ``make_arm`` [rad].
+    All other joints are locked.
+
+    angle_tolerance: largest change of an angle to a multiple of pi/2, see ``make_arm`` [rad].
     """
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)
@@ -256,12 +259,13 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
 
 
 def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
-    """Return the sum of the inertial parameters of links about the origin of their common body; None without links."""
+    """Return the inertial parameters (10,) of the links of one body together, in its frame; None without links."""
     tens = [placement.inertia(link, link.inertial) for link in links if link.inertial]
     if not tens:
         return None
     total = tens[0]
-    # The number of digits is bounded after each sum: in a malformed file it could grow with every link.
+    # The number of digits of the fractions is bounded after each sum: in a malformed file it could grow with every
+    # link.
     for ten in tens[1:]:
         total = tuple(bounded(a + b) for a, b in zip(total, ten, strict=True))
     return total
@@ -289,7 +293,7 @@ def _moved_remarks(moved: Sequence[MovingJoint], following: Mapping[str, Leader]
 
 
 def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    # One remark lists all locked joints, because a humanoid robot has thirty of them.
+    # One remark lists all locked joints, because a humanoid robot has about thirty locked joints.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
         names = ", ".join(repr(joint.name) for joint in outside)

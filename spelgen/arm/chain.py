@@ -10,10 +10,10 @@ from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
 from spelgen.urdf.robot import Robot, UrdfJoint
 
-# Names of joints of grippers. The arm ends at the first joint of a gripper.
+# Words in names of gripper joints. The arm ends before the gripper.
 _GRIPPER = re.compile(r"gripper|finger|thumb|knuckle|(?:^|[^a-z])jaws?(?:[^a-z]|$)", re.IGNORECASE)
 
-_LARGEST_JAW = 0.1  # [m] longest travel of a prismatic joint that probably opens a gripper
+_LARGEST_JAW = 0.1  # [m] a prismatic last joint with at most this travel probably opens a gripper
 
 
 class ChainChoice(NamedTuple):
@@ -29,7 +29,7 @@ class ChainChoice(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """The leader of a joint: q = multiplier * q_leader + offset [rad, m]. The leader itself is not a mimic joint."""
+    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; it is no mimic joint itself."""
 
     leader: UrdfJoint
     multiplier: Fraction
@@ -54,7 +54,7 @@ def choose_chain(robot: Robot, joints: Sequence[str] | None, tip: str | None) ->
         chain = _longest(robot)
     if not chain.joints:
         expected = "a serial chain of joints"
-        raise ArmError("no joint that moves by itself", file=robot.source, expected=expected)
+        raise ArmError("no joint that moves independently", file=robot.source, expected=expected)
     # A mobile base has a floating joint between the root and the arm. This is not an error: the arm is described
     # relative to the base.
     below = robot.path_to(chain.joints[0].parent)
@@ -78,13 +78,14 @@ def leaders(robot: Robot) -> dict[str, Leader]:
     for joint in robot.joints:
         followers = []
         leader = joint
-        # A loop in place of recursion, because a file may have any number of mimic joints in sequence.
+        # Leaders are found by a loop and not by recursion, because a file may have any number of mimic joints in
+        # sequence.
         while leader.name not in result and leader.mimic is not None:
             followers.append((leader.name, leader.mimic))
             leader = robot.joint[leader.mimic.joint]
         follow = result.setdefault(leader.name, Leader(leader, Fraction(1), Fraction(0)))
-        # The joint next to the leader comes first, because multiplier and offset of a mimic joint depend on the values
-        # of the joint that it mimics.
+        # The joint that mimics the leader directly is processed first, because multiplier and offset of each mimic
+        # joint depend on the values of the joint that it mimics.
         for name, mimic in reversed(followers):
             multiplier = exact(mimic.multiplier)
             offset = multiplier * follow.offset + exact(mimic.offset)
@@ -102,14 +103,15 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 
 def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
-    """Return the joints of these names. Raises ArmError unless all are on one path, in the order from the root."""
+    """Return the joints that the user has chosen. Raises ArmError unless they are on one path, in the path's order."""
     chosen = [_usable(robot, name) for name in names]
     for name in names:
         if list(names).count(name) > 1:
             raise ArmError(f"the joint {name!r} twice", file=robot.source, expected="each joint once")
     if not chosen:
         return ()
-    # The path to the joint that is farthest from the root contains all others, unless they are on another branch.
+    # The path to the chosen joint that is farthest from the root contains all other chosen joints, unless they are on
+    # another branch.
     deepest = max(chosen, key=lambda joint: len(robot.path_to(joint.child)))
     ordered = tuple(joint for joint in robot.path_to(deepest.child) if joint in chosen)
     for joint in chosen:
@@ -118,7 +120,8 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
             raise ArmError(
                 got, file=robot.source, line=joint.line, expected="joints on one path from the root"
             )
-    # A wrong order is an error and is not corrected, because users expect columns of logs in the order of `names`.
+    # A wrong order of the chosen joints is an error and is not corrected, because users expect columns of logs in the
+    # order of `names`.
     if list(ordered) != chosen:
         got, do = f"the joints in the order {','.join(names)}", f"use {','.join(x.name for x in ordered)}"
         raise ArmError(got, file=robot.source, expected="the order from the root to the tip", do=do)
@@ -126,7 +129,7 @@ def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
 
 
 def _usable(robot: Robot, name: str) -> UrdfJoint:
-    """Return the joint of this name. Raises ArmError if it is unknown, or a mimic, fixed, floating or planar joint."""
+    """Return a joint that the user has chosen. Raises ArmError if it is unknown, mimic, fixed, floating or planar."""
     joint = robot.joint.get(name)
     if joint is None:
         names = [joint.name for joint in _independent(robot.joints)]
@@ -136,7 +139,7 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
     got, expected, do = f"a {joint.type} joint", "a revolute, continuous or prismatic joint", None
     if joint.moves:
         got, expected = "a mimic joint", "its leader"
-        do = f"name {leaders(robot)[name].leader.name!r} instead: what follows it moves with it"
+        do = f"name {leaders(robot)[name].leader.name!r} instead: its mimic joints move with it"
     element = f"joint {name!r}"
     raise ArmError(got, file=robot.source, line=joint.line, element=element, expected=expected, do=do)
 
@@ -145,13 +148,13 @@ def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
     If several chains are the longest, and only one of them has effort limits for all joints, this chain is returned;
-    otherwise ArmError is raised. Exception: the last joint is omitted if it is one of a pair of jaws, prismatic joints
-    with the same parent link. They are a joint and its mimic joint, or the joints in which the longest chains differ.
+    otherwise ArmError is raised. Exception: the last joint is omitted if it is one of a pair of jaws. Jaws are
+    prismatic joints with the same parent link: a joint and its mimic joint, or the last joints of all longest chains.
     """
     # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
     # shorter branches.
     tips = [link.name for link in robot.links if not robot.joints_below[link.name]]
-    # Duplicates are removed: several fixed fingers are at the end of the same chain.
+    # Duplicate chains are removed: several fingers without joints may be at the end of the same chain.
     chains = dict.fromkeys(_without_gripper(_independent(robot.path_to(tip))) for tip in tips)
     length = max(map(len, chains), default=0)
     longest = [chain for chain in chains if len(chain) == length]

@@ -34,7 +34,7 @@ TenVector = tuple[Fraction, ...]
 
 @dataclass(frozen=True)
 class AngleRounding:
-    """Replacement of rounded numbers in a URDF, such as 1.5708, by the exact values that they represent, such as pi/2.
+    """Replacement of rounded numbers in a URDF, such as 1.5708, by the exact values that are meant, such as pi/2.
 
     tolerance: largest change of an angle to a multiple of pi/2 [rad]. Offsets, axes and inertia tensors are rounded
     with tolerances of their own. A tolerance of 0 disables all rounding. diagnostics: one entry per changed position,
@@ -46,7 +46,7 @@ class AngleRounding:
 
     @property
     def rotation_error(self) -> float:
-        """Largest error of the rational approximation of a rotation [rad]."""
+        """Largest permitted error of the rational approximation of a rotation [rad]."""
         # If rounding is disabled, the rational approximation must not round either: with an error of 1e-11, an angle of
         # 1.57079632679 would become pi/2, from which it differs by 5e-12.
         return TUNING.rotation_error if self.tolerance else 1e-15
@@ -69,11 +69,11 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
-        # Most origins have no rotation: with None, callers avoid a product of exact matrices.
+        # Most origins have no rotation: for the result None, callers omit a product of exact matrices.
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
-        """Return the exact inertia tensor (3, 3) [kg m2]; products of inertia of the size of rounding errors are 0."""
+        """Return the exact inertia tensor (3, 3) [kg m2] in the inertial frame; tiny products of inertia become 0."""
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
             # CAD programs export products of inertia such as 1e-18 in place of 0 for symmetric parts.
@@ -93,7 +93,7 @@ class AngleRounding:
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        # Components below 1e-3 are set to 0, because some CAD exporters print three digits.
+        # Components of an axis below 1e-3 are set to 0, because some CAD exporters print three digits.
         rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)
         # The axis is normalised again, because components were set to 0.
         rounded /= np.linalg.norm(rounded)
@@ -113,7 +113,7 @@ class AngleRounding:
 
 
 def _in_pi(angle: float) -> str:
-    """Return a rounded angle as a multiple of pi: "-3 pi/4"."""
+    """Return a rounded angle [rad] as text for a message, as a multiple of pi: "-3 pi/4"."""
     # 120 is a common multiple of 2, 5, 8 and 12, the divisors of pi of all special angles (see `rounded_angle`).
     multiple = Fraction(angle / pi).limit_denominator(120)
     numerator, denominator = multiple.as_integer_ratio()
@@ -124,7 +124,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text with six digits per component."""
+    """Return a vector (3,) as text for a message, with six digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
@@ -155,12 +155,12 @@ class Placement:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
         # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue the
-        # segment. The list has one element for the root and each body: the rotations, relative to the start of its
-        # segment, of all bodies from the start to this body, in float64 and exact.
+        # segment. `_segments[body + 1]` has an element for each body from the start of the segment to this body: its
+        # rotation relative to the start of the segment, in float64 and exact. Index 0 is the root (body -1).
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
-        """Add the child link of a joint that is locked at the position ``value`` [rad, m]."""
+        """Add to ``frames`` the pose of the child link of a joint that is locked at the position ``value`` [rad, m]."""
         frame = self._joint_origin(joint)
         if value:
             axis = self._rounding.axis(joint)
@@ -170,11 +170,13 @@ class Placement:
             else:
                 # A revolute joint that is not locked at zero rotates the frames of all later links by a constant angle.
                 turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
-            frame = self._placed(frame, offset, turn)
+            frame = self._displaced(frame, offset, turn)
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
-        """Add a moving joint and its child link, which start a body; bodies are numbered in the order of the calls.
+        """Add a moving joint and the pose of its child link, which start a body.
+
+        Bodies are numbered in the order of the calls.
 
         Returns:
             The index of the parent body, and the rotation (3, 3) and position (3,) [m] of the joint's frame in the
@@ -197,7 +199,7 @@ class Placement:
             self._segments.append(((np.eye(3), IDENTITY),))
             composed = aligning.T
         self.frames[joint.child] = Frame(body, composed, self._in_body(body, composed), ZERO)
-        return frame.body, rotation, self._seen_from_both(rotation, frame.position)
+        return frame.body, rotation, self._without_rounding_errors(rotation, frame.position)
 
     def inertia(self, link: UrdfLink, inertial: Inertial) -> TenVector:
         """Return the inertial parameters (m, m c, I) of a link in the frame of its body, (10,) [kg, kg m, kg m2].
@@ -206,7 +208,7 @@ class Placement:
         """
         where = f"link {link.name!r} inertial origin"
         origin = self._rounding.origin(inertial.com, inertial.rpy, where, inertial.line)
-        frame = self._placed(self.frames[link.name], *origin)
+        frame = self._displaced(self.frames[link.name], *origin)
         mass, center = exact(inertial.mass), frame.position
         tensor = frame.rotation @ self._rounding.tensor(link, inertial) @ frame.rotation.T
         tensor = tensor + mass * (center @ center * IDENTITY - np.outer(center, center))
@@ -214,36 +216,47 @@ class Placement:
 
     def _joint_origin(self, joint: UrdfJoint) -> Frame:
         origin = self._rounding.origin(joint.xyz, joint.rpy, f"joint {joint.name!r} origin", joint.line)
-        return self._placed(self.frames[joint.parent], *origin)
+        return self._displaced(self.frames[joint.parent], *origin)
 
-    def _placed(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
-        """Return ``frame`` moved by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3); None: no rotation."""
+    def _displaced(self, frame: Frame, offset: np.ndarray, turn: np.ndarray | None) -> Frame:
+        """Return a new frame: ``frame``, translated by ``offset`` (3,) [m] and then rotated by ``turn`` (3, 3).
+
+        offset and turn are relative to the axes of ``frame``. turn: None for no rotation.
+        """
         position = self._rounding.position(frame.position + frame.rotation @ offset)
         if turn is None:
             return Frame(frame.body, frame.composed, frame.rotation, position)
         composed = frame.composed @ turn
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
-    def _seen_from_both(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return the position (3,) [m] of a joint's frame, changed so that tiny components in this frame are exactly 0.
+    def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Return a joint's position (3,) [m] in the parent body, with rounding errors in both frames replaced by 0.
 
-        position: in the frame of the parent body; its tiny components are 0 already. rotation: rotation (3, 3) of the
-        joint's frame in the parent body. Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly
-        parallel to the rational approximation of the axis. The result is ``position`` if the components cannot be zero
-        in both frames.
+        A position may have components that should be 0 in the frame of the parent body, or in the joint's own frame.
+        Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly parallel to the rational
+        approximation of the axis. The result is ``position`` if the components cannot be 0 in both frames.
+
+        Args:
+            rotation: exact rotation (3, 3) of the joint's frame in the frame of the parent body.
+            position: exact position (3,) [m] in the frame of the parent body, whose tiny components are 0 already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # A rounding error in place of 0 would make a zero entry of M nonzero.
+        # Tiny components of a position are set to 0 in both frames: a rounding error would make a zero entry of M
+        # nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
-        """Return an exact rotation (3, 3) in the frame of a body.
+        """Return the exact rotation (3, 3) of a frame relative to a body, from its rotation in float64.
 
-        composed: float64 rotation (3, 3) relative to the start of the segment of the body (see ``_segments``). A zero
-        element of a rotation between two bodies of the segment means that two axes are normal to each other, and must
-        remain zero. The rotation is therefore approximated relative to each of these bodies in turn, and the
-        approximation with the most zero elements, relative to all of them, is used.
+        Relative to each body of the segment (see the docstring of the module), the rotation may have zero elements: two
+        axes are normal to each other. A rational approximation relative to one body preserves its zeros, but may lose
+        the zeros relative to another body. The rotation is therefore approximated relative to each body of the segment
+        in turn, and the approximation that loses the fewest zeros is used.
+
+        Args:
+            body: index of the body, -1 for the root link.
+            composed: float64 rotation (3, 3) of the frame relative to the start of the segment that contains the body.
         """
         segment = self._segments[body + 1]
         candidates: list[tuple[int, int, np.ndarray]] = []

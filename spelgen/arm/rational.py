@@ -13,7 +13,7 @@ Matrix = tuple[Vector, ...]
 
 @dataclass(frozen=True)
 class GeometryTuning:
-    """Tolerances with which rounded numbers of a URDF are replaced by the exact values that they represent."""
+    """Tolerances with which rounded numbers of a URDF are replaced by exact values, such as 1.5708 by pi/2."""
 
     # [rad, 1] A change of an angle, or of a component of a unit axis, by at most this number is not reported.
     notable: float = 1e-9
@@ -119,7 +119,7 @@ def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY
-    # The smallest bound is tried first, because exact arithmetic with short fractions is fast.
+    # The smallest bound of the denominators is tried first, because exact arithmetic with short fractions is fast.
     for bound in TUNING.denominators:
         candidate = _rotation_of([Fraction(ratio).limit_denominator(bound) for ratio in ratios])
         if np.abs(candidate.astype(float) - rotation).max() < error:
@@ -151,7 +151,7 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
 
 
 def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
-    """Return the number of zero elements of a float64 rotation (3, 3) that are nonzero in a rational one (3, 3)."""
+    """Return the number of zero elements of ``rotation`` (3, 3) that are nonzero in its approximation ``candidate``."""
     return int(np.count_nonzero(candidate[np.abs(rotation) < TUNING.zero_noise]))
 
 
@@ -176,10 +176,10 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     be 1. error: largest error of an element.
     """
     # The angle is split into exact quarter turns and a remainder: only the remainder is approximated, so that the
-    # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad,
-    # not between -45 and 45 degrees: rounding errors of +-45 degrees, which are common angles, would change the number
-    # of quarter turns.
-    eighth = 0.7  # [rad] somewhat less than pi/4
+    # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad
+    # (`eighth` [rad]), not between -45 and 45 degrees: rounding errors of +-45 degrees, which are common angles, would
+    # change the number of quarter turns.
+    eighth = 0.7
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)
     t = Fraction(0)
@@ -209,7 +209,8 @@ def turn_about(axis: int, cosine: Fraction, sine: Fraction) -> np.ndarray:
 
 def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
     """Return the exact rotation matrix (3, 3) of a rational quaternion (w, x, y, z) of any norm (Euler-Rodrigues)."""
-    # All components are multiplied by their common denominator, because integers are faster than fractions.
+    # All components of the quaternion are multiplied by their common denominator, because integers are faster than
+    # fractions.
     common = lcm(*(component.denominator for component in quaternion))
     w, x, y, z = (int(component * common) for component in quaternion)
     v = np.array([x, y, z], dtype=object)

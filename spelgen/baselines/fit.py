@@ -30,7 +30,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 
     preprocessing: preprocessing of the fit, in which all default values are resolved.
     """
-    # Imported here: evaluation reads the fitted baselines.
+    # The identification is imported here, since an evaluation, which imports this file, only reads fitted baselines.
     from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify_by
 

@@ -19,7 +19,7 @@ class DelayedCommand:
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the delayed commands as predicted positions, (K, n) [rad, m] per segment of K sample intervals.
 
-        parts, q, qd: see `CommandFollower.positions`.
+        parts: the segments, (log, slice of its samples) each. The initial states q and qd are not used.
         """
         return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
 
@@ -46,7 +46,10 @@ class LinearServos:
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions, (K, n) [rad, m] per segment of K sample intervals.
 
-        parts, q, qd: see `CommandFollower.positions`.
+        Args:
+            parts: the segments, (log, slice of its samples) each.
+            q: (parts, n) initial positions [rad, m].
+            qd: (parts, n) initial velocities [rad/s, m/s].
         """
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
         for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
@@ -74,7 +77,8 @@ def linear_response(
     Returns:
         (..., K, n) positions at the end of each interval [rad, m].
     """
-    system = np.zeros((len(frequency), 3, 3))  # The state has three entries: position, velocity, command.
+    # system: (n, 3, 3), matrix A of x' = A x, with the state x = (position, velocity, command)
+    system = np.zeros((len(frequency), 3, 3))
     system[:, 0, 1] = 1.0
     system[:, 1, 0], system[:, 1, 2] = -(frequency**2), frequency**2
     system[:, 1, 1] = -2 * damping * frequency

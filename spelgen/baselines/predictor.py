@@ -28,17 +28,23 @@ def roll_out_stiff(
 ) -> tuple[Tensor, Tensor]:
     """Return predicted positions and velocities, (W, K-1, n) each, of W windows of K samples.
 
-    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted.
+    Sample 0 of a window is the initial state; samples 1 to K-1 are predicted. If a prediction diverges, its later
+    states are NaN.
 
-    Method: ROS2, a Rosenbrock method. It has order two for any approximation of the Jacobian, and is L-stable with the
-    exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the approximation is
-    the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry friction) then need no
-    smaller steps, and the error of an explicit method is not confused with an error of the dynamics.
+    Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
+    with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
+    approximation is the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry
+    friction) then need no smaller steps, and the error of an explicit method is not confused with an error of the
+    dynamics.
 
-    disturbance: constant disturbance (W, n) from `observe`. If a prediction diverges, its later states are NaN.
+    Args:
+        dynamics: dynamics of the arm, see `equations_of`.
+        windows: measured motion (W, K, n) and inputs (W, K-1, n).
+        substeps: number of integrator steps per sample interval.
+        disturbance: constant disturbance in each window, (W, n), see `_stepper`; None: no disturbance.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    # The windows may have the friction state of another model: for friction without a state, it is omitted.
+    # The friction state of the windows may be of another model: it is omitted for dynamics whose friction has no state.
     z = windows.z if windows.z is not None and is_stateful(dynamics) else sliding_memory(dynamics, qd)
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
@@ -48,7 +54,7 @@ def roll_out_stiff(
     positions = torch.full_like(windows.q[:, 1:], torch.nan)
     velocities = positions.clone()
     for k in range(windows.dt.shape[1]):
-        step = windows.dt[:, k].unsqueeze(-1) / substeps  # (W, 1) [s]
+        step = windows.dt[:, k].unsqueeze(-1) / substeps  # step: (W, 1) [s]
         for _ in range(substeps):
             q, qd, z = advance((q, qd, z), windows.tau[:, k], step)
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
@@ -75,7 +81,10 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N]. pose: equations of motion at q."""
+        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with the disturbance included.
+
+        pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
+        """
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
@@ -88,20 +97,24 @@ def _stepper(
         pose = pose_at(q)
         damping, stiffness = _friction_slopes(dynamics, pose, qd, z, width)
         h = GAMMA * step
-        # Both stages solve equations with the matrix 1 - h A. After elimination of the position, the matrix is
-        # M + h D + h^2 K (n, n), which is factorised once for both stages.
+        # Both stages solve equations with the matrix 1 - h A, with h = GAMMA * step and the approximate Jacobian A of
+        # (q, qd). After elimination of the position, the matrix is M + h D + h^2 K (n, n), which is factorised once for
+        # both stages.
         factors, pivots, _ = torch.linalg.lu_factor_ex(
             pose.mass + torch.diag_embed(h * damping + h * h * stiffness)
         )
 
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each."""
+            """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each.
+
+            A is the approximate Jacobian of (q, qd), and h = GAMMA times the step length.
+            """
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u): the next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u) and
-        # (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for u' = F(u) with the approximate Jacobian A: the next state is u + step (3 k1 + k2) / 2, where (1 - h
+        # A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -119,14 +132,17 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the derivatives of friction with respect to velocity (D) and, through the bristles, to position (K).
+    """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
 
-    Both are diagonals of matrices of W windows, (W, n): the friction of a joint depends only on the joint's motion.
+    D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
+    a joint depends only on the motion of the joint. Friction depends on position through the bristles. width: (n,)
+    finite-difference steps of velocity [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
-    # Negative damping (friction that decreases with velocity) is omitted from D, so that the matrix M + h D + h^2 K
-    # remains positive definite. The method then treats this part of friction explicitly.
+    # Negative damping (friction that decreases with velocity) is omitted from the friction derivative D, so that the
+    # matrix M + h D + h^2 K of a Rosenbrock step remains positive definite. The method then treats this part of
+    # friction explicitly.
     damping = slope.clamp(min=0)
     if not z.shape[-1]:
         return damping, torch.zeros_like(damping)
@@ -139,7 +155,7 @@ def _friction_slopes(
 
 @dataclass(frozen=True)
 class PredictorTuning:
-    """Constants of the integration of predictions by the Rosenbrock method."""
+    """Constants of the integration of predicted motion by the Rosenbrock method (`roll_out_stiff`)."""
 
     # [1] Largest number of integrator steps between two samples; a power of two.
     most_substeps: int = 16
@@ -148,7 +164,8 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS error that is multiplied by `tolerance`, divided by the RMS change of velocity.
+    # [1] Lower bound of the RMS velocity error that is multiplied by `tolerance`, as a fraction of the RMS change of
+    # velocity in the windows.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -168,7 +185,10 @@ States = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """The Rosenbrock method, with the fewest steps per sample interval that are accurate in the `probe` windows."""
+    """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
+
+    The integrator takes the fewest steps per sample interval that are accurate in the `probe` windows.
+    """
 
     dynamics: RigidDynamics
     probe: Windows
@@ -176,9 +196,8 @@ class Solver:
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
         """Return predicted q and qd at samples 1 to K-1 of W windows of K samples, (W, K-1, n) each.
 
-        Values after a divergence are NaN.
-
-        disturbance: constant disturbance (W, n) from `observe`.
+        Values after a divergence are NaN. disturbance: constant disturbance in each window, (W, n), see
+        `roll_out_stiff`.
         """
         return self._integrated(windows, self.substeps, disturbance)
 
@@ -188,7 +207,7 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of steps per sample interval, chosen at the first use: torque errors need no rollouts.
+        """Number of integrator steps per sample interval, chosen at the first use: evaluations of torques need none.
 
         A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
         less than `TUNING.tolerance` times the error of the predictions.
@@ -223,7 +242,7 @@ class Predictor:
 
 
 def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return the predictor of `dynamics`, with the number of integration steps chosen on the probe windows."""
+    """Return the predictor of motion by `dynamics`; the windows `probe` determine its number of integration steps."""
     return Predictor(name, Solver(dynamics, probe), dynamics)
 
 

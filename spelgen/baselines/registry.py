@@ -48,16 +48,16 @@ class EvaluatedArm:
 
 
 def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
-    """Return the predictor that keeps the initial velocity of a window."""
+    """Return a list with one predictor, for which all joints keep the velocity of the first sample of a window."""
     return [Predictor(CONSTANT_VELOCITY, hold_velocity)]
 
 
 def hold_velocity(windows: Windows) -> States:
     """Return q [rad, m] and qd [rad/s, m/s] of W windows of K samples for constant velocity from sample 0.
 
-    Both are (W, K-1, n), at samples 1 to K-1.
+    q and qd are (W, K-1, n), at samples 1 to K-1.
     """
-    elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # (W, K-1, 1) [s]
+    elapsed = windows.dt.cumsum(dim=1).unsqueeze(-1)  # elapsed: time since sample 0, (W, K-1, 1) [s]
     qd = windows.qd[:, :1]
     return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
@@ -127,7 +127,7 @@ def command_followers(
     """Return {name: baseline} for an arm under position commands.
 
     linear_servos: parameters of linear servos in the record of the fit. For a model without a record it is None; the
-    result is then empty, and a note is added.
+    result is then empty, and a note with the reason is appended to ``notes``.
     """
     if linear_servos is None:
         message = "no linear servos to compare with: they are fitted by `train`"

@@ -1,1 +1,1 @@
-"""The structure of an arm for users and programs: facts with reasons, closed forms, and a numerical verification."""
+"""The derived structure of an arm for users: facts as sentences with reasons, closed forms, numerical verification."""

@@ -1,7 +1,8 @@
-"""Tests of relations between joint axes that hold at every configuration, and of the balance of the last body.
+"""Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-A relation is tested in exact arithmetic at two random rational configurations. A relation that does not hold at every
-configuration fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results prove reasons for the structure of M and V. A relation, such as parallel axes, is tested in exact arithmetic
+at two random rational configurations. A relation that is not true at all configurations fails this test with a
+probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -15,7 +16,7 @@ from spelgen.urdf.robot import Assume
 
 
 def is_plain(arm: Chain) -> bool:
-    """Whether the bodies form one chain and each has its own coordinate: an arm without branches and mimic joints."""
+    """Return True for an arm without branches and mimic joints: its bodies form one chain, with a coordinate each."""
     for index, body in enumerate(arm.bodies):
         if body.parent != index - 1 or body.coordinate != index or body.multiplier != 1:
             return False
@@ -23,29 +24,34 @@ def is_plain(arm: Chain) -> bool:
 
 
 class Axes:
-    """Tests of the axes of the joints of an arm without branches and mimic joints; joints are counted from 0.
+    """Tests of the joint axes of an arm without branches and mimic joints; joints are counted from 0.
 
-    A test is True if the relation holds at every configuration. assume: ``inertials`` for the inertial parameters of
-    the URDF; with ``kinematics`` they are unknown, and all tests of the last body's balance are False.
+    A test returns True if the relation is true at all configurations.
+
+    Args:
+        arm: the arm.
+        assume: ``inertials``: the inertial parameters of the URDF are used. ``kinematics``: inertial parameters are
+            unknown, and the four attributes about the last body are False.
 
     Attributes:
-        centred: Whether the centre of mass of the last body in the URDF is on the axis of the last joint.
-        balanced: Whether the last body is dynamically balanced: the axis of the last joint is then a principal axis of
+        centred: True if the centre of mass of the last body is on the axis of the last joint.
+        balanced: True if the last body is dynamically balanced: the axis of the last joint is a principal axis of
             inertia through the centre of mass of the body.
-        symmetric: Whether the inertia of the last body, in the frame of its parent, does not depend on the last joint.
-        without_inertia: Whether the last body has no moment of inertia about the axis of the last joint.
+        symmetric: True if the inertia of the last body, in the frame of its parent, does not depend on the position of
+            the last joint.
+        without_inertia: True if the last body has no moment of inertia about the axis of the last joint.
     """
 
     def __init__(self, arm: Chain, assume: Assume = "kinematics"):
         self.arm = arm
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
-        generator = random.Random(0)  # The seed is fixed, so that reports are reproducible.
+        generator = random.Random(0)  # The seed is constant, so that reports are reproducible.
         # Each configuration has the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
-        # the probability that a false relation holds by chance at one of them is about (degree of its polynomial) /
-        # 1e6.
+        # the probability that a false relation is true by chance at one configuration is about (degree of the
+        # relation's polynomial) / 1e6.
         self._configurations = [_configuration(arm, generator) for _ in range(2)]
-        # The tests of balance are for a revolute joint with known inertials. In all other cases the inertial parameters
-        # are set to 1, for which all these tests are False.
+        # The balance of the last body is tested if its joint is revolute and its inertials are known. In all other
+        # cases its inertial parameters are set to 1, for which all attributes about the last body are False.
         last = arm.bodies[-1]
         inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
         if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
@@ -69,19 +75,19 @@ class Axes:
         return {axes[a] @ axes[b] for axes, _ in self._configurations}
 
     def opposed(self, a: int, b: int) -> bool:
-        """Whether the axes of two joints have opposite directions; only for axes that are always parallel."""
-        # The cosine of the angle between parallel unit vectors is 1 or -1, equal at all configurations.
+        """Return True if the axes of joints ``a`` and ``b`` have opposite directions; the axes must be parallel."""
+        # The cosine of the angle between unit vectors that are always parallel is 1 or -1 at all configurations.
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Whether two joints have equal or opposite twists: they are coaxial or, if prismatic, parallel.
+        """Return True if joints ``a`` and ``b`` have equal or opposite twists: coaxial or, if prismatic, parallel axes.
 
         A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
         """
         return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
     def commute(self, a: int, b: int) -> bool:
-        """Whether the motions of two joints commute: the Lie bracket of their twists is zero."""
+        """Return True if the motions of joints ``a`` and ``b`` commute: the Lie bracket of their twists is zero."""
         for _, twists in self._configurations:
             (v, w), (v_b, w_b) = np.split(twists[a], 2), np.split(twists[b], 2)
             if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
@@ -89,14 +95,15 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Whether all points that the prismatic joint ``slider`` carries keep a constant signed distance from a plane.
+        """Return True if all points that joint ``slider`` carries have constant signed distances from a plane.
 
-        The plane contains the axis of the revolute joint ``hinge`` and is parallel to the axis of ``slider``. The
-        distance must be constant for any motion of the joints from ``hinge`` to the tip; ``hinge`` is nearer the root
-        than ``slider``.
+        ``hinge`` is a revolute joint, ``slider`` a prismatic joint farther from the root. The plane contains the axis
+        of ``hinge``, is parallel to the axis of ``slider``, and moves with the child link of ``hinge``. The distances
+        must be constant for any motion of the joints between ``hinge`` and the tip. The entry of M in the row of
+        ``slider`` and the column of ``hinge`` is then constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between both joints could change the direction of ``slider``.
+            return False  # A revolute joint between ``hinge`` and ``slider`` could change the direction of ``slider``.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])
@@ -105,7 +112,10 @@ class Axes:
         return True
 
     def is_weightless(self, joint: int) -> bool:
-        """Whether the joint does no work against gravity: it slides horizontally, or rotates about a vertical axis."""
+        """Return True if a motion of ``joint`` does no work against gravity.
+
+        The joint then slides horizontally, or rotates about a vertical axis, at all configurations.
+        """
         gravity = np.array(self.arm.gravity)
         return all(_is_orthogonal(twists[joint], gravity) for _, twists in self._configurations)
 
@@ -117,8 +127,8 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
     body's point at the origin of the root frame, then angular velocity (3,).
     """
     axes, twists = [], []
-    # Random numerators and denominators are from this range: the larger it is, the fewer false relations hold by
-    # chance.
+    # `numbers` is the range of random numerators and denominators of positions. In a larger range, a false relation is
+    # less likely to be true by chance.
     numbers = range(1, 10**6)
     rotation, origin = IDENTITY, ZERO
     for body in arm.bodies:
@@ -132,19 +142,19 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
             origin = origin + t * axis
         else:
             twists.append(np.concatenate([np.cross(origin, axis), axis]))
-            # t is the tangent of half the angle, so that cosine and sine are rational.
+            # t is the rational tangent of half the joint angle, so that its cosine and sine are rational.
             norm = 1 + t * t
             rotation = rotation @ turn_about(2, (1 - t * t) / norm, 2 * t / norm)
     return axes, twists
 
 
 def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two vectors (k,) are parallel."""
+    """Return True if two vectors, (k,) each, are parallel."""
     products = np.outer(a, b)
     return not (products - products.T).any()
 
 
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
-    """Whether no point of a body with this twist (6,) has a velocity component along the direction (3,)."""
+    """Return True if no point of a body with ``twist``, (6,), has a velocity along ``direction``, (3,)."""
     v, w = np.split(twist, 2)
     return not v @ direction and not np.cross(w, direction).any()

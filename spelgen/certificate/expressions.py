@@ -1,9 +1,10 @@
-"""SymPy expressions from the polynomials of an arm, and their output as text, LaTeX and Python.
+"""SymPy expressions of closed forms from polynomials of an arm, and their output as text, LaTeX and Python.
 
-For consecutive joints with parallel axes, products of cosines and sines are expressed as cosines and sines of sums of
-angles. Other simplifications (powers of single angles, common factors of several terms) are not used: they shorten long
-formulas by 20 %, but not the formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve
-digits; Python for SymPy has exact fractions.
+The polynomials are entries of M, or V, in sines, cosines and positions of joints. For consecutive joints with parallel
+axes, products of cosines and sines are expressed as cosines and sines of sums of angles. Other simplifications (powers
+of single angles, common factors of several terms) are not used: they shorten long formulas by 20 %, but not the
+formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits; Python for SymPy has
+exact fractions.
 """
 
 import re
@@ -22,14 +23,14 @@ from spelgen.certificate.axes import Axes, is_plain
 from spelgen.structure.recursion import base_denominators
 
 FLOAT_DIGITS = 17  # number of significant decimal digits that suffice for any double
-_FIXED = "\N{NO-BREAK SPACE}"  # replaces blanks at which textwrap must not break a line
+_FIXED = "\N{NO-BREAK SPACE}"  # This character replaces blanks at which textwrap must not break a line.
 Terms = dict[Expr, fmpq]
-"""A linear combination {product of distances, cosines and sines: coefficient}, with nonzero coefficients."""
+"""A sum of terms {product of positions of prismatic joints, cosines and sines: nonzero coefficient}."""
 
 
 @cache
 def coordinate(joint: int) -> Symbol:
-    """Return the symbol of the position of a joint; joints are counted from 0."""
+    """Return the symbol of the position of a joint: q1 for joint 0."""
     return Symbol(f"q{joint + 1}", real=True)
 
 
@@ -39,9 +40,9 @@ def parameter(name: str) -> Symbol:
 
 
 def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
-    """Return the sum of coefficient * expression for terms {expression: coefficient}."""
+    """Return the sum of coefficient * expression over ``terms``, {expression: coefficient}."""
     products = []
-    # Without this setting SymPy expands 2*(a + b) to 2*a + 2*b.
+    # Without `distribute(False)`, SymPy expands 2*(a + b) to 2*a + 2*b.
     with distribute(False):
         for expression, number in terms.items():
             products.append(Rational(int(number.p), int(number.q)) * expression)
@@ -49,31 +50,38 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Conversion of polynomials of an arm to SymPy terms.
+    """Conversion of polynomials of an arm, coefficients of inertial parameters in M or V, to SymPy terms.
 
     The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position of each coordinate (see
     `Expansion`).
+
+    Args:
+        arm: the arm.
+        context: polynomial ring of FLINT with these variables.
     """
 
     def __init__(self, arm: Chain, context: fmpq_mpoly_ctx):
         generators = context.gens()
         waves = zip(generators[::3], generators[1::3], strict=True)
         self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
-        # s and c are the sine and cosine of q / d, with the coordinate q and an integer d: the angles of mimic joints
-        # are integer multiples of q / d.
+        # The variables s and c are the sine and cosine of q / d, with the coordinate q and an integer d: the angles of
+        # mimic joints are integer multiples of q / d.
         fractions = enumerate(base_denominators(arm))
         self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
 
     def reduced(self, polynomial: fmpq_mpoly) -> fmpq_mpoly:
-        """Return a polynomial with the same values, in which the power of every sine is at most 1."""
+        """Return an equal polynomial in which the power of every sine is at most 1: s^2 is replaced by 1 - c^2."""
         for circle in self._circles:
-            # The remainder modulo s^2 + c^2 - 1, with s as the leading variable, has no s^2.
+            # A remainder modulo s^2 + c^2 - 1, with s as the leading variable, has no s^2.
             polynomial %= circle
         return polynomial
 
     def terms(self, polynomial: fmpq_mpoly) -> Terms:
-        """Return a polynomial as {term: coefficient}, with cosines and sines of sums of angles in place of products."""
+        """Return a polynomial as SymPy terms, {term: coefficient}.
+
+        Products of cosines and sines of parallel joints are replaced by cosines and sines of sums of angles.
+        """
         result: Terms = {}
         for exponents, coefficient in polynomial.terms():
             distances = Integer(1)
@@ -92,10 +100,10 @@ class PolynomialWriter:
 
 
 def parallel_runs(arm: Chain) -> list[list[int]]:
-    """Return groups of consecutive revolute coordinates whose axes are parallel at every configuration.
+    """Return groups of consecutive revolute coordinates whose axes are parallel at all configurations.
 
-    A coordinate without a parallel neighbour is a group of one; in an arm with mimic joints or branches, all groups
-    are.
+    A coordinate without a parallel neighbour is a group of one. In an arm with mimic joints or branches, each revolute
+    coordinate is a group of one.
     """
     turning = sorted({body.coordinate for body in arm.bodies if body.joint_type == "revolute"})
     if not is_plain(arm):
@@ -122,7 +130,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
         for quarter in [1] * sines + [0] * cosines:
             products: dict[tuple[Expr, int], fmpq] = {}
             for (total, quarters), value in waves.items():
-                # Each product becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
+                # Each product of cosines becomes a sum: cos a cos b = (cos(a + b) + cos(a - b)) / 2.
                 for sign in (1, -1):
                     wave = (total + sign * angle, (quarters + sign * quarter) % 4)
                     products[wave] = products.get(wave, fmpq(0)) + value / 2
@@ -130,7 +138,7 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
     result: Terms = {}
     for (total, quarters), value in waves.items():
         function = sin(total) if quarters % 2 else cos(total)
-        # SymPy simplifies cos(-a) to cos(a) and sin(-a) to -sin(a).
+        # SymPy has simplified cos(-a) to cos(a) and sin(-a) to -sin(a): the sign is moved to the coefficient.
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
             sign = -sign
@@ -139,15 +147,15 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
 
 
 def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
-    """Return the sum of parameter * function over all pairs (parameter, function).
+    """Return a closed form, the sum of parameter * function over all pairs (parameter, function), as an expression.
 
     Parameters a and b with proportional functions f and 2 f are combined: (a + 2 b) f in place of a f + b (2 f).
     """
     groups: dict[tuple[tuple[Expr, fmpq], ...], dict[Expr, fmpq]] = {}
     for symbol, terms in functions:
         leading = next(iter(terms.values()))
-        # Functions are proportional if their coefficients are equal after division by the coefficient of the first
-        # term.
+        # Two functions are proportional if their coefficients are equal after division by the coefficient of their
+        # first term.
         unit = tuple((function, value / leading) for function, value in terms.items())
         groups.setdefault(unit, {})[symbol] = leading
     total = []
@@ -161,13 +169,13 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
 
 
 def text(expression: Expr) -> str:
-    """Return an expression as plain text, with decimals of at most twelve digits."""
+    """Return an expression as plain text; fractions are decimals of at most twelve digits."""
     result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, 12))
     return result
 
 
 def latex(expression: Expr) -> str:
-    r"""Return an expression in LaTeX. Brackets are \bigl(, since \left( must be closed in the same line."""
+    r"""Return an expression in LaTeX, in which brackets are \bigl(, since \left( must be closed in the same line."""
     names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
     printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
     formula: str = printer.doprint(_rounded(expression, 1, 12))
@@ -183,12 +191,12 @@ def python(expression: Expr) -> str:
 
 
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
-    """Return start + formula + end as lines of at most ``width`` characters.
+    """Return the text start + formula + end as lines of at most ``width`` characters.
 
-    A line without a permitted break may be longer.
+    A line may be longer if it has no blank at which a break is permitted.
     """
     indent = " " * (len(start) - len(start.lstrip()) + 4)
-    # Lines are not broken after a sign, within an argument of cos or sin, or within short brackets.
+    # Lines of a formula are not broken after a sign, within an argument of cos or sin, or within short brackets.
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
@@ -211,15 +219,15 @@ class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
 
 
 def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
-    """Return the expression with decimals of ``digits`` digits in place of some fractions.
+    """Return the expression with decimals of ``digits`` digits in place of long fractions.
 
-    A fraction is replaced if its numerator or denominator exceeds ``largest``.
+    A fraction is long if its numerator or denominator exceeds ``largest``.
     """
     decimals = {}
     for number in expression.atoms(Rational):
         if not number.is_Integer and max(abs(number.p), number.q) > largest:
             decimals[number] = Float(number, digits)
-    # Without this setting SymPy expands products of numbers and sums.
+    # Without `distribute(False)`, SymPy expands products of numbers and sums.
     with distribute(False):
         return expression.xreplace(decimals)
 

@@ -1,13 +1,13 @@
-"""The structure of the mass matrix M and of the potential energy V in words, with reasons.
+"""The structure of the mass matrix M and of the potential energy V as sentences (facts), with geometric reasons.
 
 The facts are about zero, constant and equal entries of M, and about joints on which M or V does not depend. A reason is
-given only if the exact geometry of the arm proves it. M[a, b] is the integral of v_a . v_b over the mass that joints a
-and b both move, where v_a is the velocity field for a unit velocity of joint a; the reasons are properties of this
-integral.
+given only if the exact geometry of the arm proves it. The entry M[a, b] is the integral of v_a . v_b over the mass that
+joints a and b both move, where v_a is the velocity field for a unit velocity of joint a; the reasons are properties of
+this integral.
 
-Functions that return a reason return None if they find none. One reason may be valid for several entries of M with one
-joint in common, such as M[c, a] and M[c, b]. Its text then names joint c; the placeholder ``{joints}`` is replaced by
-joints a and b, and ``{axes}`` by their axes.
+A reason is a text, or None if no reason is found. One reason may be valid for several entries of M with one joint in
+common, such as M[c, a] and M[c, b]. Its text then names joint c; the placeholder ``{joints}`` is replaced by joints a
+and b, and ``{axes}`` by the axes of joints a and b.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,13 +25,13 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 
 @dataclass(frozen=True)
 class Fact:
-    """A property of M or V at all configurations.
+    """A property of M or V that is true at all configurations, as text.
 
     Attributes:
-        statement: sentence with the property.
-        means: sentence with its consequence for the model.
-        reason: None if the geometry gives no simple reason, or if the arm has branches or mimic joints; the property is
-            nevertheless exact.
+        statement: sentence with the property, such as "M21 is always zero".
+        means: sentence with the consequence for the model.
+        reason: geometric reason. None if the geometry gives no simple reason, or if the arm has branches or mimic
+            joints; the property is nevertheless exact.
     """
 
     statement: str
@@ -44,9 +44,9 @@ class Fact:
 
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
-    """Return the properties of M and V at all configurations, with simple geometric reasons if there are any."""
-    # The reasons are about pairs of axes, so they are not valid for a coordinate that moves several joints
-    # (mimic joints).
+    """Return the facts about M and V of an arm: properties at all configurations, with geometric reasons if found."""
+    # Reasons are about pairs of joint axes, so they are not valid for a coordinate that moves several joints (mimic
+    # joints).
     words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
     zero = ("always zero", "Nothing is learned for it", "Nothing is learned for them")
     constant = ("constant", "It needs one parameter and no network", "They need parameters and no networks")
@@ -61,9 +61,12 @@ def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
 
 @dataclass(frozen=True)
 class _Sentences:
-    """The facts about a structure, as sentences.
+    """Generator of the facts about the structure of an arm.
 
-    axes: tests that prove reasons; None for an arm with branches or mimic joints, whose facts have no reasons.
+    Attributes:
+        structure: structure of the arm.
+        axes: tests of the joint axes that prove reasons; None for an arm with branches or mimic joints, whose facts
+            have no reasons.
     """
 
     structure: Structure
@@ -75,12 +78,12 @@ class _Sentences:
     def entries(
         self, kind: str, why: EntryReason, statement: str, means_one: str, means_several: str
     ) -> Iterator[Fact]:
-        """Yield facts about the zero or the constant entries of M; entries with the same reason have one fact.
+        """Yield facts about the zero or the constant entries of M: one fact for all entries with the same reason.
 
         Args:
             kind: "zero" or "constant".
-            why: function that returns the reason for an entry.
-            statement: predicate of the sentence about the entries.
+            why: function of (`Axes`, entry of M) that returns the reason why the entry is zero or constant, or None.
+            statement: end of the sentence about the entries, such as "always zero".
             means_one: consequence for the model, if the fact is about one entry.
             means_several: consequence for the model, if the fact is about several entries.
         """
@@ -92,8 +95,8 @@ class _Sentences:
         # Entries without a reason are listed last.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The placeholders are replaced by the joint of each entry's column or, if this joint is prismatic, of
-                # its row.
+                # The placeholders in the reason are replaced by the joint of each entry's column or, if this joint is
+                # prismatic, by the joint of its row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -112,8 +115,8 @@ class _Sentences:
                 terms.setdefault((row, column), {})[number] = factor
         groups: dict[tuple[tuple[int, Fraction], ...], dict[tuple[int, int], bool]] = {}
         for entry, factors in sorted(terms.items()):
-            # If the first factor of an entry is negative, all its factors are multiplied by -1: opposite entries are
-            # then in the same group.
+            # An entry of M is a linear combination of the terms of M. If its first factor is negative, all its factors
+            # are multiplied by -1: opposite entries are then in the same group.
             positive = next(iter(factors.values())) > 0
             if not positive:
                 factors = {number: -factor for number, factor in factors.items()}
@@ -129,7 +132,7 @@ class _Sentences:
         """Yield a fact for each joint on which no entry of M depends."""
         inputs = {joint for entry in self.structure.entries for joint in entry.joints}
         if not inputs:
-            return  # M is constant: the facts about its entries state this.
+            return  # M is constant, as the facts about its entries state, so no joint is listed.
         for joint in sorted(set(range(len(self.structure.joints))) - inputs):
             means = "It is not an input of the networks of M"
             yield Fact(f"M does not depend on joint {joint + 1}", means, self._reason(idle_reason, joint))
@@ -138,7 +141,7 @@ class _Sentences:
         if not self.structure.potential:
             yield Fact("V is zero", "It needs no network", self._reason(potential_reason))
             return
-        # Joints with the same reason are listed in one fact.
+        # Joints on which V does not depend for the same reason are listed in one fact.
         groups: dict[Reason, list[int]] = {}
         for joint in range(len(self.structure.joints)):
             if joint not in self.structure.potential:
@@ -150,7 +153,7 @@ class _Sentences:
 
 
 def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason why an entry of M is zero at all configurations."""
+    """Return the geometric reason why an entry of M is zero at all configurations; None if no reason is found."""
     later, earlier = entry.row, entry.column
     slider = later if axes.prismatic[later] else earlier
     if axes.prismatic[later] != axes.prismatic[earlier] and axes.parallel(later, earlier):
@@ -162,7 +165,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the reason why an entry of M is constant."""
+    """Return the geometric reason why an entry of M is constant; None if no reason is found."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)
@@ -183,8 +186,8 @@ def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def _diagonal_reason(axes: Axes, joint: int) -> Reason:
-    # Joints nearer the root move the axis and the load of this joint together: only joints nearer the tip can change
-    # the inertia of the load about the axis.
+    # The diagonal entry of M is the inertia about the joint axis of all bodies that the joint carries (its load).
+    # Joints nearer the root move axis and load together: only joints nearer the tip can change this inertia.
     behind = range(joint + 1, len(axes.prismatic))
     if axes.prismatic[joint]:
         return "the diagonal entry of a prismatic joint is the mass that it carries"
@@ -198,10 +201,10 @@ def _diagonal_reason(axes: Axes, joint: int) -> Reason:
 
 
 def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return why M[n, i] is constant or zero, if the last body is dynamically balanced; n: last joint.
+    """Return the reason why an entry M[n, i] is constant or zero because the last body is dynamically balanced.
 
-    M[n, i] is then Izz of the last body times the cosine of the angle between the axes of joints n and i. Return None
-    if the body is not balanced, or if the entry is in another row of M.
+    n is the last joint. For a balanced last body, M[n, i] is Izz of the body times the cosine of the angle between the
+    axes of joints n and i. Return None if the body is not balanced, or if the entry is in another row of M.
     """
     last, earlier = len(axes.prismatic) - 1, entry.column
     if not axes.balanced or entry.row != last:
@@ -220,13 +223,14 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
-    """Return the reason why entries in one row of M are equal or opposite.
+    """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    The bodies that the joint of the row carries then have the same velocity field for unit velocities of the joints of
-    all columns. If the joint carries one balanced body, the same angular velocity suffices. entries: (row, column) of
-    each entry, counted from 0.
+    The bodies that the joint of the row carries have the same velocity field for unit velocities of the joints of all
+    columns. If the joint of the row carries one balanced body, the same angular velocity suffices.
+
+    entries: (row, column) of each entry, counted from 0.
     """
-    # Entries in different rows are integrals over different bodies, for whose equality there is no simple reason.
+    # Entries in different rows of M are integrals over different bodies: there is no simple reason for their equality.
     rows, columns = map(sorted, zip(*entries, strict=True))
     if rows[0] != rows[-1]:
         return None
@@ -244,11 +248,11 @@ def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
 
 
 def idle_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason why M does not depend on the position of ``joint``."""
+    """Return the geometric reason why M does not depend on the position of ``joint``; None if no reason is found."""
     if joint == 0:
         return "it moves the whole arm as one rigid body"
-    # A joint whose motion commutes with the motions of all joints nearer the root could be the first joint. M does not
-    # depend on the position of the first joint, which moves the whole arm.
+    # A joint whose motion commutes with the motions of all joints nearer the root could be the first joint of the arm.
+    # M does not depend on the position of the first joint, which moves the whole arm.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"
@@ -258,7 +262,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
 
 
 def weightless_reason(axes: Axes, joint: int) -> Reason:
-    """Return the reason why V does not depend on the position of ``joint``."""
+    """Return the geometric reason why V does not depend on the position of ``joint``; None if no reason is found."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
@@ -270,7 +274,7 @@ def weightless_reason(axes: Axes, joint: int) -> Reason:
 
 
 def potential_reason(axes: Axes) -> Reason:
-    """Return the reason why V is zero at all configurations."""
+    """Return the reason why V is zero at all configurations; None if no reason is found."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
     if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):

@@ -1,7 +1,7 @@
-"""Closed forms as text for a terminal, a JSON object, LaTeX for documents with amsmath, and Python for SymPy.
+"""Output of closed forms of M and V: text for a terminal, a JSON object, LaTeX with amsmath, and Python for SymPy.
 
-The names of symbols consist of letters and numbers of joints. Names from the URDF occur in files only in comments, as
-JSON strings without line ends and control characters.
+Names of symbols consist of letters and numbers of joints. Names from the URDF occur in files only in comments, as JSON
+strings without line ends and control characters.
 """
 
 import json
@@ -19,21 +19,21 @@ from spelgen.labels import printable, short_name
 _LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
-# The file starts with this docstring. The comments with names from the URDF follow later, since a comment in the first
-# two lines could declare an encoding (PEP 263).
+# A Python file of closed forms starts with the docstring `_HEAD`. Comments with names from the URDF are below it, since
+# a comment in the first two lines could declare an encoding (PEP 263).
 _HEAD = '''"""Closed forms of a serial arm's mass matrix M(q) and potential energy V(q), by spelgen.
 
 q: the joints' positions [rad, m]. entries: {(row, column): entry of M}, counted from 1, lower triangle.
-M: the whole matrix, V: the energy [J] up to a constant; both where nothing is missing.
-base_parameters: what each stands for, m being a mass [kg], h = m c a first moment [kg m] and I a tensor
-[kg m2] about the joint's origin, in a frame whose z is the joint's axis.
-values: what the URDF gives them, where it has inertials.
+M: the whole matrix, V: the energy [J] up to a constant; each only if all its expressions are included.
+base_parameters: definition of each base parameter, with masses m [kg], first moments h = m c [kg m] and
+inertia tensors I [kg m2] about the joint's origin, in a frame whose z axis is the axis of the joint.
+values: values of the base parameters in the URDF, if it has the inertials.
 """
 '''
 
 
 def text(formulas: Formulas, width: int = 80) -> str:
-    """Return a text for a terminal: formulas, definitions of the base parameters, and their values from the URDF.
+    """Return closed forms as text for a terminal: formulas, and base parameters with definitions and URDF values.
 
     width: largest number of characters per line.
     """
@@ -52,7 +52,7 @@ def text(formulas: Formulas, width: int = 80) -> str:
 
 
 def to_dict(formulas: Formulas) -> dict[str, object]:
-    """Return the formulas as a JSON object. Rows and columns are counted from 1; an omitted expression is null."""
+    """Return closed forms as a JSON object. Rows and columns of M are counted from 1; omitted expressions are null."""
     base, values, entries = [], formulas.values, []
     for symbol, definition in formulas.base_parameters.items():
         # JSON has no fractions: exact values are rounded to floats.
@@ -74,7 +74,7 @@ def _notes(formulas: Formulas) -> list[str]:
     for row in writable[:1]:
         option = ",".join(map(str, row.entry))
         notes.append(
-            f"Omitted here: --entry {option} shows {row.name} alone, and -o FILE.py writes all entries for SymPy."
+            f"Omitted here: --entry {option} shows only {row.name}, and -o FILE.py writes all entries for SymPy."
         )
     return notes
 
@@ -84,7 +84,7 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # A base parameter that equals a single inertial parameter has its name, so no equation is printed.
+        # A base parameter that is a single inertial parameter has the same name as it, so no equation is printed.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines
@@ -102,9 +102,9 @@ def _legend(formulas: Formulas) -> str:
 
 
 def latex(formulas: Formulas) -> str:
-    """Return LaTeX: the formulas, and the definitions of the base parameters, in two ``align*`` environments."""
+    """Return closed forms in LaTeX: formulas, and definitions of base parameters, in two ``align*`` environments."""
     rows = {Symbol(row.name): row.expression for row in formulas.written}
-    # A base parameter that equals a single inertial parameter has its name, so no definition is printed.
+    # A base parameter that is a single inertial parameter has the same name as it, so no definition is printed.
     definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
     result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
     result += _comments(formulas, "%")
@@ -114,17 +114,17 @@ def latex(formulas: Formulas) -> str:
             start = f"{expressions.latex(name)} &= "
             aligned += expressions.lines(expressions.latex(expression), start, _LATEX_WIDTH)
         if aligned:
-            # The second and further lines of a formula are indented by \quad.
+            # All lines of a formula except the first are indented by \quad.
             body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
             result += [r"\begin{align*}", body, r"\end{align*}"]
     return "\n".join(result) + "\n"
 
 
 def sympy_source(formulas: Formulas) -> str:
-    """Return the text of a Python file that defines the formulas as SymPy expressions."""
+    """Return the source of a Python file that defines closed forms as SymPy expressions."""
     n = len(formulas.q)
     body = _table("entries", formulas.entries)
-    # M is omitted if one of its entries has no expression.
+    # The file has no matrix M if one entry of M has no expression.
     if formulas.mass_matrix is not None:
         body.append(f"M = Matrix({n}, {n}, lambda i, j: entries[max(i, j) + 1, min(i, j) + 1])")
     body.append("")
@@ -143,7 +143,7 @@ def _table(name: str, rows: Mapping[tuple[int, int], Expr] | Mapping[Symbol, Exp
 
 
 def _beginning(formulas: Formulas, body: str) -> list[str]:
-    """Return the lines before ``body``: comments, the imports that ``body`` needs, and definitions of the symbols."""
+    """Return the lines of a Python file before ``body``: comments, the imports that ``body`` needs, and symbols."""
     # Only names that occur in `body` are imported, because linters reject unused imports.
     imported = sorted({"Symbol", *re.findall(r"\b(Add|Matrix|S|cos|sin)\(", body)})
     inertial = {symbol.name for x in formulas.base_parameters.values() for symbol in x.free_symbols}

@@ -1,8 +1,8 @@
 """Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
 
-Each entry of M, and V, is expanded exactly (``expansion``). Its terms are collected per base parameter
-(``base_parameters``) and expressed with sums of angles (``expressions``). For an entry that is too long, only the
-number of terms is given.
+Each entry of M, and V, is expanded exactly to polynomials (``structure.expansion``). Its terms are collected per base
+parameter (``structure.base_parameters``) and expressed with cosines and sines of sums of angles (``expressions``). For
+an entry that is too long, only the number of terms is given.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ from spelgen.structure.recursion import triangle
 from spelgen.structure.structure import Structure
 
 WRITABLE = 3000
-"""Largest number of terms of an entry that is written to a file, or requested as a single entry."""
+"""Largest number of terms of an entry of M, or of V, that is written to a file or requested as a single entry."""
 
 Entry = tuple[int, int] | Literal["V"]
 """An entry of M as (row, column), counted from 1, or the potential energy V."""
@@ -54,15 +54,15 @@ class Formula:
 
     @property
     def name(self) -> str:
-        """Name of the entry, such as ``M21``, or ``V``."""
+        """Name of the entry of M, such as ``M21``, or ``V``."""
         return "V" if self.entry == "V" else entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
     def omission(self) -> str:
-        """Text with the reason why an entry has no expression."""
+        """Text with the reason why the entry has no expression, for users."""
         if self.terms is None:
             return "too many terms to be expanded"
-        return f"{self.terms} terms, not written out"
+        return f"{self.terms} terms, omitted"
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,8 +70,9 @@ class Formulas:
     """Closed forms of M, and of V up to a constant, in the base parameters of an arm.
 
     Attributes:
-        assume: with ``inertials``, terms that are zero for the inertials of the URDF are omitted.
-        base: base parameters.
+        arm: the arm.
+        assume: ``inertials``: terms that are zero for the inertials of the URDF are omitted. ``kinematics``: all terms.
+        base: base parameters in the closed forms.
         rows: one closed form per entry of the lower triangle of M, then V.
     """
 
@@ -108,10 +109,10 @@ class Formulas:
 
     @property
     def base_parameters(self) -> dict[Symbol, Expr]:
-        """{base parameter: its definition, a linear combination of inertial parameters of the bodies}.
+        """{symbol of a base parameter: its definition as a linear combination of inertial parameters of bodies}.
 
-        In the names of inertial parameters, m is a mass [kg], h = m c a first moment [kg m] and I an inertia tensor
-        [kg m2] about the origin of the joint's frame, whose z axis is the axis of the joint.
+        In the names of inertial parameters, m is a mass [kg], h = m c a first moment [kg m] with the centre of mass c,
+        and I an inertia tensor [kg m^2] about the origin of the joint frame, whose z axis is the axis of the joint.
         """
         definitions = {}
         for base in self.base:
@@ -121,12 +122,12 @@ class Formulas:
 
     @property
     def values(self) -> dict[Symbol, Rational]:
-        """Exact values of the base parameters for the inertials of the URDF; empty if the URDF has none."""
+        """{symbol of a base parameter: exact value for the inertials of the URDF}; empty if the URDF has none."""
         return {parameter(base.name): Rational(base.value) for base in self.base if base.value is not None}
 
     @property
     def trusted(self) -> str:
-        """Text about the inertial parameters for which the formulas are valid: any, or with the zeros of the URDF."""
+        """Text that states for which inertial parameters the formulas are valid: any, or with the zeros of the URDF."""
         if self.assume == "inertials":
             return "the URDF's inertial zeros and symmetries"
         return "any inertial values"
@@ -146,7 +147,7 @@ class Formulas:
         return f"<Formulas of {self.arm.name!r}: {counts}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of the entries in LaTeX, for a notebook."""
+        """Return a table of the closed forms in LaTeX, for a notebook."""
         rows = []
         for row in self.rows:
             rows.append((row.name, row.omission if row.expression is None else f"${latex(row.expression)}$"))
@@ -161,7 +162,7 @@ def formulas(
     Args:
         arm: The arm.
         structure: Structure of the arm.
-        entry: The entry; None: all entries.
+        entry: (row, column) of an entry of M, counted from 1, or "V"; None: all entries and V.
         longest: Largest number of terms of an entry; longer entries have no expression. Default: 40, or 3,000
             (``WRITABLE``) for one entry.
 
@@ -171,17 +172,17 @@ def formulas(
     entries: list[Entry] = [*((row + 1, column + 1) for row, column in triangle(n)), "V"]
     if entry is not None:
         lower = entry if entry == "V" else (max(entry), min(entry))
-        # M is symmetric, and only its lower triangle is computed: entry 2,1 is returned for 1,2.
+        # M is symmetric, and only its lower triangle is computed: entry (2, 1) is returned for (1, 2).
         if lower not in entries:
             expected = f"a row and a column from 1 to {n}, or V"
             raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
         entries = [lower]
     if longest is None:
-        # Entries of up to 40 terms, about three lines of a terminal, can be read.
+        # By default, only entries of at most 40 terms are shown, about three lines of a terminal, which can be read.
         longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
-    # Entries of joints close to the tip are short. They are expanded first, so that they are complete if the budget of
-    # the expansion does not suffice for all entries.
+    # Entries of joints close to the tip are short. They are expanded first, so that they have expressions even if the
+    # budget of the expansion does not suffice for all entries.
     rows = [writer.formula(x, longest) for x in reversed(entries)]
     # For a single entry, only the base parameters in its expression are listed.
     base = writer.base
@@ -192,7 +193,11 @@ def formulas(
 
 
 class _Writer:
-    """Computes closed forms of single entries; recursion and base parameters of the arm are computed once."""
+    """Computes closed forms of single entries of M, or of V; the expansion of an arm is prepared once for all entries.
+
+    Attributes:
+        base: base parameters in the closed forms.
+    """
 
     def __init__(self, arm: Chain, structure: Structure):
         self._at_urdf_values = structure.assume == "inertials"
@@ -201,15 +206,15 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int) -> Formula:
-        """Return the closed form of an entry, without expression if it has more than ``longest`` terms.
+        """Return the closed form of an entry of M, or of V.
 
-        An expansion that exceeds the budget has no expression either.
+        It has no expression if it has more than ``longest`` terms, or if its expansion exceeds the budget.
         """
         try:
             polynomials = self._polynomials(entry)
         except TooLarge:
             return Formula(entry, None, None)
-        # The terms are counted before the conversion to SymPy, which would be slow for an entry that is too long.
+        # Terms are counted before the conversion to SymPy, which would be slow for an entry that is too long.
         terms = sum(map(len, polynomials.values()))
         if terms > longest:
             return Formula(entry, terms, None)
@@ -230,8 +235,8 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # The first inertial parameter of a base parameter occurs in no other base parameter. Its coefficient in M
-            # or V is therefore the coefficient of the base parameter.
+            # The first inertial parameter of a base parameter occurs in no other base parameter, so its coefficient in
+            # M or V is the coefficient of the base parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
@@ -240,8 +245,8 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # For the inertials of the URDF, terms of different base parameters with the same monomial may cancel. Monomials
-        # whose total coefficient is zero are removed.
+        # For the inertials of the URDF, terms of different base parameters with the same monomial may cancel each
+        # other. Monomials whose total coefficient is zero are removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

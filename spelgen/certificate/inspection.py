@@ -1,4 +1,4 @@
-"""The result of `spelgen inspect`: the structure of an arm as text, and as JSON (schema 1)."""
+"""The result of `spelgen inspect`: the derived structure of an arm as text for users, and as JSON (schema 1)."""
 
 from __future__ import annotations
 
@@ -28,9 +28,14 @@ if TYPE_CHECKING:  # These modules are not imported at run time, since they impo
 
 @dataclass(frozen=True, repr=False)
 class Inspection:
-    """The result of ``spelgen inspect`` for an arm: structure, inputs and diagnostics.
+    """The result of ``spelgen inspect`` for an arm: derived structure, inputs and diagnostics.
 
-    actuation: the input matrix G. input: "torque", or "position" for an arm with position servos.
+    Attributes:
+        arm: the arm.
+        structure: structure of M and V.
+        actuation: entries of the input matrix G.
+        diagnostics: remarks of the reading of the URDF, such as rounded angles.
+        input: "torque", or "position" for an arm with position servos.
     """
 
     arm: Chain
@@ -41,17 +46,25 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """Facts about the structure as sentences."""
+        """Facts about the structure of M and V as sentences, with geometric reasons."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
-        """Return M and V, or one entry, as expressions; arguments and errors: see ``certificate.formulas.formulas``."""
+        """Return M and V, or one entry, as SymPy expressions.
+
+        Args:
+            entry: (row, column) of an entry of M, counted from 1, or "V"; None: all entries and V.
+            longest: Largest number of terms of an entry; longer entries have no expression. Default: 40, or 3,000 for
+                one entry.
+
+        Raises SpelgenError for an entry that M does not have.
+        """
         from spelgen.certificate.formulas import formulas
 
         return formulas(self.arm, self.structure, entry=entry, longest=longest)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the result as a JSON object. Names are names in the URDF; rows and columns are counted from 1."""
+        """Return the result as a JSON object. Joints have their names in the URDF; indices are counted from 1."""
         structure = self.structure
         entries = []
         for entry in structure.entries:
@@ -78,7 +91,7 @@ class Inspection:
         }
 
     def text(self) -> str:
-        """Return a report for a terminal."""
+        """Return the result as a report for a terminal: joints, pattern of M, needs of the model, facts, remarks."""
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
@@ -95,7 +108,7 @@ class Inspection:
         return f"<Inspection of {self.arm.name!r}: {needs['M(q)'].split(' make ')[0]}, {needs['base']}>"
 
     def _repr_html_(self) -> str:
-        """Return the whole matrix, for a notebook."""
+        """Return a table of the whole mass matrix, for a notebook: the joints that each entry depends on."""
         cells, n = self._cells(), len(self.structure.joints)
         rows = []
         for row, name in enumerate(self.structure.joints):
@@ -112,7 +125,7 @@ class Inspection:
 
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
-        # The JSON object contains zero entries of G too, unlike `actuation.entries`.
+        # The JSON object contains all entries of G; `actuation.entries` has only the nonzero entries.
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
         entries = []
         for row, column in product(range(n), repeat=2):
@@ -129,9 +142,10 @@ class Inspection:
         return {**content, "entries": entries}
 
     def _servo_needs(self) -> str:
-        """Return a text about the parameters that logs of position servos determine, and the ones that they do not."""
-        # Logs of positions do not determine the scale of torques: they do not change if kp, mass and friction of a
-        # group of joints are multiplied by a common factor. One known parameter of the group determines this factor.
+        """Return a text for users about the parameters that logs of position servos can and cannot determine."""
+        # Logs of positions do not determine the scale of torques: the logs would be the same if kp, mass and friction
+        # of a group of joints were multiplied by a common factor. One known parameter of the group determines the
+        # factor.
         rank = servo_rank(self.arm)
         determined = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
         if len(rank.groups) == 1:
@@ -149,19 +163,19 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return a text about the input matrix G and the servos of the model."""
+        """Return a text for users about the input matrix G, the position servos and the passive joints of the model."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]
-        # G is not the identity if the logs contain motor torques, which the model converts to joint torques.
+        # G is not the identity if logs contain motor torques, which the model converts to joint torques by G.
         if not self.actuation.direct:
             needs = ["motor torques"]
             for kind, meaning in (("fixed", "gear known"), ("gain", "gain trained"), ("coupled", "coupled")):
                 entries = [entry for entry in self.actuation.entries if entry.kind == kind]
                 if entries:
-                    needs.append(f"{meaning} at {_rows(entries)}")
+                    needs.append(f"{meaning} at {_driven_joints(entries)}")
         if self.actuation.couplings:
-            needs.append(f"motors coupled at {_rows(self.actuation.couplings)}")
+            needs.append(f"motors coupled at {_driven_joints(self.actuation.couplings)}")
         # Joints without a drive are listed, because they have no input.
         if self.structure.passive:
             needs.append(f"{joints_in_ranges(self.structure.passive)} without a drive")
@@ -179,10 +193,10 @@ class Inspection:
         return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
 
     def _matrix(self) -> str:
-        """Return the lower triangle of M as a table in text form; a cell has the joints on which the entry depends."""
+        """Return a text table of the lower triangle of M with a cell per entry, see `cell_text`."""
         cells, n = self._cells(), len(self.structure.joints)
         lines = ["Mass matrix: joints each entry depends on; C constant, 0 always zero"]
-        # Each column is as narrow as its widest cell, so that M of seven joints fits into 80 characters.
+        # Each column of the table has the width of its widest cell, so that M of seven joints fits into 80 characters.
         widths = [max(len(cells[row, column]) for row in range(column, n)) for column in range(n)]
         for row in range(n):
             line = f"  {row + 1:>2}"
@@ -192,13 +206,13 @@ class Inspection:
         return "\n".join(lines)
 
     def needs(self) -> dict[str, str]:
-        """Return {"M(q)", "V(q)", "G" or "base": text about the functions and constants that a model needs}.
+        """Return {quantity: text for users about the functions and constants that a model needs for it}.
 
-        "base" is the number of base inertial parameters.
+        The quantities are "M(q)", "V(q)", "G" (the inputs) and "base" (the number of base inertial parameters).
         """
         structure = self.structure
-        # Outputs are counted per set of joints, because one network computes all outputs that depend on the same
-        # joints.
+        # Outputs (varying terms of M) are counted per set of joints, because one network computes all outputs that
+        # depend on the same joints.
         counts = Counter(output.joints for output in structure.outputs)
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
@@ -218,8 +232,8 @@ class Inspection:
         }
 
 
-def _rows(entries: Iterable[InputEntry]) -> str:
-    """Return the joints in whose rows of G these entries are, as text."""
+def _driven_joints(entries: Iterable[InputEntry]) -> str:
+    """Return the joints that entries of the input matrix G drive (their rows), as text such as ``joints 2-4``."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 
@@ -236,7 +250,7 @@ def _remark(diagnostic: Diagnostic) -> str:
 
 
 def range_text(coordinate: Coordinate) -> str:
-    """Return the range of a joint as text, with its unit."""
+    """Return the position limits of a joint as text with unit, or "continuous" or "no limits"."""
     if coordinate.continuous:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:
@@ -245,7 +259,7 @@ def range_text(coordinate: Coordinate) -> str:
 
 
 def cell_text(entry: MassEntry) -> str:
-    """Return the joints on which an entry of M depends as text; "C" for a constant entry, "0" for a zero entry."""
+    """Return text for an entry of M: the joints on which it depends, "C" if it is constant, "0" if always zero."""
     return {"zero": "0", "constant": "C"}.get(entry.kind, joint_ranges(entry.joints))
 
 

@@ -1,4 +1,4 @@
-"""Test that a module that spelgen has built is up to date with its URDF: the function ``check``."""
+"""The function ``check``: test whether a module that spelgen has built is up to date with its URDF."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,12 +12,12 @@ from spelgen.structure.structure import derive
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of ``check``.
+    """Result of ``check`` for a module.
 
     Attributes:
         urdf: path of the URDF.
-        fresh: True if the module is up to date and the verification finds no error.
-        reasons: the differences and errors, if any.
+        fresh: True if the module is up to date and the numerical verification of the structure finds no error.
+        reasons: differences between module and URDF, and errors of the structure, as text; empty if ``fresh``.
         proof: numerical verification of the structure.
     """
 
@@ -44,19 +44,19 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     stated = parse_spec(text, module)
     path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
     arm = arm_of_spec(stated, path)
-    # The URDF is compared by its digest. Its path is taken from the module, since the file may have been moved since
-    # the build.
+    # The URDF is compared by its digest. The path of the URDF is copied from the module to `spec` before the
+    # comparison, since the file may have been moved since the build.
     spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
     reasons = []
     if spec.urdf_sha256 != stated.urdf_sha256:
         reasons.append(f"{path} has changed since the module was built")
     if spec.sha256 != stated.sha256:
         reasons.append("the derived model differs from the one in the module")
-    # The text is compared with both forms of the module, standalone or not, because it does not state its form.
+    # The text of the module is compared with both forms, standalone or not, because it does not state its form.
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    # The comparison cannot detect an error of the derivation, which both texts would contain. The verification by
-    # Pinocchio is independent of the derivation.
+    # A comparison of texts cannot detect an error of the derivation of the structure, which both texts would contain.
+    # The verification by Pinocchio is independent of the derivation.
     proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

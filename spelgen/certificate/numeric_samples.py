@@ -1,12 +1,12 @@
-"""Computations by Pinocchio for the verification of a structure: random samples and a reading of the URDF.
+"""Computations by Pinocchio for the verification of a structure: random samples, and a comparison with the URDF.
 
 The samples are mass matrices, gravity torques and torque regressors at random configurations, computed from the chain
-that was read from the URDF. Random inertial parameters are physically consistent: their pseudo-inertia is positive
-definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
+of bodies that spelgen has read from the URDF. Random inertial parameters are physically consistent: their
+pseudo-inertia is positive definite (Wensing, Kim and Slotine, RA-L 3(1), 2018).
 
-Errors in the reading of the URDF would not be detected by these samples. Therefore Pinocchio reads the URDF, too, and
-axes of joints, masses and inertias are compared with the chain. Pinocchio does not round angles: its values are
-compared with a chain without rounding, and the effect of rounding is computed separately.
+The samples cannot detect errors of spelgen's reading of the URDF. Therefore Pinocchio reads the URDF, too, and joint
+axes, masses and inertias are compared with the chain. Pinocchio does not round angles: its values are compared with a
+chain without rounding, and the effect of rounding is computed separately.
 """
 
 import hashlib
@@ -32,13 +32,13 @@ TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 @dataclass(frozen=True)
 class NumericSamples:
-    """Samples of M and of the gravity torque at S random configurations.
+    """Samples of M and of the gravity torque by Pinocchio at S random configurations.
 
     Attributes:
-        mass: (1 + n, S, n(n+1)/2), entries of the lower triangle of M, divided by ``scale``. mass[0] is M at the S
+        mass: entries of the lower triangle of M, divided by ``scale``, (1 + n, S, n(n+1)/2) [1]. mass[0] is M at the S
             configurations; for mass[1 + k], coordinate k has another random position.
-        scale: (n(n+1)/2,), sqrt(mean M_ii * mean M_jj) for the entry (i, j), with means over the samples.
-        gravity: (S, n), gravity torque dV/dq divided by its largest magnitude.
+        scale: magnitude of each entry (i, j): sqrt(mean M_ii * mean M_jj), with means over the samples, (n(n+1)/2,).
+        gravity: gravity torque dV/dq, divided by its largest magnitude, (S, n) [1].
         changes: changes of M / scale due to a change of one coordinate, (n, S, n(n+1)/2): mass[1:] - mass[0].
     """
 
@@ -49,9 +49,14 @@ class NumericSamples:
 
 
 def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: bool) -> NumericSamples:
-    """Return samples at ``count`` random configurations.
+    """Return samples of M and of the gravity torque at random configurations.
 
-    random_inertials: True: each sample has its own random inertial parameters; False: all have the ones of the URDF.
+    Args:
+        arm: the arm.
+        count: number of configurations.
+        rng: generator of the random configurations and inertial parameters.
+        random_inertials: True: each sample has other random inertial parameters. False: all samples have the inertial
+            parameters of the URDF.
     """
     n = len(arm.coordinates)
     rows, columns = np.tril_indices(n)
@@ -59,42 +64,45 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     gravity = np.zeros((count, n))
     for sample in range(count):
         dynamics = arm_dynamics(with_random_inertias(arm, rng) if random_inertials else arm, Settings())
-        # Row 0 of q, (1 + n, n), has random positions. Row 1 + k differs from row 0 in coordinate k only, so that a
-        # difference of M is an effect of this coordinate.
+        # Row 0 of q, (1 + n, n), has random positions. Row 1 + k differs from row 0 in coordinate k only, so that the
+        # difference of M between both rows is an effect of coordinate k.
         base, moved = _positions(arm, rng), _positions(arm, rng)
         q = np.where(np.eye(1 + n, n, -1) == 1, moved, base)
         mass[:, sample] = dynamics.mass_matrix(q)
         gravity[sample] = dynamics.gravity(base)
-    # Entries have different units (kg, kg m, kg m2), and are therefore divided by scales with the same units.
+    # Entries of M have different units (kg, kg m, kg m^2), and are therefore divided by scales with the same units.
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    # Without gravity, all torques are zero and are divided by 1.
+    # Without gravity, all gravity torques are zero, and they are divided by 1.
     largest = np.abs(gravity).max() or 1.0
     mass = mass[:, :, rows, columns] / scale
     return NumericSamples(mass, scale, gravity / largest, mass[1:] - mass[0])
 
 
 def regressor(arm: Chain, rng: np.random.Generator) -> np.ndarray:
-    """Return the torque regressors of n coordinates and B bodies, (m n, 10 B), at m random states q, qd, qdd."""
-    # The regressor does not depend on inertial parameters. Random ones are used, because Pinocchio needs some values.
+    """Return the torque regressor of n coordinates and B bodies at m random states (q, qd, qdd), (m n, 10 B).
+
+    Its rank is the number of base parameters.
+    """
+    # The regressor does not depend on inertial parameters, but Pinocchio needs some values: random ones are used.
     dynamics = arm_dynamics(with_random_inertias(arm, rng), Settings())
     n, bodies = len(arm.coordinates), len(arm.bodies)
     rows = []
-    # There are more rows than columns, so that the samples do not limit the rank.
+    # The regressor has more rows than columns, so that the number of samples does not limit its rank.
     for _ in range(10 * bodies // n + 10):
         q = dynamics.configuration(_positions(arm, rng))
         qd = dynamics.jacobian @ rng.normal(size=n)
         qdd = dynamics.jacobian @ rng.normal(size=n)
         by_joint = pin.computeJointTorqueRegressor(dynamics.model, dynamics.data, q, qd, qdd)
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         rows.append(dynamics.jacobian.T @ by_joint.reshape(bodies, -1))
     return np.concatenate(rows)
 
 
 def _positions(arm: Chain, rng: np.random.Generator) -> np.ndarray:
-    """Return random positions (n,) [rad, m]."""
-    # Limits of joints are not used, because the structure is valid at every configuration.
+    """Return random joint positions, (n,): in [-pi, pi] rad for revolute, in [-1, 1] m for prismatic joints."""
+    # Joint limits are not used, because the structure is valid at every configuration.
     half_range = np.where(np.array(arm.joint_types) == "revolute", np.pi, 1.0)
     return rng.uniform(-half_range, half_range)
 
@@ -114,10 +122,12 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 @dataclass(frozen=True)
 class ReadingDifference:
-    """Largest relative differences of a quantity between readings of a URDF.
+    """Largest relative differences of a quantity between Pinocchio's and spelgen's readings of a URDF.
 
-    difference: between Pinocchio and the chain without rounding. rounding: between the arm's chain and the chain
-    without rounding of angles.
+    Attributes:
+        quantity: name of the quantity, such as "masses and inertias".
+        difference: difference between Pinocchio and spelgen's chain without rounding of angles.
+        rounding: difference between spelgen's chains with and without rounding of angles.
     """
 
     quantity: str
@@ -128,22 +138,24 @@ class ReadingDifference:
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
     """Return the differences between the chain of ``arm`` and Pinocchio's reading of the URDF.
 
-    Axes, masses and inertias are compared at random configurations. seed: seed of the configurations. Exceptions of
-    Pinocchio are raised, and ValueError if the file has changed.
+    Joint axes, masses and inertias are compared at random configurations. Raises the exceptions of Pinocchio, and
+    ValueError if the file has changed.
+
+    robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random configurations.
     """
     dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
     gravity = tuple(map(float, arm.gravity))
     as_written = make_arm(robot, joints=arm.joint_names, angle_tolerance=0.0, gravity=gravity)
-    theirs = _reading(dynamics, arm, q)
-    written, ours = (_reading(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
+    theirs = _compared_values(dynamics, arm, q)
+    written, ours = (_compared_values(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
     if all(body.inertia is None for body in arm.bodies):
         del written["masses and inertias"]
     differences = []
     for quantity, values in written.items():
-        # Each difference is divided by the magnitude of its own number, so that errors of light bodies are detected. A
-        # thousandth of the largest magnitude is added to this divisor, so that rounding errors of numbers close to zero
-        # are not reported.
+        # Each difference of two numbers is divided by the magnitude of the number, so that errors of light bodies are
+        # detected. A thousandth of the largest magnitude is added to the divisor, so that rounding errors of numbers
+        # close to zero are not reported.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
         pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
@@ -151,12 +163,12 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
-    """Return the dynamics of the URDF as read by Pinocchio. Raises ValueError if the file has changed."""
+    """Return the dynamics of the URDF as Pinocchio reads it. Raises ValueError if the file has changed."""
     document = read_document(robot.path)
     if hashlib.sha256(document.data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")
     root = document.root
-    # Limits and friction are replaced, because they are not compared, and Pinocchio rejects some of their values.
+    # Limits and friction in the URDF are replaced, because they are not compared, and Pinocchio rejects some values.
     for element in [*root.iter("limit"), *root.iter("dynamics")]:
         element.getparent().remove(element)
     for joint in root.iterfind("joint"):
@@ -172,13 +184,13 @@ def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
 def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
     bodies = []
     for body in arm.bodies:
-        # Pinocchio reads a body without <inertial> as massless, so the chain gets zero mass, too.
+        # Pinocchio reads a body without <inertial> as massless, so the body has zero mass in the chain, too.
         bodies.append(replace(body, inertia=body.inertia or (Fraction(0),) * 10))
     return arm_dynamics(replace(arm, bodies=tuple(bodies)), Settings())
 
 
-def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {quantity: values} of the B moving bodies of an arm at S positions q (S, n).
+def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
     (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.
@@ -187,9 +199,9 @@ def _reading(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]
     axes, loads = [], []
     for configuration in dynamics.configuration(q):
-        # Pinocchio returns a vector in place of a matrix for a single joint.
+        # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         axes.append(pin.computeJointJacobians(model, data, configuration).reshape(6, -1)[:, columns])
-        # Pinocchio computes only the upper triangle of M.
+        # Pinocchio computes only the upper triangle of M. The sum of both triangles doubles the diagonal entries.
         upper = np.triu(pin.crba(model, data, configuration))
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)

@@ -1,9 +1,9 @@
-"""Numerical verification of a structure by Pinocchio at random configurations.
+"""Numerical verification of the derived structure of an arm by Pinocchio at random configurations.
 
-For a structure with ``assume="kinematics"``, each sample has its own random inertial parameters; for ``inertials``, all
-samples have the inertial parameters of the URDF. The verification and the derivation of the structure both start from
-the chain that spelgen read from the URDF. Therefore the chain is also compared with the reading of the URDF by
-Pinocchio (see ``numeric_samples``).
+For a structure with ``assume="kinematics"``, each sample has other random inertial parameters; with ``inertials``, all
+samples have the inertial parameters of the URDF. Verification and derivation of the structure both use the chain of
+bodies that spelgen has read from the URDF. Therefore the chain is also compared with Pinocchio's reading of the URDF
+(see ``numeric_samples``).
 """
 
 import textwrap
@@ -28,12 +28,12 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """Result of the verification of one derived fact.
+    """Result of the numerical verification of one derived fact about M or V.
 
     Attributes:
-        fact: name of the fact.
-        derived: result of the derivation.
-        found: result of the independent computation.
+        fact: name of the fact, such as "zero entries".
+        derived: result of the derivation, as text.
+        found: result of the independent computation by Pinocchio, as text.
         verdict: "agrees", "differs", or "undecided" if rounding errors are too large or Pinocchio cannot read the file.
     """
 
@@ -48,13 +48,13 @@ class FactCheck:
 
 @dataclass(frozen=True, repr=False)
 class Verification:
-    """Result of the verification of an arm's structure.
+    """Result of the numerical verification of an arm's structure.
 
     Attributes:
-        means: text that states the program, the number of configurations and the inertial values.
+        means: text that states the program (Pinocchio), the number of configurations and the inertial values.
         samples: number of random configurations.
-        seed: seed of the configurations.
-        checks: one result per fact.
+        seed: seed of the random configurations.
+        checks: one result per derived fact, then the comparison of the chain with the URDF.
     """
 
     means: str
@@ -64,12 +64,12 @@ class Verification:
 
     @property
     def agrees(self) -> bool:
-        """Whether no check contradicts the derivation or the chain."""
+        """True if no check contradicts the derivation of the structure or the chain read from the URDF."""
         return not self.differences
 
     @property
     def differences(self) -> tuple[FactCheck, ...]:
-        """The checks that contradict the derivation of the structure or the chain."""
+        """The checks that contradict the derivation of the structure or the chain read from the URDF."""
         return tuple(check for check in self.checks if check.verdict == "differs")
 
     def __repr__(self) -> str:
@@ -85,7 +85,7 @@ class Verification:
         return {"agrees": self.agrees} | asdict(self)
 
     def text(self) -> str:
-        """Return a paragraph for a terminal, with one or more lines per check."""
+        """Return the verification as text for a terminal, with one or more lines per check."""
         lines = textwrap.wrap(f"Verified by {self.means}", WIDTH)
         for check in self.checks:
             mark = f"  {_MARKS[check.verdict]:<7} "
@@ -96,12 +96,12 @@ class Verification:
 
 
 def size_text(size: float) -> str:
-    """Return an error with one digit as text, such as ``3e-12``, or ``0``."""
+    """Return a number as text with one significant digit, such as ``3e-12``, or ``0``."""
     return f"{size:.0e}" if size else "0"
 
 
 Magnitude = tuple[str, float, bool]
-"""Name of a number, its magnitude divided by its scale, and whether the derivation states that it is nonzero."""
+"""A sampled number that tests a fact: name, magnitude divided by its scale, and whether it must be nonzero or zero."""
 
 
 @dataclass(frozen=True)
@@ -118,44 +118,50 @@ class _DerivedFact:
     fact: str
     derived: str
     magnitudes: list[Magnitude]
-    # [1] Numbers (divided by their scale) up to this value count as zero, since they may be rounding errors.
+    # [1] Sampled numbers, divided by their scales, count as zero up to this value: they may be rounding errors.
     rounding: float = 1e-12
 
-    def check(self, is_fine: bool) -> FactCheck:
-        """Return the result of the check.
+    def check(self, has_tiny_numbers: bool) -> FactCheck:
+        """Return the verification of the fact by the sampled numbers.
 
-        is_fine: True if numbers of the arm are so small that nonzero results may be lost in rounding errors (see
-        `_is_fine`). If a number that should be nonzero counts as zero, the check is then undecided instead of
-        "differs".
+        has_tiny_numbers: True if numbers of the arm are so small that nonzero results may be lost in rounding errors
+        (see `_has_tiny_numbers`). If a number that should be nonzero counts as zero, the verdict is then "undecided"
+        instead of "differs".
         """
         zeros = [(name, value) for name, value, is_nonzero in self.magnitudes if not is_nonzero]
         nonzeros = [(name, value) for name, value, is_nonzero in self.magnitudes if is_nonzero]
         differences = [
             f"{name} is {size_text(value)} of its scale" for name, value in zeros if value > self.rounding
         ]
-        verdict: Verdict = "undecided" if is_fine and not differences else "differs"
+        verdict: Verdict = "undecided" if has_tiny_numbers and not differences else "differs"
         differences += [f"{name} is not seen" for name, value in nonzeros if value <= self.rounding]
         if differences:
             return FactCheck(self.fact, self.derived, shortened(differences, 4), verdict)
         largest = max((value for _, value in zeros), default=0.0)
-        result = f"what should be zero is at most {size_text(largest)} of its scale"
+        result = f"numbers that should be zero are at most {size_text(largest)} of its scale"
         if nonzeros:
             smallest = min(value for _, value in nonzeros)
-            result = f"what should not be zero is at least {size_text(smallest)} of its scale, {result}"
+            result = (
+                f"numbers that should not be zero are at least {size_text(smallest)} of its scale, {result}"
+            )
         return FactCheck(self.fact, self.derived, result, "agrees")
 
 
 def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> Verification:
-    """Verify the structure of an arm, and compare the arm with the URDF of ``robot``, at random configurations.
+    """Verify the derived structure of an arm by Pinocchio, and compare the arm with the URDF of ``robot``.
 
-    seed: seed of the configurations.
+    Args:
+        robot: the URDF.
+        arm: the chain of bodies that spelgen has read from the URDF.
+        structure: structure that is derived from the chain.
+        seed: seed of the random configurations and inertial parameters.
     """
-    # A derived rank is at most the number of entries, so this number of samples suffices to confirm it. Six more
-    # samples would reveal a larger rank.
+    # A derived rank is at most the number of entries of M, so this number of samples suffices to confirm it. Six more
+    # samples would show a larger rank.
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
-    # All facts are checked on the same samples: with other samples for each fact, an error could pass by chance.
+    # All facts are verified on the same samples, which are computed once.
     samples = numeric_samples.draw(arm, count, rng, random_inertials=is_random)
     facts = [
         *_entries(structure, samples),
@@ -164,40 +170,43 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
         _potential(structure, samples),
         _rank("base parameters", numeric_samples.regressor(arm, rng), structure.base_parameter_count),
     ]
-    is_fine = _is_fine(arm, structure)
-    checks = [fact.check(is_fine) for fact in facts]
+    has_tiny_numbers = _has_tiny_numbers(arm, structure)
+    checks = [fact.check(has_tiny_numbers) for fact in facts]
     inertials = "inertial values of its own" if is_random else "the URDF's inertial values"
     means = f"{numeric_samples.ENGINE} at {count} random configurations, each with {inertials}"
     return Verification(means, count, seed, (*checks, *_reading_checks(robot, arm, seed)))
 
 
 def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
-    """Yield checks that compare the chain with the reading of the URDF by Pinocchio."""
+    """Yield checks that compare the chain read by spelgen with Pinocchio's reading of the URDF."""
     try:
         differences = numeric_samples.differences_of_reading(robot, arm, seed)
-    except Exception as problem:  # A failure of Pinocchio is no evidence about the chain.
+    except Exception as problem:  # A failure of Pinocchio is no evidence against the chain: undecided.
         text = " ".join(str(problem).split())[:120]
         result = f"Pinocchio cannot read it ({type(problem).__name__}: {text})"
         yield FactCheck("reading of the file", "the moving bodies", result, "undecided")
         return
     is_rounded = any(remark.code.startswith("snapped-") for remark in arm.diagnostics)
-    # [1] The tolerance is 1e-9 per joint: the chain has no offsets of less than 1e-9 m, and the errors of its rational
-    # rotations are 1e-11 rad each.
+    # [1] The tolerance of the comparison is 1e-9 per joint: the chain omits offsets below 1e-9 m, and the errors of its
+    # rational rotations are 1e-11 rad each.
     allowed = 1e-9 * len(robot.joints)
     for difference in differences:
         verdict: Verdict = "agrees"
         if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(difference.difference)} of their size apart"
+        result = f"at most {size_text(difference.difference)} of their magnitude apart"
         if is_rounded:
-            result += f"; the reported roundings move them by {size_text(difference.rounding)}"
+            result += f"; the reported roundings change them by {size_text(difference.rounding)}"
         yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield two facts: which entries of M are zero, and on which joints each entry depends."""
+    """Yield the facts which entries of M are zero, and on which joints each entry depends.
+
+    Each fact has the numbers that test it: the entries in `samples`, and their changes if only one joint moves.
+    """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
-    # (entries, n), largest change of each entry of M when only one joint moves
+    # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
     largest_changes = np.abs(samples.changes).max(axis=1).T.tolist()
     zeros = []
     pairs = []
@@ -216,9 +225,10 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
 
 
 def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that M = sum_k c_k A_k + sum_j f_j(q) B_j with constants c_k and outputs f_j.
+    """Return the fact, with the numbers that test it, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
 
-    Each f_j must depend only on its own joints, the c_k on none. A_k and B_j are constant matrices.
+    c_k are constants, f_j functions (outputs), A_k and B_j constant matrices. Each f_j must depend only on its own
+    joints, the c_k on no joint.
     """
     n = len(structure.joints)
     remainder = samples.mass
@@ -227,22 +237,22 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         functional = row_of(term.functional, n)
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
-        # The value of a term is a linear functional of M. Its changes are divided by the sum of the magnitudes of the
-        # functional's summands.
+        # The value of a term, f_j or c_k, is a linear functional of M. Changes of the value are divided by the sum of
+        # the magnitudes of the functional's summands.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # Changes caused by the joints of the term are allowed; only changes caused by other joints contradict the fact.
+        # Changes of a term caused by its own joints are allowed; only changes by other joints contradict the fact.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
-    # The bound of rounding errors is larger than for other facts, because the fractions of the functionals are rounded
-    # to floats.
+    # The bound of rounding errors is larger than for other facts, because the coefficients of the functionals, which
+    # are fractions, are rounded to floats.
     derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about numbers of terms of M; each number must be equal to the rank of a matrix of samples.
+    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix of samples.
 
     The numbers are: outputs (terms that vary with q); outputs and constants; and, for k = 0, 1, ..., the outputs that
     do not depend on the first k joints.
@@ -252,20 +262,24 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The outputs are chosen such that, for each k, as many of them as possible do not depend on the first k joints.
-    # This number is checked for each k.
+    # The outputs are derived such that, for each k, the largest possible number of outputs does not depend on the first
+    # k joints. This number is verified for each k.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # The rank of the changes of M caused by the first joints is the number of outputs that depend on them.
+        # Outputs are linearly independent functions of q. Therefore the rank of the changes of M due to the first k
+        # joints must equal the number of outputs that depend on any of these joints.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that V depends only on the derived joints: the gravity torque of all other joints is zero."""
+    """Return the fact that V depends on the derived joints only, with the numbers that test it.
+
+    The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
+    """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):
         name = f"torque of gravity at joint {joint + 1}"
@@ -275,12 +289,16 @@ def _potential(structure: Structure, samples: numeric_samples.NumericSamples) ->
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return the fact that the matrix ``rows`` has this rank, the number of nonzero singular values.
+    """Return the fact, with singular values, that a matrix has a derived rank: its number of nonzero singular values.
 
-    fact: name of the fact.
+    Args:
+        fact: name of the fact.
+        rows: the matrix, (m, k).
+        rank: derived rank.
     """
     if len(rows) > rows.shape[1]:
-        # The triangular factor of the QR decomposition has the same singular values and fewer rows.
+        # The matrix is replaced by the triangular factor of its QR decomposition, which has the same singular values
+        # and fewer rows.
         rows = np.asarray(np.linalg.qr(rows, mode="r"))
     values = np.linalg.svd(rows, compute_uv=False)
     # The singular values are divided by the largest one, because the scale of the rows is arbitrary.
@@ -292,11 +310,11 @@ def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
     return _DerivedFact(fact, str(rank), magnitudes)
 
 
-def _is_fine(arm: Chain, structure: Structure) -> bool:
-    """Whether the arm has nonzero numbers below 1e-3, whose products may be lost in rounding errors.
+def _has_tiny_numbers(arm: Chain, structure: Structure) -> bool:
+    """Return True if the arm has nonzero numbers below 1e-3, whose products may be lost in rounding errors.
 
-    The numbers are the entries of the rotations and, if the structure depends on inertials, relative moments of
-    inertia.
+    The numbers are the entries of the rotations between joint frames and, if the structure depends on inertials, the
+    moments of inertia of each body divided by its largest one.
     """
     numbers = [np.array(body.rotation, dtype=float).ravel() for body in arm.bodies]
     if structure.assume == "inertials":

@@ -132,7 +132,7 @@ def identify(
     # Error codes on the command line are accepted in addition to the codes in the settings.
     log_mapping = options.log_mapping(arm, mapping, accept)
     logs = read_logs(paths, arm, log_mapping, role="train")
-    # Logs are checked first: least squares would fit logs in wrong units without any error.
+    # Logs are checked before the identification: least squares would fit logs in wrong units without any error.
     for diagnostic in require_sound_logs(logs, arm, log_mapping):
         note(diagnostic)
     result = identify_arm(arm, logs, method, preprocessing=Preprocessing(cutoff=filter))

@@ -25,7 +25,7 @@ FAILED = 1
 INTERRUPTED = 130  # Shells use the exit code 128 + signal number; SIGINT is 2.
 BROKEN_PIPE = 141  # Shells use the exit code 128 + signal number; SIGPIPE is 13.
 
-# {top-level module: optional dependency group ("extra") of spelgen that installs the module}
+# {optional package: group of dependencies ("extra") of spelgen that installs it}, for the error if it is absent
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
 EXTRAS |= dict.fromkeys(("casadi", "mujoco", "onnxruntime", "onnxscript", "safetensors"), "deploy")
 
@@ -56,7 +56,8 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
             for name, group in groups.items():
                 values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
             command(**values)
-            # A closed pipe raises its error here, where it is reported, and not at the exit of the interpreter.
+            # The flush raises the error of a closed pipe here, where it is reported, and not at the exit of the
+            # interpreter.
             sys.stdout.flush()
         except (typer.Exit, typer.Abort, typer.BadParameter):
             raise
@@ -90,10 +91,10 @@ def _local(value: object) -> object:
 
 
 def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
-    """Report an exception on stderr, with `debug` after the traceback; exit with the exit code of the exception."""
+    """Report an exception on stderr, and exit with its exit code. debug: if True, print the traceback first."""
     if isinstance(error, BrokenPipeError):
-        # The reader of stdout has ended. No message is printed; stdout becomes /dev/null, so that the flush at the exit
-        # of the interpreter does not fail.
+        # A closed pipe means that the reader of stdout has ended: no message is printed, and stdout becomes /dev/null,
+        # so that the flush at the exit of the interpreter does not fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(BROKEN_PIPE)
     if debug:
@@ -123,9 +124,9 @@ def _message(error: BaseException, debug: bool) -> str:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on stderr if stderr is a terminal.
+    """Context manager that shows a progress bar on stderr if stderr is a terminal.
 
-    Yield a function with the arguments number of finished steps, number of all steps, and optionally title of the
+    It yields a function with the arguments number of finished steps, number of all steps, and optionally title of the
     current step.
     """
     from rich.console import Console
@@ -161,7 +162,7 @@ def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
 
 
 def deliver(text: str, output: Path | None) -> None:
-    """Print a result without its last line end, or write it to a file and print the path."""
+    """Print a result without its last line end, or write it to the file `output` and print the path of the file."""
     if output is None:
         say(text.removesuffix("\n"))
     else:
@@ -169,7 +170,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Exit with code 1 if there is any warning: the effect of the option --strict."""
+    """Exit with code 1 and a message about `subject` if there is any warning: the effect of the option --strict."""
     if count:
         note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

@@ -222,20 +222,20 @@ def compare(
         "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
-    # Options on the command line replace the values of the file.
+    # Options on the command line replace the values in the file of the comparison.
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, paths, mapping).model_copy(update=changes)
     name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
-    # Workers have other working directories, so the path must be absolute.
+    # The path of the output folder must be absolute, since workers have other working directories.
     folder = (output or Path("comparisons") / name).absolute()
     # All cores are used by default, because a comparison takes hours on one core.
     parallel = jobs or default_jobs()
-    # The folder is locked: two simultaneous comparisons would overwrite each other's runs.
+    # The output folder is locked: two simultaneous comparisons would overwrite each other's runs.
     with locked(folder), termination_as_interrupt():
         with progress_bar("simulating") as progress:
             study = prepare_study(comparison, folder, progress)
         note(study.announcement(parallel))
-        # Inputs are written before the workers start, so that all workers read the same files.
+        # The inputs of all runs are written before the workers start, so that all workers read the same files.
         study = run_study(study, note, parallel, address)
         sections = arm_sections(study)
         # Tables are printed in addition to the page, which cannot be shown in a terminal.
@@ -244,7 +244,7 @@ def compare(
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")
-    # Failures affect the exit code only after the page is written, which lists the failed runs.
+    # The exit code for failed runs is set only after the page is written, which lists these runs.
     if study.failures:
         raise typer.Exit(FAILED)
 

@@ -69,7 +69,8 @@ def excite(
 
     for path in (output, trajectory, html):
         if path is not None:
-            # Outputs are checked before the search for a motion, because the search takes minutes.
+            # Output files that exist already are reported before the search for a motion, because the search takes
+            # minutes.
             options.require_free(path, force=force)
     arm = chosen_arm.load()
     with progress_bar("searching") as progress:

@@ -41,7 +41,7 @@ class Command(TyperCommand):
         return super().get_help(ctx)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the arguments for the usage line: without braces, optional arguments in brackets."""
+        """Return the texts of the arguments in the usage line: without braces, optional arguments in brackets."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 
@@ -49,19 +49,19 @@ class CommandGroup(TyperGroup):
     """The group of all commands. A usage error suggests the nearest command, option or choice."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Parse the options before the name of the command; usage errors get suggestions."""
+        """Parse the options before the name of the command; a usage error names the nearest option or choice."""
         with _suggestions():
             return super().make_context(*arguments, **options)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; usage errors get suggestions."""
+        """Run a command; a usage error names the nearest command, option or choice."""
         with _suggestions():
             return super().invoke(ctx)
 
 
 @contextmanager
 def _suggestions() -> Iterator[None]:
-    """Add suggestions to usage errors that are raised in the block."""
+    """Context manager that adds the nearest option or choice to usage errors that are raised in its block."""
     try:
         yield
     except BaseUsageError as error:
@@ -71,11 +71,11 @@ def _suggestions() -> Iterator[None]:
 
 def _suggest(error: Any) -> None:
     """Add the nearest option or choice to the message of a usage error of click."""
-    # Click lists all similar names; the message suggests only the first one.
+    # Click lists all similar names of an unknown option or command; the message suggests only the first one.
     nearest = list(vars(error).get("possibilities") or [])[:1]
     if nearest:
         error.possibilities = []
-    # Pydantic, with which choices are checked, adds this prefix.
+    # Choices are checked by pydantic, which adds the prefix "Value error" to messages: it is removed.
     error.message = error.message.replace("Value error, ", "")
     # Click makes no suggestion for an invalid choice, so the choices are read from its message.
     choice = re.fullmatch(r"'(.*)' is not one of (.*)\.", error.message, re.DOTALL)
@@ -125,12 +125,12 @@ def main() -> None:
     # OMP_NUM_THREADS is set before BLAS and torch are imported, because both read the variable only once. One thread
     # makes runs deterministic, and is fastest for small matrices.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    # A termination ends a command as Ctrl-C does: unfinished files are removed.
+    # The signal SIGTERM ends a command as Ctrl-C does: unfinished files are removed.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # Imports create many objects that live as long as the process: collections during imports take 6 % of the time of a
-    # short command.
+    # Garbage collection is made rare: imports create many objects that live as long as the process, and collections
+    # during imports take 6 % of the time of a short command.
     gc.set_threshold(100_000)
     for stream in (sys.stdout, sys.stderr):
-        # Names from a file may contain characters that the encoding of the terminal does not have.
+        # Characters of names from a file that the encoding of the terminal does not have are printed as escapes.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     app(prog_name="spelgen")

@@ -122,7 +122,7 @@ def export(
     from spelgen.exporting.exported import format_by_extension, require_fitting
     from spelgen.fitting.fitted import load_run
 
-    # By default the suffix of the output selects the format.
+    # By default the suffix of the output file selects the format of the export.
     if to is None:
         to = format_by_extension(output)
     # The name of the output is checked before the model is loaded, which takes seconds.

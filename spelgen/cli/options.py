@@ -50,12 +50,12 @@ def option(
 
 
 def flag(name: str, text: str) -> Declared:
-    """Return an option without a value, and without the negation `--no-...` that typer would add."""
+    """Return the declaration of an option without a value, and without the negation `--no-...` that typer would add."""
     return option("", text, name, default=False)
 
 
 def argument(metavar: str, text: str, default: object = ...) -> Declared:
-    """Return a positional argument; without a default it is required."""
+    """Return the declaration of a positional argument of a command; without a default it is required."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 
@@ -145,7 +145,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
         return None
     if text == "V":
         return "V"
-    # Numbers have at most four digits, because Python does not convert texts of thousands of digits.
+    # Indices of an entry have at most four digits, because Python does not convert texts of thousands of digits.
     match = re.fullmatch(r"\s*(\d{1,4})\s*,\s*(\d{1,4})\s*", text, re.ASCII)
     if match is None:
         raise typer.BadParameter("name it as ROW,COLUMN or V", param_hint="'--entry'")
@@ -153,7 +153,7 @@ def entry(text: str | None) -> tuple[int, int] | Literal["V"] | None:
 
 
 def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
-    """Return the paths of all options --data. Raises a usage error if there are none."""
+    """Return the paths of all logs on the command line. Raises a usage error if there is no option --data."""
     # Logs are given by an option and not by an argument, so that they cannot be confused with a module.
     if not data:
         raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
@@ -174,7 +174,7 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
     chosen = log_source(arm, mapping).mapping
-    # A dict, unlike a set, preserves the order, so that the record of a run is deterministic.
+    # Accepted codes are collected in a dict, which preserves the order, so that the record of a run is deterministic.
     accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
     return chosen.model_copy(update={"accept": tuple(accepted)})
 
@@ -189,7 +189,7 @@ class ArmOptions:
     angle_tolerance: float = ANGLE_TOLERANCE
 
     def load(self) -> Arm:
-        """Return the arm that these options select."""
+        """Return the arm that these options select in the URDF."""
         from spelgen.arm.configured_arm import load_arm
 
         return load_arm(self.robot, names(self.joints), self.tip, self.angle_tolerance)

@@ -40,7 +40,7 @@ def train(
     force: bool = options.FORCE,
     source: Path | None = option("RUN", "Adapt the model of this run; replaces MODULE.", "--from"),
     objective: Objective | None = option(
-        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks alone."
+        "", "Default: torque for rigid bodies; rollout, after momentum steps, for networks."
     ),
     assignments: list[str] | None = option(
         "KEY=VALUE", "Set an option of the fit, e.g. epochs=50; repeat it for more options.", "--set"
@@ -53,8 +53,8 @@ def train(
     Defaults come from `training` in the robot's settings; --set takes the same keys, which docs/cli_runs.md lists.
     A key that does not apply to the objective is an error.
     """
-    start_time = time.monotonic()  # The limit `max_minutes` includes the time to read the logs.
-    # Keys are checked before any file is read, so that a misspelt key costs no time.
+    start_time = time.monotonic()  # The limit `max_minutes` includes reading the logs.
+    # Keys of --set are checked before any file is read, so that a misspelt key costs no time.
     request = Request(objective, read_assignments(assignments or []))
     if source is not None:
         if module is not None:
@@ -84,7 +84,7 @@ def train(
     from spelgen.fitting.fit import RunOptions
     from spelgen.fitting.train import train as train_files
 
-    # Device and threads are not recorded, because they describe the machine and not the result.
+    # The options device and threads are not recorded in the run, because they describe the machine and not the result.
     machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     config = fit_options(request, None if resume else settings)
@@ -158,7 +158,7 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    # The outcome of a servo fit already has a table of its drives.
+    # For a servo fit only the first table of the posterior is printed: its outcome already contains a table of drives.
     listings = () if posterior is None else posterior.listings[: 1 if fit.record.servo else None]
     outcome += [table.text() for table in listings]
     answer(format, record, *outcome, f"run folder: {folder}")
@@ -169,12 +169,12 @@ def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payl
 
 
 def _outcome(fit: Fit) -> tuple[str, str]:
-    """Return two sentences: the status of a fit with its reason, and the result of the fit."""
+    """Return two sentences for the terminal: the status of a fit with its reason, and the result of the fit."""
     config, result = fit.config, fit.result
     reason = ""
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    # Only fits with the rollout objective have epochs, which the sentences below state.
+    # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
     if not isinstance(config, Rollout):
         summary = None
         if fit.record.servo is not None:
@@ -195,9 +195,9 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request of a warm start: the default of the objective is "torque" and the default of `adapt` "load".
+    """Return the request of a fit that starts from a fitted model: by default the load is adapted by a torque fit.
 
-    `adapt` applies only to the objective "torque".
+    The default objective is "torque". The key `adapt`, by default "load", applies only to this objective.
     """
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":
@@ -208,7 +208,10 @@ def _warm_start(request: Request) -> Request:
 
 
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:
-    """Return the default run folder. With --resume, the argument of the command may be the run folder itself."""
+    """Return the run folder of a command without -o: runs/NAME of the module, or runs/NAME_adapted of the run `source`.
+
+    With --resume, `module` may be the run folder itself. Raises RunError if there is no run to resume.
+    """
     if resume and module is not None and module.is_dir():
         return module
     name = f"{(source or Path()).resolve().name}_adapted" if module is None else module.stem

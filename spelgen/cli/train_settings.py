@@ -28,7 +28,7 @@ class UsageError(typer.BadParameter):
     """Usage error about an option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
-        """Return the message without the prefix that names a parameter."""
+        """Return the message without the prefix that typer adds, which names a parameter."""
         return self.message
 
 
@@ -58,7 +58,7 @@ class Request:
     warm_start: bool = False
 
     def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return {key: value} of the given keys that `--set` has set."""
+        """Return {key: value} for each of `keys` that `--set` has set."""
         return {name: self.values[name] for name in keys if name in self.values}
 
 
@@ -69,12 +69,13 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     key; the message suggests the most similar known key.
     """
     keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by the option --objective.
-    # All assignments are collected before they are checked, since the fields of a group are checked together.
+    # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         name, _, field = key.strip().replace("-", "_").partition(".")
-        # A missing `=` is reported before an unknown key, because the user may have typed a blank in place of `=`.
+        # A missing `=` in --set is reported before an unknown key, because the user may have typed a blank in place of
+        # `=`.
         if not equals:
             raise UsageError(f"--set: got {assignment!r}, expected KEY=VALUE")
         if name not in keys:
@@ -107,10 +108,11 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
     settings = dict(defaults.options)
     objective = request.objective or defaults.objective
     if request.warm_start and objective == "rollout":
-        # In a warm start no torque fit precedes the rollout: it would discard the source run's parameters.
+        # In a warm start no torque fit precedes the rollout fit: a torque fit would discard the source run's
+        # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The logs determine the objective later, and some objectives have no time limit. For these objectives an option
-        # would be an error, but a default value is ignored.
+        # The logs determine the objective later, and some objectives have no time limit. For these objectives the
+        # option `max_minutes` would be an error; as a setting, which is only a default value, it is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

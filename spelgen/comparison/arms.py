@@ -78,7 +78,7 @@ class Comparison(Group):
 
 
 def ablation_designs() -> dict[str, str | Design]:
-    """Return {name: design}, in an order from phnode to hybrid in which each design changes one property."""
+    """Return {name: design} from phnode to hybrid; each design differs from the one before in one property."""
     friction = replace(load_design("phnode"), dissipation="per-joint")
     inputs = replace(friction, input="derived")
     return {
@@ -146,7 +146,7 @@ class ArmInputs(ComparedArm):
         return load_arm(self.urdf, self.joints, self.tip)
 
     def log_mapping(self) -> LogMapping:
-        """Return the columns and units of the logs."""
+        """Return the columns and units of the arm's logs."""
         return log_source(self.load(), self.mapping).mapping
 
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:

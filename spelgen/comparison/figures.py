@@ -1,6 +1,6 @@
-"""Figures of a model trained on the paper's simulated protocol: losses, sizes, invariants, and the error of M.
+"""Results of a model on the simulated protocol of Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 
-Source: Wang, Chen and Ding, Sci Rep 15:33179 (2025).
+The results are losses, numbers of parameters and outputs, invariants of the motion, and the error of M.
 """
 
 import statistics
@@ -38,7 +38,7 @@ class ComparisonTuning:
     # [s] Time over which motions are predicted, as in Wang et al., Sci Rep 15:33179 (2025).
     horizon: float = 1.0
     # [s] Duration of the evaluation of a run after its training, for the estimated duration of a comparison. Measured
-    # with robots/two_link.urdf, like the next two values.
+    # with robots/two_link.urdf, like `momentum_cost` and `run_on_logs`.
     measuring: float = 10.0
     # [1] Duration of a training step with the momentum objective, divided by the duration of a step with the rollout
     # objective. A momentum step is shorter, because it needs no numerical integration.
@@ -59,7 +59,7 @@ NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"
 
 @dataclass(frozen=True)
 class SimulatedFigures:
-    """Figures of a model of a simulated arm.
+    """Numbers by which models of a simulated arm are compared, for one model.
 
     Attributes:
         losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
@@ -77,7 +77,7 @@ class SimulatedFigures:
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Return the figures of a fit to simulated logs. truth: URDF with the true parameters of the simulated arm."""
+    """Return the numbers by which models of a simulated arm are compared. truth: URDF with the true parameters."""
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
@@ -175,9 +175,9 @@ def sizes(model: ArmModel) -> Figures:
 def predict_example(
     predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
 ) -> PredictedMotion | None:
-    """Return the measured and predicted motion in the middle of the first log that is long enough; None without one.
+    """Return the measured motion in the middle of the first log that is long enough, and its prediction.
 
-    The motion has `steps` steps of `decimation` samples.
+    The motion has `steps` steps of `decimation` samples each. None is returned if all logs are shorter.
     """
     span = steps * decimation
     for log in logs:

@@ -83,7 +83,7 @@ class Job(Group):
 
     @property
     def preset(self) -> str:
-        """Return the name of the design; for a YAML file, its name without folder and suffix."""
+        """Return the name of the compared preset or ablation design; for a YAML file, the name of the file."""
         return Path(self.design).stem
 
     @property
@@ -100,8 +100,8 @@ class Job(Group):
         """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
-        # The hash contains the content of the design and not its name, since a YAML file may have changed. It contains
-        # the version of spelgen, since versions may give different results.
+        # The hash contains the content of the design and not its name, since a YAML file may have changed. The hash
+        # contains the version of spelgen, since versions may give different results.
         sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
 
@@ -111,12 +111,15 @@ class Job(Group):
         return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:
-        """Return the untrained model."""
+        """Return the untrained model of the run."""
         arm = self.inputs.load()
         return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the stored result if its key is the key of this run, else None. Raises RunError."""
+        """Return the result in result.json; None if there is none, or if it is of a run with other inputs.
+
+        The inputs are compared by their hash, `key`. Raises RunError if the file is malformed.
+        """
         path = self.folder / "result.json"
         if not path.is_file():
             return None
@@ -124,7 +127,11 @@ class Job(Group):
         return result if result.key == self.key else None
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
-        """Return the configuration of the fit: the same for all models of a simulated arm, else from the settings."""
+        """Return the configuration of the fit of the model.
+
+        On a simulated arm, all models have the same one (see `equal_steps`). On logs of the user, it consists of the
+        training settings of the arm.
+        """
         if self.inputs.truth is not None:
             return self.equal_steps()
         objective = self.training.objective
@@ -197,7 +204,10 @@ def run_job(job: Job) -> RunResult:
 
 
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return True if the folder has a checkpoint of this run; a checkpoint with another key is discarded."""
+    """Return True if the run folder contains an interrupted fit with the same inputs, which can be resumed.
+
+    A fit with other inputs, recognized by its key in job.json (see `Job.key`), is discarded.
+    """
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
         return run.config.exists()
@@ -208,7 +218,10 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 
 
 def _errors(results: Results) -> Errors:
-    """Return {measure: {predictor: error}}: first the errors of replays, then of horizons, then of torques."""
+    """Return {label of an error measure, with its unit: {predictor: error}}.
+
+    The order is: position errors of replays, relative errors per prediction horizon, nMSE of torques.
+    """
     errors: Errors = {}
     for replay in results.replays:
         measure = f"position RMS, {replay.name} [{thousandths(results.joint_types)}]"

@@ -22,7 +22,7 @@ from spelgen.settings.settings import load_settings
 from spelgen.tasks import run_tasks
 
 PRESETS_ON_LOGS: tuple[str, ...] = ("closed-form", "hybrid")
-# The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
+# Presets that are compared on simulated logs. The models of the paper (Wang et al., Sci Rep 15:33179, 2025) are first.
 SIMULATED_PRESETS: tuple[str, ...] = ("phnode", "spel", "spel-kan", "minimal", "hybrid", "closed-form")
 
 
@@ -53,7 +53,8 @@ class Study:
             text += f", {len(self.results)} finished before"
         if not self.estimates:
             return text
-        # The estimated time assumes that all workers are equally loaded. It is at least the time of the longest run.
+        # The estimated time assumes that all workers are equally loaded. The estimate is at least the time of the
+        # longest run.
         seconds = max(sum(self.estimates.values()) / parallel, *self.estimates.values(), 0.0)
         return f"{text}; estimated time {duration(seconds)}"
 
@@ -147,10 +148,11 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
 
 
 def _estimate(job: Job, results: Mapping[str, RunResult]) -> float:
-    """Return the expected duration of a run [s]: the median duration of finished runs of the same arm and preset.
+    """Return the expected duration of a run [s].
 
-    If there is no such run, the duration is the number of training steps times the measured duration of a step for a
-    simulated arm, and a constant for logs of the user.
+    It is the median training time of finished runs of the same arm and preset, plus a constant for the evaluation. If
+    there is no such run, the training time of a simulated arm is the number of training steps times the measured
+    duration of a step; for logs of the user, the expected duration is a constant.
     """
     finished = [x.seconds for x in results.values() if (x.arm, x.preset) == (job.arm, job.preset)]
     if finished:

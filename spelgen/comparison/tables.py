@@ -18,7 +18,10 @@ Runs = Mapping[str, Sequence[RunResult]]
 """Preset -> results of the runs of an arm with all seeds and splits."""
 Numbers = dict[str, float | None]
 RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""Label of a row -> name in the label of the next row, which shows the baseline's figure divided by each model's."""
+"""{label of a row of losses: name of this loss in the label of the row below}.
+
+The row below contains the loss of the baseline (`BASELINE`) divided by the loss of each model.
+"""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class ArmResults:
 
 
 def arm_sections(study: Study) -> list[ArmResults]:
-    """Return a section for each arm with finished runs."""
+    """Return the tables and the sentence of each arm with finished runs, for the report of a comparison."""
     arms: dict[str, list[RunResult]] = {}
     for job in study.jobs:
         if job.name in study.results:
@@ -172,9 +175,10 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
 def _summary(
     figures: Mapping[str, Sequence[Figures]], label: str, combine: Callable[[list[float]], float]
 ) -> Numbers:
-    """Return {preset: figure}, for the row `label` of a table.
+    """Return {preset: number}, the row `label` of a table.
 
-    The figures of all runs of a preset are combined to one number. combine: function for this, such as the median.
+    figures: {preset: figures of all runs}. combine: function that combines the figures of a preset's runs to one
+    number, such as the median.
     """
     return {name: _combined([run[label] for run in runs], combine) for name, runs in figures.items()}
 

@@ -1,1 +1,1 @@
-"""Rigid-body dynamics with a common protocol (Pinocchio, regressor, trained models), and kinematics of the tip."""
+"""Dynamics of arms with a common interface (Pinocchio, regressor, trained models), and kinematics of the tip."""

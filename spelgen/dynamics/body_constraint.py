@@ -1,4 +1,4 @@
-"""Joint positions of all bodies as a linear function of the coordinates of an arm, computed without Pinocchio."""
+"""Joint positions of all bodies, mimic joints included, as a linear function of the coordinates q of an arm."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from spelgen.dynamics.constraint import Constraint
 
 
 def body_constraint(arm: Chain) -> Constraint:
-    """Return the constraint that gives the joint positions of all bodies, including mimic joints, from q (n,)."""
+    """Return the linear function of q, (n,), whose values are the joint positions of all bodies, (bodies,) [rad, m]."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)

@@ -1,7 +1,7 @@
-"""Conversions of inertial parameters, the regressor of the joint torques, and base parameters.
+"""Conversions of inertial parameters, the regressor of the joint torques, and numerical base parameters.
 
-`base_combinations` computes base parameters of bodies and armatures numerically. Their inertial parts (without
-armatures) are equal to the exact base parameters of `structure.base_parameters`.
+`base_combinations` computes base parameters of bodies and armatures numerically. Without armatures, the base parameters
+are equal to the exact base parameters of `structure.base_parameters`.
 """
 
 import numpy as np
@@ -15,30 +15,36 @@ from spelgen.runtime.port_hamiltonian import applied
 
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the mass, the centre of mass and the inertia (3, 3) about the centre of mass, in the joint's frame."""
+    """Return mass [kg], centre of mass (3,) [m], and inertia (3, 3) [kg m^2] about the centre of mass, of a body.
+
+    inertia: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz), (10,), about the origin of the joint frame. The results are in the
+    joint frame, too.
+    """
     mass = inertia[0]
     center = inertia[1:4] / mass
     xx, xy, xz, yy, yz, zz = inertia[4:]
     about_joint = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # Parallel-axis theorem: the inertia about the joint's origin exceeds the inertia about the centre by mass * shift.
+    # `mass * shift` is the inertia about the origin minus the inertia about the centre of mass (parallel-axis theorem).
     shift = center @ center * np.eye(3) - np.outer(center, center)
     return mass, center, about_joint - mass * shift
 
 
 def quaternion(rotation: object) -> np.ndarray:
-    """Return the unit quaternion (w, x, y, z) with w >= 0 of a rotation matrix (3, 3)."""
+    """Return the unit quaternion (w, x, y, z), with w >= 0, of a rotation matrix, (3, 3)."""
     matrix = np.array(rotation, dtype=float)
     # SciPy returns quaternions in the order (x, y, z, w); `np.roll` moves w to the front.
     result: np.ndarray = np.roll(Rotation.from_matrix(matrix).as_quat(canonical=True), 1)
-    result[np.abs(result) < 1e-16] = 0.0  # Smaller elements are rounding errors.
+    result[np.abs(result) < 1e-16] = 0.0  # Elements of a quaternion below 1e-16 are rounding errors.
     return result
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
     """Return the pseudo-inertia [[tr(I)/2 1 - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (..., 10).
 
-    The parameters are mass m, first moment m c, and inertia I about the origin. The pseudo-inertia is positive definite
-    if and only if they are physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+    It is positive definite if and only if the inertial parameters are physically consistent (Wensing, Kim and Slotine,
+    IEEE RA-L 3:60, 2018).
+
+    ten: mass m, first moment m c, and inertia I (xx, xy, xz, yy, yz, zz) about the origin [kg, kg m, kg m^2].
     """
     m, x, y, z, xx, xy, xz, yy, yz, zz = ten.unbind(dim=-1)
     half = (xx + yy + zz) / 2
@@ -47,15 +53,18 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
 
 
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the regressor Y of B bodies, (..., n, 10 B): the joint torques [Nm, N] are Y @ inertial parameters.
+    """Return the regressor Y of B bodies, (..., n, 10 B): the joint torques are Y @ inertial parameters [Nm, N].
+
+    Column 10 b + i belongs to parameter i of body b: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) about the joint frame's
+    origin. Y has no columns for armature and friction.
 
     Args:
-        chain: kinematics of the bodies.
+        chain: kinematics of the bodies, with gravity.
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
     # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4), with T' the time
-    # derivative of its homogeneous transform T. `forward` returns T times four given points; the columns of the
+    # derivative of its homogeneous transform T. `chain.forward` returns T times four given points; the columns of the
     # identity as points give T itself.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
@@ -67,57 +76,64 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return the regressor Y, (T, n, 10 B), for arrays q, qd, qdd (T, n); see ``regressor_of``."""
-    # Filters return arrays with negative strides, which torch does not accept: copy them.
+    """Return ``regressor_of`` for NumPy arrays q, qd, qdd (T, n): the regressor Y of B bodies, (T, n, 10 B)."""
+    # The arrays are copied, since filters return arrays with negative strides, which torch does not accept.
     states = [torch.from_numpy(np.array(x, dtype=float)) for x in (q, qd, qdd)]
     with torch.no_grad():
         return np.asarray(regressor_of(chain, *states))
 
 
 def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the derivative of joint torques with respect to the inertial parameters and armatures.
+    """Return the regressor of inertial parameters and armatures: the derivative of the joint torques.
 
     Args:
         chain: kinematics of B bodies.
-        motors: matrix C, (n, n): the velocities of the drives are C qd.
+        motors: matrix C, (n, n): the velocities of the drives, whose rotors have the armatures, are C qd.
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (T, n).
 
     Returns:
-        Derivative (T, n, 10 B + n): columns of the inertial parameters, then of the armatures.
+        (T, n, 10 B + n): columns of the inertial parameters, then of the armatures.
     """
     rotors = (qdd @ motors.mT).unsqueeze(-2) * motors.mT
     return torch.cat([regressor_of(chain, q, qd, qdd), rotors], dim=-1)
 
 
 def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...], Tensor]:
-    """Return the names of the r base parameters, and their coefficients (r, 10 B + n); see `constants_regressor`.
+    """Return the r base parameters of an arm: their names, and their coefficients, (r, 10 B + n).
 
-    The regressor is evaluated at random states. The parameter of a column that depends linearly on the preceding
-    columns is regrouped into their parameters (Gautier and Khalil, IEEE T-RA 6:368, 1990). Torque offsets count as
-    parameters, too: gravity along a prismatic joint is constant.
+    A base parameter is its row of coefficients times the inertial parameters of B bodies and the n armatures, in the
+    order of `constants_regressor`. That regressor is evaluated at random states. The parameter of a column that depends
+    linearly on the preceding columns is regrouped into the parameters of those columns (Gautier and Khalil, IEEE T-RA
+    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter; torque offsets count, since
+    gravity along a prismatic joint is constant.
+
+    Args:
+        chain: kinematics of B bodies.
+        motors: matrix C, (n, n): the velocities of the drives are C qd.
     """
     n, inertial = len(motors), 10 * len(chain.parents)
-    # The last parameters in BASE_ORDER (Iyy, hz, m) are regrouped into the others if possible. The result then has the
-    # conventional base parameters.
+    # A column can only be regrouped into preceding ones. The parameters that are regrouped by convention (Iyy, hz, m)
+    # are therefore last in BASE_ORDER, and the result has the conventional base parameters.
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
     order += range(inertial, inertial + 2 * n)
-    # There are twice as many equations as parameters, so that the samples do not limit the rank.
+    # The random states give twice as many equations as parameters, so that they do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
-    # The array is copied, since results on memory of NumPy depend in the last digit on its alignment.
+    # The random states are copied, since results on memory of NumPy depend in the last digit on its alignment.
     motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion)
     columns = torch.cat([columns, motors.mT.expand(len(columns), n, n)], dim=-1).flatten(0, 1)
     # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
-    # A column is linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8 times
-    # the column. Rounding errors are smaller than this.
+    # A column is regarded as linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8
+    # times the column. Rounding errors are smaller than 1e-8.
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
-    # The default driver, gelsy, differs in the last digit from call to call. The columns have full rank, as gels needs.
+    # The results of lstsq's default driver, gelsy, differ in the last digit from call to call. The driver gels needs
+    # columns of full rank, which base parameters have.
     combination = torch.linalg.lstsq(columns[:, base], columns, driver="gels").solution
-    # Coefficients below the threshold are rounding errors.
+    # Coefficients of base parameters below 1e-9 are rounding errors.
     combination[combination.abs() < 1e-9] = 0.0
     labels = [*map(parameter_name, range(inertial)), *(f"armature{joint + 1}" for joint in range(n))]
     names = []

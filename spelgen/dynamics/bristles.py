@@ -1,4 +1,4 @@
-"""The friction state z along a measured path: deflections of the bristles at every sample, in one pass."""
+"""Friction state z along measured positions: deflections of Maxwell-slip bristles at every sample."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,14 +14,16 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class BristleReach:
-    """Break-away displacements of the K bristles of each of n drives.
+    """Break-away displacements of K bristles for each of n drives, from which a friction state is computed.
+
+    A bristle is a Maxwell-slip element: elastic up to its break-away displacement, sliding beyond it.
 
     Attributes:
-        values: (n, K) [rad, m]; K is 0 without bristles.
+        values: break-away displacements, (n, K) [rad, m]; K is 0 without bristles.
         motors: matrix C, (n, n): the velocities of the drives are C qd (see ``Actuation.motor_speeds``); None: each
             drive moves its own joint.
-        smoothing_velocity: width of the smooth sign of velocity for dry friction without bristles, (n,) [rad/s, m/s];
-            None: unknown.
+        smoothing_velocity: velocity at which the smooth sign of velocity, which replaces bristles at drives without
+            bristles, is 0.7, (n,) [rad/s, m/s]; None: unknown.
     """
 
     values: np.ndarray
@@ -35,41 +37,43 @@ class BristleReach:
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the typical break-away displacements of n joints, (n, K) for K bristles.
+    """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
 
-    kinds: type of each joint (revolute or prismatic). motors: see `BristleReach`.
+    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C of `BristleReach`.
     """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Return the break-away displacements of a model; K is 0 for a model without bristles."""
+    """Return the break-away displacements of a trained model; there are K = 0 bristles in a model without bristles."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
     tensors = (model.friction.reach, motors_of(model), width)
-    # The arrays are NumPy arrays in double precision, as measured positions are, also for a model on a GPU.
+    # The model's tensors are converted to NumPy arrays in double precision, the type of measured positions.
     arrays = [x.detach().cpu().double().numpy() for x in tensors]
     return BristleReach(*arrays)
 
 
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
-    """Return the exact deflections, (..., n, K), of K bristles per drive after a monotonic displacement of the drives.
+    """Return the deflections of K bristles per drive after a displacement of the drives, (..., n, K) [rad, m].
+
+    The result is exact if the displacement has no reversals. Dimensions may have another order, if they broadcast.
 
     Args:
-        z: (..., n, K) deflections of the bristles [rad, m].
-        displacement: (..., n, 1) displacement of the drives [rad, m].
-        reach: (n, K) break-away displacements [rad, m].
+        z: deflections before the displacement, (..., n, K) [rad, m].
+        displacement: displacement of the drives, (..., n, 1) [rad, m].
+        reach: break-away displacements, (n, K) [rad, m].
     """
     return (z + displacement).clamp(-reach, reach)
 
 
 def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
-    """Return the friction state z, (T, n, K) [rad, m], along positions q (T, n) [rad, m]; z[0] is zero.
+    """Return the friction state z, (T, n, K) [rad, m], along measured joint positions q, (T, n) [rad, m].
 
-    K is the number of bristles per drive. Encoder jitter is first removed from q, the measured positions. After a
-    reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is over
-    reversals, not over samples.
+    z has the deflections of K bristles per drive, and is zero at the first sample. Encoder jitter is first removed from
+    q. After a reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is
+    over reversals, not over samples.
     """
     path = encoded(q)
     if bristles.motors is not None:
@@ -77,7 +81,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     z = np.empty((*q.shape, bristles.elements))
     for drive, (positions, reach) in enumerate(zip(path.T, bristles.values, strict=True)):
         steps = np.diff(positions)
-        # A drive at rest keeps the direction of its last motion.
+        # Samples of a drive at rest are ignored: a reversal is a change of sign between two steps that are not zero.
         moving = np.flatnonzero(steps)
         signs = np.sign(steps[moving])
         reversals = moving[1:][signs[1:] * signs[:-1] < 0]
@@ -93,28 +97,28 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 
 
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
-    """Return the smooth sign of the velocity of each drive, (T, n); qd: joint velocities, (T, n).
+    """Return the smooth sign of the velocity of each drive, (T, n), at joint velocities qd, (T, n) [rad/s, m/s].
 
-    It is the factor, from -1 to 1, of dry friction of a drive without bristles. None if the smoothing velocity is
-    unknown.
+    The dry friction of a drive without bristles has this factor, from -1 to 1. Return None if the smoothing velocity
+    is unknown.
     """
     if bristles.smoothing_velocity is None:
         return None
-    # The formula must be equal to the smooth sign in `runtime.friction_laws`, which the trained model uses.
+    # The smooth sign must be equal to the smooth sign of `runtime.friction_laws`, which the trained model uses.
     speed = qd if bristles.motors is None else qd @ bristles.motors.T
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
 
 def encoded(q: np.ndarray) -> np.ndarray:
-    """Return the path (T, n) [rad, m] without encoder jitter.
+    """Return the measured positions q, (T, n) [rad, m], without encoder jitter.
 
-    q: measured path, (T, n). The result changes only if q would differ from it by more than one encoder step, as behind
-    a gear with backlash.
+    Jitter between two adjacent encoder steps would be a reversal of the drive at each sample. The result is constant
+    until q differs from it by more than one encoder step, like the output of a gear with backlash.
     """
     step = encoder_step(q)
     if not step.any():
         return q
-    # Backlash: out[k] = clip(out[k-1], low[k], high[k]), with low and high one encoder step from the input.
+    # Backlash: out[k] = clip(out[k-1], low[k], high[k]), with low and high one encoder step below and above q[k].
     # Compositions of clips are clips, so a parallel scan needs log2(T) passes instead of T sequential steps.
     low, high = q - step, q + step
     shift = 1
@@ -127,7 +131,10 @@ def encoded(q: np.ndarray) -> np.ndarray:
 
 
 def encoder_step(q: np.ndarray) -> np.ndarray:
-    """Return the encoder step (n,) [rad, m] of positions (T, n); 0 for a joint whose positions are not quantised."""
+    """Return the encoder step of each joint, (n,) [rad, m]; 0 for a joint whose positions are not quantised.
+
+    q: measured positions, (T, n) [rad, m].
+    """
     steps = np.zeros(q.shape[1])
     for joint, values in enumerate(q.T):
         # Positions of an encoder repeat exactly. A joint is regarded as quantised if each value occurs more than four

@@ -1,4 +1,4 @@
-"""Equations of motion M qdd = force at given positions, and one step of their integration."""
+"""Equations of motion M qdd = force at given positions for rollouts, and a step of the Runge-Kutta method."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,10 +17,12 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False)
 class MotionEquations:
-    """Equations of motion of W rollouts at fixed positions (W, n).
+    """Equations of motion of W rollouts at fixed positions q, (W, n), for several evaluations of the torques.
+
+    Velocities qd and inputs tau are (W, n); z is the friction state of K bristles per joint, (W, n, K), or None.
 
     Attributes:
-        mass: mass matrix M, (W, n, n).
+        mass: mass matrix M(q), (W, n, n).
         force: function of (qd, tau, z) that returns M qdd, (W, n) [Nm, N].
         friction: function of (qd, z) that returns the friction torque, (W, n) [Nm, N].
     """
@@ -35,54 +37,54 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics that provide their own `equations_at`, which needs fewer operations than the general equations."""
+    """Dynamics with a method `equations_at`, which needs fewer operations than equations from forward dynamics."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""
 
 
 def equations_of(dynamics: object) -> EquationsAt:
-    """Return a function of q (W, n) that returns the equations of motion of W rollouts at q.
+    """Return a function of positions q, (W, n), that returns the equations of motion of W rollouts at q.
 
-    The function uses cached values of the parameters: it is valid until a parameter changes.
+    The function uses the parameter cache of ``dynamics``: it is valid until a parameter changes.
     """
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
-    return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_any, dynamics)
+    return dynamics.equations_at if isinstance(dynamics, OwnEquations) else partial(_of_dynamics, dynamics)
 
 
 def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEquations:
-    """Return the equations of motion of W rollouts of a port-Hamiltonian model at q (W, n).
+    """Return the equations of motion of W rollouts of a port-Hamiltonian model at positions q, (W, n).
 
-    prepared: parameter cache of the model.
+    prepared: parameter cache, from ``model.prepare()``.
     """
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
 
 
-def _of_any(dynamics: Any, q: Tensor) -> MotionEquations:
-    """Return the equations of motion of W rollouts at q (W, n) for dynamics of any other class.
+def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
+    """Return the equations of motion of W rollouts at positions q, (W, n), for any ``RigidDynamics``.
 
-    The force M qdd is computed from the forward dynamics.
+    The force M qdd is computed from the forward dynamics, since ``RigidDynamics`` has no method that returns it.
     """
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N]."""
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N]."""
-        # `RigidDynamics` has no method that returns M qdd, so the acceleration qdd is multiplied by M.
+        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
+        # `RigidDynamics` has no method that returns the force M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
 
@@ -102,20 +104,21 @@ def runge_kutta(
     Hairer et al., Solving ODEs I, II.1.
 
     Args:
+        dynamics: dynamics whose bristles are displaced; without bristles, z is returned unchanged.
         rhs: function of (q, p, z) that returns dq/dt and dp/dt.
         q: positions, (..., n) [rad, m].
         p: momenta or velocities, (..., n).
         z: friction state of K bristles per joint, (..., n, K); it is not integrated, but computed from the displacement
             of the joints.
-        step: duration [s].
+        step: duration of the step [s].
     """
 
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
-    # For each stage, its time as a fraction of the step, and its weight in the mean.
+    # For each stage of the Runge-Kutta method: its time as a fraction of the step, and its weight in the mean rate.
     for fraction, weight in ((0.0, 1), (0.5, 2), (0.5, 2), (1.0, 1)):
         stage = fraction * step
-        # z is the friction state at the start of the step; `memory_after` adds the displacement since then.
+        # z is the friction state at the start of the step; `memory_after` adds the displacement up to the stage.
         qd, pd = rhs(q + stage * qd, p + stage * pd, memory_after(dynamics, z, stage * qd))
         if fraction == 0:
             qd1 = qd
@@ -125,24 +128,26 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return the factor t = 1, (...), for mass matrices M, (..., n, n): an indefinite M is not corrected.
+    """Return the factor t = 1, (...), for mass matrices M, (..., n, n).
 
-    The function replaces ``DerivedMass.fraction``, which returns t < 1 for an indefinite M.
+    ``mass_as_learned`` puts this function in place of ``DerivedMass.fraction``, which returns t < 1 for an indefinite
+    M: M is then not corrected to be positive definite.
     """
     return mass.new_ones(mass.shape[:-2])
 
 
 @contextmanager
 def mass_as_learned(model: nn.Module) -> Iterator[None]:
-    """Context manager that switches off the correction of an indefinite M by ``DerivedMass``.
+    """Context manager in which ``DerivedMass`` does not correct an indefinite mass matrix M of the model.
 
-    Models with other mass matrices are unchanged.
+    Fits that do not invert M use it: with the correction, gradient descent would stop at the boundary of the positive
+    definite matrices. Models with other mass matrices are unchanged.
     """
     mass = model.mass if isinstance(model, NetworkDynamics) else None
     if not isinstance(mass, DerivedMass):
         yield
         return
-    # An attribute of the instance hides the method of its class, so that only this model is changed.
+    # The attribute `fraction` of the instance hides the method of `DerivedMass`, so that only this model is changed.
     vars(mass)["fraction"] = unbounded
     try:
         yield

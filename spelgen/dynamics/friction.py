@@ -1,4 +1,4 @@
-"""Friction of drives: a model with constant coefficients, and regressor columns for the fit of coefficients."""
+"""Friction of drives with constant coefficients: its torque, and its regressor for the fit of coefficients."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -23,12 +23,13 @@ class DampedJoint(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DriveFriction:
-    """Friction of n drives; arrays are (n,), in Nm and rad/s, or N and m/s for prismatic joints.
+    """Viscous friction and Coulomb friction of n drives, with different Coulomb torques for both directions.
 
     Attributes:
-        forward: Coulomb torque for velocities > 0, not negative.
-        backward: Coulomb torque for velocities < 0, not positive.
-        smoothing_velocity: width of the tanh that replaces the sign of the velocity.
+        viscous: viscous coefficients, (n,) [Nm s/rad, N s/m].
+        forward: Coulomb torques for velocities > 0, not negative, (n,) [Nm, N].
+        backward: Coulomb torques for velocities < 0, not positive, (n,) [Nm, N].
+        smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s].
         speeds: matrix C, (n, n): the velocities of the drives are C qd (see `motor_speeds`); None: each drive moves its
             own joint.
     """
@@ -40,7 +41,7 @@ class DriveFriction:
     speeds: np.ndarray | None = None
 
     def __call__(self, qd: np.ndarray) -> np.ndarray:
-        """Return the joint friction torque, (..., n) [Nm, N], at joint velocities qd (..., n).
+        """Return the friction torque of the joints, (..., n) [Nm, N], at joint velocities qd, (..., n) [rad/s, m/s].
 
         The torque is C^T times the torque of the drives, which depends on their velocities v = C qd:
 
@@ -53,10 +54,12 @@ class DriveFriction:
         return self.torque(qd, np.tanh(v / self.smoothing_velocity))
 
     def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the joint friction torque (..., n) [Nm, N] at joint velocities qd (..., n).
+        """Return the friction torque of the joints, (..., n) [Nm, N], with a given factor of dry friction.
 
-        direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity) with
-        the velocity v of the drive, or a function of the friction state.
+        Args:
+            qd: joint velocities, (..., n) [rad/s, m/s].
+            direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity)
+                with the velocity v of the drive, or a function of the friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.
@@ -71,15 +74,15 @@ def joint_friction(
     smoothing_velocity: float,
     speeds: np.ndarray | None,
 ) -> DriveFriction:
-    """Return the friction of joints: from ``drives`` for joints in it, from <dynamics> of the URDF for the others.
+    """Return the friction of joints, from the settings of their drives or from the URDF.
 
     Args:
         joints: joints of a URDF, or coordinates of an arm.
-        drives: {name of a joint: settings of its drive}.
+        drives: {name of a joint: settings of its drive}; for other joints, <dynamics> of the URDF is used.
         smoothing_velocity, speeds: see ``DriveFriction``.
     """
-    # Settings replace the whole <dynamics> element: both describe the same losses, so adding them would count
-    # the losses twice.
+    # Settings of a drive replace the whole <dynamics> element of the URDF: both describe the same losses, so adding
+    # them would count the losses twice.
     losses = []
     for joint in joints:
         if joint.name in drives:
@@ -99,16 +102,16 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 
 @dataclass(frozen=True)
 class FrictionModel:
-    """Friction of drives that is linear in its coefficients: columns of the regressor.
+    """Torques of drives that are linear in coefficients, as columns of the regressor of a least-squares fit.
 
-    The effects are armature, viscous and Coulomb friction, and torque offset; the following are optional.
+    Each effect is a torque per drive: armature, viscous and Coulomb friction, torque offset, and optional ones.
 
     Attributes:
-        stribeck: dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
-        polynomial: qd |qd| and qd^3.
-        memory: if True, Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with a
-            column per bristle; if False, on a tanh of the velocity, with the width coulomb_smoothing_velocity [rad/s,
-            m/s].
+        coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s].
+        stribeck: True: add dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
+        polynomial: True: add the effects qd |qd| and qd^3.
+        memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with an
+            effect per bristle. False: it depends on the tanh of the velocity.
     """
 
     coulomb_smoothing_velocity: float = 0.01
@@ -118,7 +121,7 @@ class FrictionModel:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of all effects, in the order of the columns."""
+        """Names of all effects, in the order of the regressor's columns."""
         names = ["armature", "viscous", *(BRISTLES if self.memory else ("coulomb",)), "offset"]
         if self.stribeck:
             names.append("stribeck")
@@ -133,12 +136,12 @@ class FrictionModel:
         bent: np.ndarray | None = None,
         motors: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the regressor of E effects, (T, n, E n): effect e of drive j is column e n + j.
+        """Return the regressor of E effects, (T, n, E n): column e n + j is effect e of drive j per unit coefficient.
 
         Args:
             qd, qdd: velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2] of the joints, (T, n).
-            bent: deflections of K bristles per drive, divided by the break-away displacements, (T, n, K); None:
-                unknown.
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (T, n, K). None, if
+                unknown: Coulomb friction of each bristle then depends on the tanh of the velocity.
             motors: matrix C, (n, n): the velocities of the drives are C qd; None: each drive moves its own joint.
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
@@ -150,9 +153,14 @@ class FrictionModel:
     def torque(
         self, constants: np.ndarray, qd: np.ndarray, bent: np.ndarray | None, motors: np.ndarray
     ) -> np.ndarray:
-        """Return the joint torque of all effects except for the armature, (..., n) [Nm, N].
+        """Return the joint torque of friction and offset: all effects except for the armature, (..., n) [Nm, N].
 
-        constants: coefficients of all effects, (effects, n). qd, bent, motors: see `columns`.
+        Args:
+            constants: coefficients of the E effects in `effects`, (E, n).
+            qd: joint velocities, (..., n) [rad/s, m/s].
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (..., n, K); None:
+                unknown.
+            motors: matrix C, (n, n): the velocities of the drives are C qd.
         """
         speed = qd @ motors.T
         torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
@@ -161,19 +169,23 @@ class FrictionModel:
         return torque
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
-        """Return the torque of each effect per unit of its coefficient, (..., effects, n), at the drives.
+        """Return the torque at the drives of each effect in `effects` per unit of its coefficient, (..., effects, n).
 
-        speed, rise: velocities and accelerations of the drives, (..., n). bent: see `columns`.
+        Args:
+            speed: velocities of the drives, (..., n) [rad/s, m/s].
+            rise: accelerations of the drives, (..., n) [rad/s^2, m/s^2].
+            bent: deflections of K bristles per drive, divided by the break-away displacements, (..., n, K); None:
+                unknown.
         """
         sign = np.tanh(speed / self.coulomb_smoothing_velocity)
         dry = [sign]
         if self.memory:
-            # If the friction state is unknown, the drive is assumed to have moved in the direction of its velocity for
-            # a long time.
+            # If the bristle deflections are unknown, the drive is assumed to have moved in the direction of its
+            # velocity for a long time.
             dry = [sign] * len(BRISTLES) if bent is None else list(np.moveaxis(bent, -1, 0))
         effects = [rise, speed, *dry, np.ones_like(speed)]
         if self.stribeck:
-            # The Stribeck effect falls to 1/e at 0.1 rad/s or m/s.
+            # The Stribeck effect is exp(-(v / 0.1)^2): it falls to 1/e at a velocity v of 0.1 rad/s or m/s.
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]

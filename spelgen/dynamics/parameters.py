@@ -1,7 +1,6 @@
-"""Functions of the trained parameters of a model.
+"""Trained parameters of a model: their groups, units and number; copies of a model without residual terms.
 
-They return groups, units and number of the parameters, a copy without residual terms, and the value of a function of
-the model at other parameters.
+`evaluate_with` evaluates a function of a model at given parameters.
 """
 
 import copy
@@ -21,13 +20,15 @@ from spelgen.runtime.residual_terms import ResidualDynamics
 
 @dataclass(frozen=True)
 class ParameterInfo:
-    """The group and the unit of a parameter.
+    """Group and unit of a trained parameter of a model. Fits select parameters by group.
 
-    kind: the group: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of friction), effects
-    (friction that varies with velocity), velocities, load_dependence, fractions (of bristles), torque_splines,
-    torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness, damping, dead_zone, delay, or network.
-    unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
-    parameters are the logarithm of this quantity divided by a nominal value.
+    Attributes:
+        kind: group of the parameter: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of
+            friction), effects (friction that varies with velocity), velocities, load_dependence, fractions (of
+            bristles), torque_splines, torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness,
+            damping, dead_zone, delay, or network.
+        unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
+            parameters are the logarithm of this quantity divided by a nominal value.
     """
 
     kind: str
@@ -39,9 +40,9 @@ NETWORK = ParameterInfo("network", "1")
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return {name of a parameter of a model: its group and unit}, including buffers that a fit may set.
+    """Return {name: group and unit} of the parameters of a model and of the buffers that a fit may set.
 
-    Such buffers are quantities that only some logs determine, for example the friction compensation of a drive.
+    These buffers are quantities that only some logs determine, for example the friction compensation of a drive.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
@@ -61,7 +62,7 @@ def parameter_count(model: nn.Module) -> int:
 
 
 def parameters_of_kind(model: nn.Module, *kinds: str) -> tuple[str, ...]:
-    """Return the names of the parameters of the given groups, in the order of the model."""
+    """Return the names of the parameters whose group is in ``kinds``, in the order of the model."""
     return tuple(name for name, info in parameter_table(model).items() if info.kind in kinds)
 
 
@@ -72,12 +73,15 @@ NamedTensors = Mapping[str, Tensor]
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of all parameters that belong to residual terms whose value is zero for all q."""
+    """Return the names of the parameters of idle residual terms, whose value is zero for all q.
+
+    An empty list for a model without residual terms.
+    """
     terms = residual_terms(model)
     if terms is None:
         return []
-    # Terms of single joints are zero if their parameters are zero. Networks have nonzero hidden layers, and `_is_idle`
-    # tests their last layer.
+    # Residual terms of single joints are zero if their parameters are zero. Networks have nonzero hidden layers, so
+    # `_is_idle` tests their last layer.
     idle = [name for name, weights in terms.named_parameters(recurse=False) if not weights.any()]
     for prefix, network in (("mass", terms.mass), ("potential", terms.potential)):
         if _is_idle(network):
@@ -86,7 +90,7 @@ def idle_residuals(model: object) -> list[str]:
 
 
 def used_parameter_count(model: nn.Module) -> int:
-    """Return the number of parameters of a model, without the parameters in `idle_residuals`."""
+    """Return the number of parameters of a model, without parameters of residual terms that are zero for all q."""
     idle = idle_residuals(model)
     return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 
@@ -104,7 +108,7 @@ def without_idle_residuals(model: Model) -> Model:
 
     The copy must not be trained, since the removed terms could become nonzero in a training.
     """
-    # Copy the model, since the caller may train it further.
+    # The terms are removed from a copy, since the caller may train the model further.
     reduced = copy.deepcopy(model)
     if isinstance(reduced, ResidualDynamics) and reduced.residuals is not None:
         terms = reduced.residuals
@@ -112,7 +116,7 @@ def without_idle_residuals(model: Model) -> Model:
             terms.mass = None
         if _is_idle(terms.potential):
             terms.potential = None
-        # If all residual terms are zero, the factor on friction is one, and its evaluation is removed, too.
+        # If all residual terms are zero, the friction factor is one, and its evaluation is removed, too.
         if not any(bool(weights.any()) for weights in terms.parameters()):
             reduced.residuals = None
     return reduced
@@ -122,12 +126,15 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
     """Return True if the output of a network is zero for all inputs, or if there is no network."""
     if not isinstance(network, MaskedMLP):
         return network is None
-    # Only the last layer counts: hidden layers start at random weights.
+    # The output is zero if the last layer is zero. Hidden layers are not tested: their initial weights are random.
     return not (network.weights[-1].any() or network.biases[-1].any())
 
 
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the torque (..., n) [Nm, N] of the residual terms of M and V at q, qd, qdd (..., n)."""
+    """Return the torque of the residual terms of M and V, (..., n) [Nm, N]; zeros for a model without them.
+
+    q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
+    """
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)
     terms = model.residuals
@@ -136,14 +143,14 @@ def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
 
 
 def friction_factor(model: object, q: Tensor) -> Tensor:
-    """Return the position-dependent factor by which the residual terms multiply friction, (..., n), at q (..., n)."""
+    """Return the factor by which residual terms multiply the friction of each joint at positions q, (..., n)."""
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.ones_like(q)
     return model.residuals.at(q, model.prepare().residual).friction
 
 
 class _Caller(nn.Module):
-    """Module that calls a function of its model, since `functional_call` only calls modules."""
+    """Module that calls a given function with its model as argument, since `functional_call` can only call modules."""
 
     def __init__(self, model: nn.Module) -> None:
         super().__init__()
@@ -155,11 +162,12 @@ class _Caller(nn.Module):
 
 
 def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Model], Result]) -> Result:
-    """Return function(model), evaluated with the given parameters in place of the model's own values.
+    """Return function(model) at the given parameters, without changing the model.
 
-    The result is differentiable with respect to the given parameters. Parameters that are not given keep their values.
+    The result is differentiable with respect to the given parameters. Parameters that are not given have the values of
+    the model.
     """
     named = {f"model.{name}": tensor for name, tensor in parameters.items()}
-    # Models have no tied weights, and the search for them takes longer than most of the functions.
+    # tie_weights is off: models have no tied weights, and the search for them takes longer than most functions.
     result: Result = functional_call(_Caller(model), named, (function,), tie_weights=False)
     return result

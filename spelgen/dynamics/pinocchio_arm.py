@@ -1,4 +1,4 @@
-"""Rigid-body dynamics of an arm by Pinocchio, with the rotor inertia from the settings file of the URDF."""
+"""Pinocchio model of a derived arm (its bodies, not its URDF file), with rotor inertia from the settings file."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,15 +18,16 @@ def arm_dynamics(
 ) -> PinocchioDynamics:
     """Return the dynamics of the arm with joint torques as inputs. Raises ArmError if a body has no <inertial>.
 
-    friction: function of qd, (..., n) [rad/s, m/s], that returns the friction torque, (..., n) [Nm, N].
+    friction: function of qd, (..., n) [rad/s, m/s], that returns the friction torque, (..., n) [Nm, N]; None: no
+    friction.
     """
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
 
 
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
-    """Return ``kinematic_model`` with the inertia of each body.
+    """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
 
-    The rotor inertia on the joint side is the armature of the model. Raises ArmError if a body has no <inertial>.
+    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>.
     """
     error = partial(
         ArmError,
@@ -46,9 +47,9 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
 
 
 def kinematic_model(arm: Chain) -> pin.Model:
-    """Return a Pinocchio model with one joint per body of the arm, in the same order, and zero inertia.
+    """Return a Pinocchio model with one joint per body of the arm, in the same order, without inertia.
 
-    A joint rotates about or translates along the z axis of its frame.
+    It is sufficient for kinematics. A joint rotates about or translates along the z axis of its frame.
     """
     model = pin.Model()
     model.name = arm.name
@@ -63,6 +64,6 @@ def kinematic_model(arm: Chain) -> pin.Model:
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:
     mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
-    if mass == 0.0:  # `FromDynamicParameters` would divide by zero.
+    if mass == 0.0:  # `FromDynamicParameters` divides by the mass.
         return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
     return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

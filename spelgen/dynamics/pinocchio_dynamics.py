@@ -2,8 +2,9 @@
 
     M(q) qdd + h(q, qd) + friction(qd) = G tau        with  M = K^T M_joints(K q + offset) K
 
-K maps the coordinates q to all joints of the model (see `constraint`). K is constant, so it adds no velocity terms. It
-is a permutation unless there are mimic or locked joints. G is the input matrix.
+M_joints is Pinocchio's mass matrix of all joints, h the Coriolis, centrifugal and gravity torque, G the input matrix. K
+maps the coordinates q to the positions of all joints (see `constraint`). K is constant, so it adds no velocity terms.
+K is a permutation unless there are mimic or locked joints.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from spelgen.urdf.read import read_urdf
 
 
 def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
-    """Return a method of NumPy arrays (..., n) that also accepts tensors and broadcasts batch dimensions."""
+    """Decorate a method of NumPy arrays, (..., n), so that it accepts tensors, too, and broadcasts batch dimensions."""
 
     @wraps(method)
     def on_arrays(self: PinocchioDynamics, *states: Any) -> object:
@@ -36,7 +37,7 @@ def _takes_tensors(method: Callable[..., np.ndarray]) -> Callable[..., Any]:
         result = method(self, *np.broadcast_arrays(*map(np.asarray, states)))
         if isinstance(first, np.ndarray):
             return result
-        # `new_tensor` of the argument is used, because this file must be importable without torch.
+        # The result gets its type by `new_tensor` of an argument, because this file must be importable without torch.
         return first.new_tensor(result)
 
     return on_arrays
@@ -47,8 +48,9 @@ class PinocchioDynamics:
 
     Args:
         model: Pinocchio model of b joints, with the rotor inertia as armature.
-        constraint: mimic joints; joints of the model that it does not name are locked.
-        friction: function of the velocity (..., n) that returns the torque (..., n); None: no friction.
+        constraint: joint positions as a function of the coordinates (mimic joints); joints of the model that it does
+            not name are locked.
+        friction: function of the velocity (..., n) that returns the friction torque (..., n); None: no friction.
         inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
 
@@ -65,7 +67,7 @@ class PinocchioDynamics:
         order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
         self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
         self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
-        # Products with the identity would take longer than `aba` itself: they are skipped if K is the identity.
+        # Products with K would take longer than Pinocchio's `aba` itself: they are skipped if K is the identity.
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property
@@ -76,15 +78,15 @@ class PinocchioDynamics:
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
-        upper = np.triu(self._by_joint(pin.crba, self.configuration(q)))
-        # Pinocchio guarantees only the upper triangle of M.
+        upper = np.triu(self._batched(pin.crba, self.configuration(q)))
+        # Pinocchio guarantees only the upper triangle of M, which is copied to the lower one.
         joints = upper + np.triu(upper, 1).swapaxes(-1, -2)
         return np.asarray(self.jacobian.T @ joints @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Return Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
-        effects = self._by_joint(pin.nle, self.configuration(q), qd @ self.jacobian.T)
+        """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
+        effects = self._batched(pin.nle, self.configuration(q), qd @ self.jacobian.T)
         return effects @ self.jacobian
 
     @_takes_tensors
@@ -94,34 +96,34 @@ class PinocchioDynamics:
 
     @_takes_tensors
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N]."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n); q has no effect."""
         return self.friction(qd)
 
     @_takes_tensors
     def forward_dynamics(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
         force = tau @ self.inputs.T - self.friction(qd)
-        if self._same:  # The result is copied, because Pinocchio overwrites it in the next call.
-            return np.array(self._by_joint(pin.aba, self.configuration(q), qd, force))
-        # `aba` cannot solve the constrained equations K^T M K qdd = force, so M is computed.
+        if self._same:  # The result of `aba` is copied, because Pinocchio overwrites it in the next call.
+            return np.array(self._batched(pin.aba, self.configuration(q), qd, force))
+        # `aba` cannot solve the equations with mimic joints, K^T M_joints K qdd = force, so M is computed.
         force = force - self.nonlinear_effects(q, qd)
         return np.linalg.solve(self.mass_matrix(q), force[..., None])[..., 0]
 
     @_takes_tensors
     def inverse_dynamics(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the inputs tau, (..., n), for the accelerations qdd.
+        """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n).
 
         A passive joint has no input: its element is the torque that a motor at the joint would need.
         """
         speeds, rates = qd @ self.jacobian.T, qdd @ self.jacobian.T
-        torque = self._by_joint(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
+        torque = self._batched(pin.rnea, self.configuration(q), speeds, rates) @ self.jacobian
         torque = torque + self.friction(qd)
         # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.
         passive = np.diag(~self.inputs.any(axis=1))
         return np.linalg.solve(self.inputs + passive, torque[..., None])[..., 0]
 
     def configuration(self, q: np.ndarray) -> np.ndarray:
-        """Return the configuration vector of Pinocchio, (..., nq), at coordinates q (..., n)."""
+        """Return Pinocchio's configuration vector, (..., nq), at the coordinates q, (..., n) [rad, m]."""
         if not self._same:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
@@ -135,10 +137,10 @@ class PinocchioDynamics:
                 configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
         return configuration
 
-    def _by_joint(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
-        """Return the results of an algorithm of Pinocchio for each state of a batch.
+    def _batched(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
+        """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.
 
-        states: arguments of the algorithm, (..., nq) or (..., nv).
+        states: arguments of the algorithm after model and data, (..., nq) or (..., nv).
         """
         batch = states[0].shape[:-1]
         if not batch:
@@ -149,11 +151,16 @@ class PinocchioDynamics:
 
 
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
-    """Return the dynamics of the given joints of a URDF and of their mimic joints; all other joints are locked at zero.
+    """Return the dynamics of an arm as Pinocchio reads them from its URDF: a reference for spelgen's own parser.
 
-    The URDF defines inertials, damping and friction. The settings define gravity and the input matrix. drives: use the
-    rotors of the settings, and their friction, if any, in place of the friction of the URDF. Raises the errors of
-    Pinocchio if it cannot read the file.
+    The URDF defines inertials, damping and friction. The settings file defines gravity and the input matrix. Raises
+    the errors of Pinocchio if it cannot read the file.
+
+    Args:
+        urdf: path of the URDF.
+        joints: names of the coordinates; their mimic joints move, too, and all other joints are locked at zero.
+        drives: True: use the rotor inertias of the settings, and their friction, if any, in place of the friction of
+            the URDF.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     # Pinocchio parses the file itself, so the result is an independent reference for spelgen's own parser.
@@ -164,18 +171,18 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     if missing:
         raise ValueError(f"Pinocchio sees no joint {', '.join(missing)}")
     motors = derive_actuation(robot, settings, joints).drives()
-    # Friction of the URDF acts at the joints; friction of the settings acts at the motors.
+    # Friction of the URDF acts at the joints; friction of the settings acts at the motors, whose velocities are C qd.
     by_joint, speeds = (settings.joints, motors.speeds) if drives else ({}, None)
     for name in joints:
         if name in by_joint:
             model.armature[model.joints[model.getJointId(name)].idx_v] = by_joint[name].armature
     moving = [robot.joint[name] for name in joints]
-    # [rad/s, m/s] width of the tanh that replaces the sign of the velocity
+    # 0.05 rad/s or m/s is the width of the tanh that replaces the sign of the velocity in dry friction.
     friction = joint_friction(moving, by_joint, 0.05, speeds)
     return PinocchioDynamics(model, constraint, friction, motors.inputs)
 
 
 def drives_known(urdf: Path, joints: Sequence[str]) -> bool:
-    """Return True if the settings of a URDF specify the rotors or the friction of the given joints."""
+    """Return True if the settings file of a URDF specifies rotor inertia or friction of one of the given joints."""
     drives = load_settings(urdf).joints
     return any(x.rotor_inertia or x.viscous or any(x.coulomb) for k, x in drives.items() if k in joints)

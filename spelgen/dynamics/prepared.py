@@ -1,4 +1,7 @@
-"""A trained model for many calls: quantities that depend on the parameters only are computed once."""
+"""A trained model for many calls, as in control loops: its parameters are constant, and their cache is computed once.
+
+The methods return torques, accelerations, rollouts and linearizations.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class State(NamedTuple):
-    """State of an arm: q and qd, (..., n), and the friction state z, (..., n, K), of K bristles per joint."""
+    """State of an arm: positions q and velocities qd, (..., n), and friction state z, (..., n, K).
+
+    z has the deflections [rad, m] of K bristles per joint.
+    """
 
     q: Tensor
     qd: Tensor
@@ -27,13 +33,18 @@ class State(NamedTuple):
 
 
 class PreparedModel:
-    """A copy of a model with constant parameters.
+    """A copy of a trained model with constant parameters, for many calls of its dynamics.
 
-    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z is (...,
-    n, K); its default is the steady state of motion at the velocity qd.
+    Arguments q, qd, qdd and tau of the methods are (..., n), in rad and Nm, or m and N. The friction state z has the
+    deflections of K bristles per joint, (..., n, K); if it is omitted, it is the state after a long motion at qd.
+
+    Args:
+        model: trained model; residual terms that are zero are removed from the copy.
+        tip: kinematics of the tip, see ``tip_kinematics``.
+        dtype: type of the parameters and states.
 
     Attributes:
-        tip: kinematics of the tip, see ``tip_kinematics``.
+        n: number of joints.
         elements: number of bristles per joint, K.
         dtype: type of the parameters and states.
     """
@@ -41,7 +52,7 @@ class PreparedModel:
     def __init__(
         self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
-        # Networks whose output is zero would take most of the time: remove them.
+        # Residual networks whose output is zero would take most of the time: they are removed.
         reduced = without_idle_residuals(model)
         reduced.to(dtype=dtype).requires_grad_(False)
         self._model = reduced
@@ -62,23 +73,26 @@ class PreparedModel:
         return self._model.nonlinear_effects(self._at(q, qd), qd)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N]."""
+        """Return the friction torque, (..., n) [Nm, N]; z: friction state, (..., n, K) [rad, m]."""
         return self._model.friction_torque(self._at(q, qd), qd, *known_past(self._model, z))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time: zero at rest."""
+        """Return the friction state z, (..., n, K) [rad, m], after a long motion at qd, (..., n): zero at qd = 0."""
         return sliding_memory(self._model, qd)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        """Return the friction state after a displacement of the joints without reversals, (..., n, K) [rad, m].
+
+        z: friction state before it, (..., n, K) [rad, m]. displacement: (..., n) [rad, m].
+        """
         return memory_after(self._model, z, displacement)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the accelerations qdd, (..., n), under the input tau."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
         return self._model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self._model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the input tau, (..., n), that causes the accelerations qdd."""
+        """Return the inputs tau, (..., n), that cause the accelerations qdd, (..., n) [rad/s^2, m/s^2]."""
         return self._model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self._model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
@@ -86,7 +100,7 @@ class PreparedModel:
         return self._model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the rate dp/dt of the momenta, (..., n) [Nm, N], under the input tau, for a momentum observer."""
+        """Return dp/dt, (..., n) [Nm, N], of the momenta p = M(q) qd under the inputs tau, for momentum observers."""
         past = known_past(self._model, z)
         p = self.momentum(q, qd)
         return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
@@ -94,28 +108,43 @@ class PreparedModel:
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """Return q, qd and z after dt [s] under a constant input tau.
+        """Return the state (q, qd, z) after a time step under constant inputs.
 
-        Integration by ``substeps`` steps of the classical Runge-Kutta method. q, qd, tau: (..., n). z: friction state,
-        (..., n, K), by default ``memory(qd)``; it is not integrated, but computed from the displacement of the joints.
+        The classical Runge-Kutta method integrates q and qd. z is computed from the displacement of the joints.
+
+        Args:
+            q: positions, (..., n) [rad, m].
+            qd: velocities, (..., n) [rad/s, m/s].
+            tau: inputs, (..., n).
+            dt: duration of the time step [s].
+            z: friction state, (..., n, K) [rad, m], by default ``memory(qd)``.
+            substeps: number of Runge-Kutta steps.
         """
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return qd and qdd, (..., n) each."""
+            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
-            # The state has velocities, not momenta, since control loops measure velocities.
+            # The integrated state has velocities, not momenta, since control loops measure velocities.
             q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)
 
     def rollout(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
     ) -> State:
-        """Return q and qd, (steps + 1, ..., n), and z, (steps + 1, ..., n, K), from the initial state on.
+        """Return the trajectory under a sequence of inputs: q and qd, (steps + 1, ..., n), z, (steps + 1, ..., n, K).
 
-        tau: inputs, (steps, ..., n), each constant for dt [s]. substeps: Runge-Kutta steps for each input.
+        The first row is the initial state.
+
+        Args:
+            q: initial positions, (..., n) [rad, m].
+            qd: initial velocities, (..., n) [rad/s, m/s].
+            tau: inputs, (steps, ..., n), each constant for dt.
+            dt: duration of a time step [s].
+            z: initial friction state, (..., n, K) [rad, m], by default ``memory(qd)``.
+            substeps: number of Runge-Kutta steps per time step.
         """
         states = [State(q, qd, self.memory(qd) if z is None else z)]
         for held_tau in tau:
@@ -135,17 +164,18 @@ class PreparedModel:
     ) -> tuple[Tensor, Tensor]:
         """Return the linearization of the dynamics: A, (..., 2 n, 2 n), and B, (..., 2 n, n).
 
-        A is the derivative with respect to (q, qd), B with respect to tau. Without dt, they are derivatives of the rate
-        (qd, qdd) at constant z. With dt [s], they are derivatives of q and qd after ``step``.
+        A is the derivative with respect to the state (q, qd), B with respect to the inputs tau. Without dt, A and B are
+        derivatives of the rate (qd, qdd) at constant z (continuous time). With dt [s], A and B are derivatives of q and
+        qd after ``step`` (discrete time).
         """
         n = self.n
         z = self.memory(qd) if z is None else z
-        # torch.func cannot differentiate compiled functions: in this copy, forward dynamics is not compiled.
+        # torch.func cannot differentiate compiled functions: in the copy `plain`, forward dynamics is not compiled.
         plain = copy.copy(self)
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            """Return the rate of the state (q, qd), or the state after dt if dt is given, (2 n,)."""
+            """Return d/dt of the state (q, qd), (2 n,), at the inputs tau (n,); if dt is given, the state after dt."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])
@@ -158,18 +188,21 @@ class PreparedModel:
         return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
-        """Return the pose of the tip in the root frame, (..., 4, 4). Raises ValueError without a tip."""
+        """Return the pose of the tip in the frame of the root link, (..., 4, 4). Raises ValueError without a tip."""
         return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Return the Jacobian of the tip, (..., 6, n), linear velocity first. Raises ValueError without a tip."""
+        """Return the Jacobian of the tip in root axes, (..., 6, n), linear velocity first.
+
+        Raises ValueError without a tip.
+        """
         return self._kinematics().jacobian(q)
 
     def compile(self) -> PreparedModel:
         """Return a copy whose forward and inverse dynamics are compiled by ``torch.compile`` at their first calls."""
         result = copy.copy(self)
         for method in (self.forward_dynamics, self.inverse_dynamics):
-            # Assertions between the compiled kernels would take a tenth of the time: disable them.
+            # size_asserts=False disables assertions between compiled kernels, which would take a tenth of the time.
             compiled = torch.compile(method, fullgraph=True, options={"size_asserts": False})
             vars(result)[method.__name__] = compiled
         return result
@@ -177,7 +210,7 @@ class PreparedModel:
     def _at(self, q: Tensor, *others: Tensor) -> object:
         """Return the model's configuration cache at q, (..., n): the quantities that depend on q only.
 
-        others: further vectors (..., n), whose dtypes and shapes are checked.
+        others: other vectors of the call, such as qd and tau, (..., n), whose dtypes and shapes are checked.
         """
         return self._model.at(q, *others, prepared=self._weights)
 
@@ -188,11 +221,12 @@ class PreparedModel:
 
 
 def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` inputs.
+    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` arguments.
 
     Args:
-        function: function of the states without batch dimension, (n,) each, that returns a vector (m,).
-        states: (batch, n) each.
+        function: function of vectors, (n,) each, without batch dimension, that returns a vector, (m,).
+        variables: number of arguments with respect to which the function is differentiated.
+        states: all arguments of the function, (batch, n) each.
     """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
@@ -200,6 +234,6 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     # autograd is therefore enabled, and reverse mode is used.
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
-        # Tensors of inference mode cannot be differentiated, so the inputs are cloned.
+        # Tensors of inference mode cannot be differentiated, so the arguments are cloned.
         derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
     return derivatives

@@ -1,4 +1,7 @@
-"""The common interface of dynamics of an arm: trained models, Pinocchio, and bodies with least-squares parameters."""
+"""The common interface of an arm's dynamics: trained models, Pinocchio, and regressors with identified parameters.
+
+The functions of the friction state z accept dynamics with and without a friction state.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,11 @@ if TYPE_CHECKING:
 
 
 class RigidDynamics(Protocol):
-    """Dynamics M(q) qdd + h(q, qd) + friction(q, qd) = G tau of n joints; q, qd, qdd and tau are (..., n).
+    """Interface of dynamics of n joints: M(q) qdd + h(q, qd) + friction(q, qd) = G tau.
 
-    Units: rad and Nm for revolute joints, m and N for prismatic joints; M in kg m^2, kg m and kg.
+    M is the mass matrix, h the Coriolis, centrifugal and gravity torque, G the input matrix. Positions q, velocities
+    qd, accelerations qdd and inputs tau are (..., n), in rad and Nm for revolute joints, in m and N for prismatic
+    joints; M is in kg m^2, kg m and kg.
     """
 
     @property
@@ -31,7 +36,7 @@ class RigidDynamics(Protocol):
         """Return the gravity torque dV/dq, (..., n)."""
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return h, (..., n): Coriolis, centrifugal and gravity torques without friction."""
+        """Return h, (..., n): Coriolis, centrifugal and gravity torque, without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the friction torque, (..., n)."""
@@ -40,7 +45,7 @@ class RigidDynamics(Protocol):
         """Return the accelerations qdd, (..., n), under the inputs tau."""
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), for the accelerations qdd.
+        """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n).
 
         A passive joint has no input: its element is the torque that a motor at the joint would need.
         """
@@ -48,17 +53,20 @@ class RigidDynamics(Protocol):
 
 @runtime_checkable
 class FrictionState(Protocol):
-    """Dynamics with a friction state: the deflections z of bristles, (..., n, elements) [rad, m]."""
+    """Interface of dynamics with a friction state z: deflections of bristles, (..., n, elements) [rad, m]."""
 
     @property
     def elements(self) -> int:
         """Number of bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, elements), of joints that have moved at qd for a long time."""
+        """Return the friction state z, (..., n, elements), after a long motion at constant qd, (..., n)."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        """Return the friction state, (..., n, elements), after a displacement of the joints, (..., n) [rad, m].
+
+        z is the friction state before the displacement, which has no reversals.
+        """
 
 
 def residual_terms(model: object) -> ResidualTerms | None:
@@ -67,21 +75,25 @@ def residual_terms(model: object) -> ResidualTerms | None:
 
 
 def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
-    """Return True if friction depends on the deflections z of bristles (friction state)."""
-    if isinstance(dynamics, RigidBodyDynamics):  # isinstance of a protocol takes ten times as long
+    """Return True if friction of ``dynamics`` depends on a friction state: the deflections z of bristles."""
+    # The test of a class is first: isinstance of a protocol takes ten times as long.
+    if isinstance(dynamics, RigidBodyDynamics):
         return dynamics.elements > 0
     return isinstance(dynamics, FrictionState) and dynamics.elements > 0
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return the matrix C, (n, n): the motor velocities are C qd; the identity if each motor drives its own joint."""
+    """Return the matrix C, (n, n), for which C qd are the motor velocities of a trained model of rigid bodies.
+
+    C is the identity if each motor drives its own joint.
+    """
     return torch.eye(model.n).to(model.friction.nominal) if model.motors is None else model.motors
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
-    """Return the friction state z, (..., n, K), of joints that have moved at qd for a long time.
+    """Return the friction state z, (..., n, K) [rad, m], after a long motion at constant qd, (..., n) [rad/s, m/s].
 
-    K is the number of bristles per joint, 0 for friction without a state.
+    K is the number of bristles per joint, 0 for friction without a state: z is then empty.
     """
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
@@ -89,30 +101,42 @@ def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
 
 
 def memory_after(dynamics: object, z: Tensor, displacement: Tensor) -> Tensor:
-    """Return the friction state z after a monotonic displacement of the joints, (..., n) [rad, m]."""
+    """Return the friction state, (..., n, K) [rad, m], after a displacement of the joints, (..., n) [rad, m].
+
+    z is the friction state before the displacement, which has no reversals. An empty z (K = 0) is returned unchanged.
+    """
     if not z.shape[-1] or not is_stateful(dynamics):
         return z
     return dynamics.memory_after(z, displacement)
 
 
 def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-    """Return the friction state z, (W, K, n, elements), at K samples q and qd, (W, K, n), of W windows.
+    """Return the friction state at each sample of W windows (intervals of a log), (W, S, n, elements) [rad, m].
 
-    Between samples, q is interpolated linearly. z: initial state, (W, n, elements); None: the state of joints that have
-    moved at the first qd for a long time.
+    Between samples, q is interpolated linearly.
+
+    Args:
+        dynamics: dynamics with ``elements`` bristles per joint.
+        q: positions at S samples of each window, (W, S, n) [rad, m].
+        qd: velocities, (W, S, n) [rad/s, m/s]; only the first sample of a window is used.
+        z: friction state at the first samples, (W, n, elements) [rad, m]; None: the state after a long motion at the
+            first qd.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
-    # The state at a sample depends on the state at the previous sample, so samples cannot be a batch.
+    # The friction state at a sample depends on the state at the previous sample, so samples cannot be a batch.
     for moved in q.diff(dim=1).unbind(1):
         states.append(memory_after(dynamics, states[-1], moved))
     return torch.stack(states, dim=1)
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return (z, direction), (z,) or (): the arguments that describe past motion to the methods of `dynamics`.
+    """Return the optional arguments for friction of the methods of `dynamics`: (z, direction), (z,) or ().
+
+    A caller appends them to (q, qd, ...). They are empty if z is unknown or friction has no state.
 
     Args:
-        z: friction state of K bristles per joint, (..., n, K) [rad, m]; omitted if friction has no state.
+        dynamics: dynamics whose method is called.
+        z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
         direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
             needed only if tau was filtered: it must have passed the same filter.
     """
@@ -124,7 +148,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Adapter for rollouts of dynamics that provide no momenta p: the methods of p use qd in its place."""
+    """Adapter for rollouts of dynamics without momenta: its methods of momenta p use velocities qd in place of p."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
@@ -146,17 +170,17 @@ class VelocityState:
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:
-        """Return qd, (..., n): p is a velocity here."""
+        """Return p, (..., n), unchanged: it is the velocity qd in this class."""
         return p
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return qd and qdd, (..., n) each."""
+        """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; p is the velocity qd."""
         past = known_past(self.dynamics, z)
         return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """Return `dynamics` in a form for rollouts: unchanged if it has momenta, otherwise wrapped in `VelocityState`."""
+    """Return `dynamics` with the methods that rollouts call: unchanged for a model, else wrapped in `VelocityState`."""
     return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

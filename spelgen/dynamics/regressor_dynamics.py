@@ -1,4 +1,4 @@
-"""Regressor of an arm's bodies, and dynamics for inertial parameters that need not be physically consistent."""
+"""Regressor of an arm, and dynamics for given (identified) inertial parameters, also physically inconsistent ones."""
 
 from collections.abc import Callable
 from functools import partial
@@ -30,15 +30,20 @@ def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:
 
 
 def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-    """Return the regressor Y (T, n, 10 B) of the arm's B bodies at q, qd and qdd, each (T, n): tau = Y pi [Nm, N].
+    """Return the regressor Y, (T, n, 10 B), of the arm's B bodies: joint torques are Y @ inertial parameters [Nm, N].
 
     Column 10 b + i belongs to parameter i of ``arm.bodies[b]``, in the order of ``Body.inertia``.
+
+    q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (T, n).
     """
     return chain_regressor(body_chain(arm), q, qd, qdd)
 
 
 def urdf_parameters(arm: Chain) -> np.ndarray:
-    """Return the inertial parameters of the URDF, (10 B,); zero for a body without <inertial>."""
+    """Return the inertial parameters of the arm's B bodies from the URDF, (10 B,); zero for bodies without <inertial>.
+
+    Their order is the order of the columns of ``regressor``.
+    """
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
 
@@ -49,13 +54,14 @@ def _row(values: tuple[object, ...]) -> Row:
 class RegressorDynamics:
     """Dynamics of an arm of n coordinates and B bodies with given inertial parameters (see ``RigidDynamics``).
 
-    Friction depends on K bristles per drive.
+    Friction may have a state: the deflections of K bristles per drive.
 
     Args:
-        parameters: inertial parameters, (10 B,), in the order of ``regressor``.
+        arm: kinematics and gravity.
+        parameters: inertial parameters, (10 B,), in the order of the columns of ``regressor``.
         armature: armature of the drives, (n,) [kg m^2, kg].
-        friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns torques (T,
-            n) [Nm, N].
+        friction: function of velocities (T, n), and of the friction state z (T, n, K) or None, that returns the
+            friction torques of the joints, (T, n) [Nm, N].
         bristle_reach: break-away displacements, (n, K) [rad, m]; None: friction has no state.
         drives: matrices G of the inputs and C of the motors (see ``Drives``); None: each input is the torque of its
             joint.
@@ -89,7 +95,7 @@ class RegressorDynamics:
 
     @property
     def elements(self) -> int:
-        """Number of bristles per joint, K."""
+        """Number of bristles per drive, K."""
         return self.bristle_reach.shape[1]
 
     def mass_matrix(self, q: Tensor) -> Tensor:
@@ -101,29 +107,34 @@ class RegressorDynamics:
         return self.nonlinear_effects(q, torch.zeros_like(q))
 
     def nonlinear_effects(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return Coriolis, centrifugal and gravity torques, (..., n) [Nm, N]."""
+        """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
         chain, momenta = self._bodies(q)
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies at q, and the derivatives of their momenta with respect to qd.
+        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
 
-        The derivatives are (..., n, 12 B). The momentum of a body is T' J, 3 x 4 elements, with the time derivative T'
-        of its homogeneous transform and its pseudo-inertia J.
+        q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
+        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
+        pseudo-inertia J.
         """
-        # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in J, so that J may be physically inconsistent.
-        # `forward` returns T times four given points; the columns of the identity as points give T itself.
+        # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
+        # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as
+        # points give T itself.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the sum of friction torque and torque offset, (..., n) [Nm, N]."""
+        """Return the sum of friction torque and torque offset, (..., n) [Nm, N], at velocities qd, (..., n).
+
+        z: friction state, (..., n, K) [rad, m]; None: unknown. q has no effect.
+        """
         past = z.numpy() if z is not None and self.elements else None
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the accelerations qdd, (..., n), under the inputs tau (..., n)."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
         equations = self.equations_at(q)
         # `solve` broadcasts the batch dimensions of M and tau only if the force is a matrix with one column.
         force = equations.force(qd, tau, z).unsqueeze(-1)
@@ -131,7 +142,7 @@ class RegressorDynamics:
         return qdd.squeeze(-1)
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the inputs tau, (..., n), for the accelerations qdd.
+        """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n).
 
         A passive joint has no input: its element is the torque that a motor at the joint would need.
         """
@@ -141,30 +152,36 @@ class RegressorDynamics:
         return self.joint_torque(q, qd, qdd, z) @ inverse.mT
 
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the torques of all joints, passive ones included, for the accelerations qdd, (..., n) [Nm, N]."""
+        """Return the torques of all joints, passive ones included, (..., n) [Nm, N], that give the accelerations qdd.
+
+        z: friction state, (..., n, K) [rad, m]; None: unknown.
+        """
         equations = self.equations_at(q)
         return applied(equations.mass, qdd) - equations.force(qd, torch.zeros_like(qdd), z)
 
     def equations_at(self, q: Tensor) -> MotionEquations:
-        """Return the equations of motion at q, (T, n); see `equations.equations_of`."""
+        """Return the equations of motion M qdd = force at positions q, (T, n) [rad, m]."""
         chain, momenta = self._bodies(q)
 
         def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-            """Return the force M qdd, (T, n) [Nm, N]."""
+            """Return the force M qdd, (T, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
             bias = applied(momenta, self.chain.accelerations(chain, qd))
             return tau @ self.inputs.mT - bias - self.friction_torque(q, qd, z)
 
-        # Kinetic energy of the rotors: 1/2 (C qd)^T diag(armature) C qd.
+        # `rotors` is the contribution to M of the kinetic energy 1/2 (C qd)^T diag(armature) C qd of the rotors.
         rotors = self.motors.mT @ torch.diag(self.armature) @ self.motors
         mass = momenta @ chain.jacobian.mT @ self.chain.ratios + rotors
         return MotionEquations(mass, force, partial(self.friction_torque, q))
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K), of drives that have moved for a long time at velocities qd."""
+        """Return the friction state z, (..., n, K) [rad, m], after a long motion at joint velocities qd, (..., n)."""
         return (qd @ self.motors.mT.to(qd)).sign().unsqueeze(-1) * self.bristle_reach
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K), after a monotonic displacement of the joints, (..., n) [rad, m]."""
+        """Return the friction state, (..., n, K) [rad, m], after a displacement of the joints, (..., n) [rad, m].
+
+        z is the friction state before the displacement, which has no reversals.
+        """
         moved = displacement @ self.motors.mT.to(displacement)
         return moved_bristles(z, moved.unsqueeze(-1), self.bristle_reach)
 
@@ -172,13 +189,21 @@ class RegressorDynamics:
 def identified_dynamics(
     arm: Chain, friction: FrictionModel, parameters: np.ndarray, drives: Drives
 ) -> RegressorDynamics:
-    """Return the dynamics of an arm with these parameters (K,): bodies, then friction and rotor inertias."""
+    """Return the dynamics of an arm with the parameters that a least-squares identification has found.
+
+    Args:
+        arm: arm of B bodies and n coordinates.
+        friction: effects of friction and armature, E in all.
+        parameters: (10 B + E n,): inertial parameters, then the coefficients of each effect, in the order of
+            ``friction.effects``.
+        drives: input matrix (n, n), and matrix (n, n) from joint velocities to motor velocities.
+    """
     n, inertial = len(arm.coordinates), 10 * len(arm.bodies)
     constants = parameters[inertial:].reshape(-1, n)
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque (..., n) [Nm, N] for qd, (..., n), and friction states z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 

@@ -1,11 +1,12 @@
-"""Rollouts of arms with position servos under their commands.
+"""Rollouts of arms with position servos: positions under logged commands, by an implicit integration method.
 
-The springs of the servos and dry friction are stiff. Both are integrated implicitly, so that a few steps between
-samples are stable for any gain. Springs are linearised at the start of a step (Rosenbrock method with the weights of
-the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed for each step: decaying motion then has
-its true rate of decay to third order (exponential fitting; Liniger and Willoughby, SIAM J. Numerical Analysis 7:47,
-1970). Theta is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for the step.
-The friction state is not integrated, but computed from the displacement in the step.
+Servos act as springs, kp times the position error. These springs and dry friction are stiff. Both are integrated
+implicitly, so that a few steps between samples are stable for any kp. Springs are linearised at the start of a step
+(Rosenbrock method with the weights of the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed
+for each step: decaying motion then has its true rate of decay to third order (exponential fitting; Liniger and
+Willoughby, SIAM J. Numerical Analysis 7:47, 1970). Theta is 1/2 for slow motion, without numerical damping, and tends
+to 1 for motion that is too fast for the step. The friction state is not integrated, but computed from the displacement
+in the step.
 """
 
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 class ServoDrives(NamedTuple):
-    """Constants of the servos and of friction, (..., n).
+    """Constants of servos and friction of an arm, (..., n), in the layout that rollouts of this module use.
 
     Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
     """
@@ -30,12 +31,14 @@ class ServoDrives(NamedTuple):
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    # Bristle fraction / break-away displacement. Times dry friction, it is the stiffness of a bristle.
-    steepness: Tensor  # (K, ..., n) [1/rad, 1/m]
+    steepness: Tensor  # bristle stiffness / dry friction = fraction / break-away displacement, (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
-    """State of an arm: q and qd, (..., n), and the friction state z, (K, ..., n), of K bristles per joint."""
+    """State of an arm: positions q and velocities qd, (..., n), and friction state z, (K, ..., n) [rad, m].
+
+    z has the deflections of K bristles per joint.
+    """
 
     q: Tensor
     qd: Tensor
@@ -43,13 +46,14 @@ class ServoState(NamedTuple):
 
 
 class Load(NamedTuple):
-    """Inertia and torques of the rigid bodies that a step uses.
+    """Inertia and torques of the rigid bodies, which are constant during a step.
 
     Attributes:
         inertia: mass matrix M, (..., n, n), if ``coupled``; otherwise only its diagonal, (..., n), so that joints are
             independent.
-        bias: Coriolis, centrifugal and gravity torque, (..., n).
-        gravity: gravity torque, (..., n).
+        bias: Coriolis, centrifugal and gravity torque, (..., n) [Nm, N].
+        gravity: gravity torque, on which dry friction depends, (..., n) [Nm, N].
+        coupled: True if the inertia couples the joints.
     """
 
     inertia: Tensor
@@ -59,12 +63,12 @@ class Load(NamedTuple):
 
 
 def servo_drives(model: PortHamiltonian) -> ServoDrives:
-    """Return the constants of servos and friction of a model with servos."""
+    """Return the constants of servos and friction of a model whose inputs are commands of position servos."""
     assert isinstance(model, RigidBodyDynamics) and model.servo is not None
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # Batch dimensions of the constants, at least one.
+    # `batch`: batch dimensions of the friction constants, at least one.
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
@@ -72,10 +76,17 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return q, qd and the friction state with which the arm has no acceleration, as at rest or in steady motion.
+    """Return the initial state of a rollout: q, qd, and the friction state with which the acceleration is zero.
 
-    Dry friction balances all other torques, up to its largest magnitude. q, u: positions and commands, (..., n) [rad,
-    m]. qd: velocities, (..., n) [rad/s, m/s].
+    An arm at rest or in steady motion has this state: dry friction balances all other torques, up to its largest
+    magnitude.
+
+    Args:
+        drives: constants of servos and friction.
+        q: positions, (..., n) [rad, m].
+        qd: velocities, (..., n) [rad/s, m/s].
+        u: delayed commands, (..., n) [rad, m].
+        load: torques of the rigid bodies at q and qd.
     """
     servo = drives.servo
     torque = servo.kp * beyond(u - q, servo.dead_zone) - servo.kd * qd
@@ -86,7 +97,15 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
 
 
 def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
-    """Return the state one step ``h`` (..., 1) [s] later, under the delayed command u (..., n)."""
+    """Return the state after one implicit step (see the module's docstring).
+
+    Args:
+        drives: constants of servos and friction.
+        state: state at the start of the step.
+        u: delayed commands during the step, (..., n) [rad, m].
+        load: inertia and torques of the rigid bodies during the step.
+        h: duration of the step, (..., 1) [s].
+    """
     (q, qd, z), servo = state, drives.servo
     strength = drives.friction.dry(qd, load.gravity) * drives.steepness
     spring = servo.kp * beyond(u - q, servo.dead_zone)
@@ -103,17 +122,17 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
     decay = h * (damping + h * (servo_stiffness / 2 + stiffness)) / inertia
     theta = (3 + decay) / (6 + decay)
     # The springs of the servos are evaluated after the fraction theta of the step; the bristles, which are stiffer, at
-    # its end.
+    # the end of the step.
     part = theta * h
     impulse, bristle_stiffness = part * force, part * h * strength
     damping = part * (damping + part * servo_stiffness)
-    # The unknown is the mean velocity of the step, so displacements are divided by h.
+    # The unknown of the equation is the mean velocity of the step, so displacements are divided by the duration h.
     bent, reach = z / h, drives.reach / h
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The solution is
-        # found by fixed-point iteration; two iterations suffice.
+        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The mean velocity
+        # of the step is found by fixed-point iteration; two iterations suffice.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -127,43 +146,47 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 
 
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
-    """Return the displacement x, (..., n), that solves slope x + sum_k strength_k (z_k(x) - z_k) = push.
+    """Return the displacement x of each joint that balances a force against a spring and K bristles, (..., n).
 
-    z_k(x) is the deflection of bristle k after the displacement x. If k bristles slide, the equation is linear in x: of
+    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) is the deflection of bristle k after the
+    displacement x. For a given number of sliding bristles, 0 to K, the equation is linear in x. Of the solutions of
     these K + 1 linear equations, the one with the largest |x| is valid.
 
     Args:
         push: force on the joint, (..., n).
-        slope: stiffness without bristles, (..., n).
+        slope: stiffness of the spring, without bristles, (..., n).
         strength, z, reach: stiffness, initial deflection and break-away displacement of each bristle, (K, ..., n), the
             shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # Cumulative sums over k = 0 .. K sliding bristles: push minus the force of these bristles, and the stiffness of the
-    # spring and the bristles that do not slide.
+    # Cumulative sums over the number of sliding bristles, 0 to K. `remaining`: |push| minus the force of the sliding
+    # bristles. `resisting`: stiffness of the spring and of the bristles that do not slide.
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)
 
 
 def replayed(model: PortHamiltonian, q: Tensor, qd: Tensor, commands: Tensor, dt: Tensor) -> Tensor:
-    """Integrate W windows under their commands; return the positions (W, I, n) [rad, m] after each of I intervals.
+    """Integrate the motion of W windows (intervals of a log) under their commands; return positions, (W, I, n).
 
-    M and the gravity torque are evaluated once per interval.
+    A window has I sampling intervals, each of S integration steps. Positions are returned at the end of each sampling
+    interval [rad, m]. M and the gravity torque are evaluated once per sampling interval.
 
     Args:
-        q, qd: initial positions [rad, m] and velocities [rad/s, m/s], (W, n).
-        commands: delayed commands, (W, I, S, n) [rad, m], with S steps per interval.
-        dt: durations of the intervals, (W, I) [s].
+        model: model with position servos.
+        q, qd: initial positions [rad, m] and velocities [rad/s, m/s] of the windows, (W, n).
+        commands: delayed commands of each step, (W, I, S, n) [rad, m].
+        dt: durations of the sampling intervals, (W, I) [s].
     """
     with torch.no_grad():
         drives, prepared, positions = servo_drives(model), model.prepare(), []
         state, previous_bias = None, None
         for now, interval in zip(commands.unbind(1), dt.unbind(1), strict=True):
             pose = model.configuration(q, prepared)
-            # M and gravity change slowly, unlike springs and friction: they are evaluated once per interval.
+            # M and gravity are evaluated once per interval, since they change slowly, unlike springs and friction.
             bias = middle_bias = model.nonlinear_effects(pose, qd)
-            # The bias is known only up to the start of the interval: extrapolate it to the middle.
+            # The bias (Coriolis, centrifugal and gravity torque) is known up to the start of the interval, and is
+            # extrapolated to its middle.
             if previous_bias is not None:
                 middle_bias = bias + (bias - previous_bias) / 2
             previous_bias = bias

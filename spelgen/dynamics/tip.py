@@ -1,4 +1,4 @@
-"""Kinematics of the tip of an arm by pytorch-kinematics."""
+"""Pose and Jacobian of the tip of an arm, by pytorch-kinematics."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ if TYPE_CHECKING:
 
 
 class TipKinematics:
-    """Pose and Jacobian of a link in the frame of the root link, as functions of q (..., n) [rad, m].
+    """Pose and Jacobian of a link in the frame of the root link, as functions of q, (..., n) [rad, m].
 
-    Mimic joints are included; joints that are neither coordinates nor mimic joints are at zero. Angles of the URDF are
-    not rounded. Results have the dtype of q.
+    Mimic joints move with their coordinates; all other joints are at zero. Angles of the URDF are not rounded, unlike
+    the angles of a derived arm. Results have the dtype of q.
+
+    Args:
+        robot: the URDF.
+        joints: names of the coordinates, in the order of q.
+        link: name of the link.
     """
 
     def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
         self.link = link
         path = robot.path_to(link)
-        # A chain of pytorch-kinematics has a fixed dtype. There is one per dtype, so that results have the dtype of q.
+        # A chain of pytorch-kinematics has a fixed dtype. There is a chain per dtype: results have the dtype of q.
         self._chains = {
             dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
         }
@@ -36,15 +41,15 @@ class TipKinematics:
         # The positions of the moving joints on the path to the link are _jacobian q + _offset; (joints, n), (joints,).
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
-        # A joint that does not move the link is an error: it is probably a mistake of the caller.
+        # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
         missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
         if missing:
             raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
 
     def pose(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the homogeneous transform from the link to the root frame, (..., 4, 4)."""
+        """Return the pose of the link at q: the homogeneous transform from the link to the root frame, (..., 4, 4)."""
         poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(
-            self._rows(q), analytical_grad=False
+            self._positions(q), analytical_grad=False
         )[-1]
         return poses.reshape(*q.shape[:-1], 4, 4)
 
@@ -53,12 +58,14 @@ class TipKinematics:
         return self.pose(q)[..., :3, 3]
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the Jacobian, (..., 6, n), in root axes: linear [m/s], then angular velocity [rad/s] per qd."""
-        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(self._rows(q)) @ self._jacobian.to(q)
+        """Return the Jacobian of the link, (..., 6, n): its linear, then its angular velocity per qd, in root axes."""
+        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(
+            self._positions(q)
+        ) @ self._jacobian.to(q)
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
-    def _rows(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of the joints on the path from the root to the link, (states, joints) [rad, m]."""
+    def _positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the positions of the joints on the path to the link at q, (..., n): (states, joints) [rad, m]."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 
@@ -68,7 +75,7 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
     The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
     float32.
     """
-    import pytorch_kinematics as pk  # The import is here, because it imports matplotlib, which takes long.
+    import pytorch_kinematics as pk  # pytorch_kinematics is imported here: it imports matplotlib, which takes long.
     from pytorch_kinematics.frame import Frame, Joint, Link
 
     first = last = Frame(root, Link(root), Joint())
@@ -90,12 +97,15 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
 def tip_kinematics(
     arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
-    """Return the kinematics of ``link``, by default the tip of the arm.
+    """Return the kinematics of a link, by default the tip of the arm.
 
-    If no tip was specified, the default is the result of `Robot.last_link`.
+    Args:
+        arm: result of ``load_arm``, or the path of a URDF, together with ``joints``.
+        link: name of the link; None: the tip of the arm, or the result of `Robot.last_link` if no tip is specified.
+        joints: names of the coordinates, if ``arm`` is a path.
 
-    arm: result of ``load_arm``, or the path of a URDF together with the names of its ``joints``. Raises ValueError if
-    the link is not moved by these joints.
+    Raises:
+        ValueError: a joint does not move the link, or no joints are named.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())

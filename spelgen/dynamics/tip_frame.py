@@ -1,4 +1,4 @@
-"""The frame of the tip link of an arm."""
+"""Frames of the tip link and of all links of an arm, relative to the bodies that carry them."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,10 @@ from spelgen.arm.configured_arm import Arm
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """The frame of the tip link.
+    """The tip link, and its frame relative to the body that carries it.
 
     Attributes:
+        link: name of the tip link.
         carrier: index of the body that carries the link; -1: the root link.
         pose: pose of the link in the frame of this body, (4, 4).
         bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the results of other
@@ -30,7 +31,7 @@ def tip_frame(loaded: Arm) -> Tip:
     """Return the frame of the tip link, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or loaded.robot.last_link(names)
-    # Rounded angles would displace the tip by up to the tolerance of the rounding times the extent of the arm.
+    # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.
     bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
     return Tip(link, *link_poses(loaded)[link], bodies)
 

@@ -1,1 +1,1 @@
-"""Derive the specification of a model from the structure of an arm; make a model or the source of a module from it."""
+"""Models from arms: derive a ``ModelSpec`` from an arm's structure, and make a model or a module's source from it."""

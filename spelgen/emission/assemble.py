@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """Base class of the models of arms. Each model also has a base class with its dynamics from ``spelgen.runtime``."""
+    """Base class of all models in memory that are made from a specification, which is their attribute ``spec``.
+
+    Each model has a second base class, from ``spelgen.runtime``, with its dynamics.
+    """
 
     spec: ModelSpec
 
@@ -37,13 +40,16 @@ class ArmModel(PortHamiltonian):
     def prepared(
         self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> PreparedModel:
-        """Return a copy with constant parameters for many calls; see ``PreparedModel``."""
+        """Return a copy with constant parameters for many calls, as in control loops; see ``PreparedModel``.
+
+        tip: kinematics of the tip, for its pose and Jacobian. dtype: type of the parameters and states.
+        """
         from spelgen.dynamics.prepared import PreparedModel
 
         return PreparedModel(self, tip, dtype=dtype)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        # The class is made by a function, so that pickle does not find it by its name.
+        # pickle does not find the model's class by name, since a function makes the class: pickle calls the function.
         return (_without_state, (base_class(self.spec),), *super().__reduce_ex__(protocol)[2:])
 
     def __repr__(self) -> str:
@@ -63,8 +69,8 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
     """
     assembly = model_parts(spec)
     names: dict[str, object] = {"generator": torch.Generator().manual_seed(seed)}
-    # The source of a module defines the function `mass_entries`. In memory, `_mass_entries` takes its place, with the
-    # same operations in the same order, so that rounding errors are equal.
+    # The source of a module defines the function `mass_entries`. In memory, `_mass_entries` replaces it, with the same
+    # operations in the same order, so that rounding errors are equal.
     names["mass_entries"] = partial(_mass_entries, entry_sums(spec))
     try:
         # The tables of joints, links and functions are evaluated before the arguments of the model, which refer to the
@@ -74,8 +80,7 @@ def assemble(spec: ModelSpec, seed: int = 0) -> ArmModel:
         arguments = {str(name): _value(item, names) for name, item in assembly.model.arguments}
         model = _model_class(base_class(spec))(**arguments)
     except (RuntimeError, ValueError, ArithmeticError, LookupError, TypeError) as problem:
-        # A user may have edited the specification, so a failure of a constructor is reported as an invalid
-        # number.
+        # A user may have edited the specification: a failure of a constructor is reported as an invalid specification.
         reason = " ".join(str(problem).split())[:200]
         raise ModuleError(f"a specification of no model ({reason})", do="build it again") from problem
     model.spec = spec
@@ -97,24 +102,28 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
 
 
 def spec_of(model: object) -> ModelSpec | None:
-    """Return the specification that a model was assembled from; None if the object is not such a model."""
+    """Return the specification of a model from `assemble`; None for any other object, for example a user's model."""
     return model.spec if isinstance(model, ArmModel) else None
 
 
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
-    """Return M, (..., n, n), whose entries are linear combinations of terms, (...,).
+    """Return the mass matrix M, (..., n, n), from its functions of q and its constants (the terms).
 
-    The result is equal to the result of ``mass_entries`` in a module.
+    The function ``mass_entries`` of an emitted module computes the same.
 
-    rows: a list of linear combinations for each row of the lower triangle of M. terms: values of the functions of q,
-    then the constants.
+    Args:
+        rows: for each row of the lower triangle of M, a list of the entries as linear combinations of the terms.
+        terms: values of the functions of q, then of the constants, (...,) each.
     """
     return runtime.symmetric(*([_sum(sums, terms) for sums in row] for row in rows))
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return a linear combination of terms (...,), in the order of operations of the module."""
-    # Negative terms are subtracted, as in the module's text, so that rounding errors are equal.
+    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source.
+
+    sums: pairs (factor, index of a term).
+    """
+    # Negative terms are subtracted, as in the module's source, so that rounding errors are equal.
     total: Tensor | float = 0
     for position, (factor, index) in enumerate(sums):
         term = terms[index] if abs(factor) == 1 else abs(factor) * terms[index]
@@ -128,18 +137,21 @@ def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
 @cache
 def _model_class(base: str) -> Callable[..., ArmModel]:
     """Return a class ``Model`` that derives from ``ArmModel`` and from ``base``, a class of ``spelgen.runtime``."""
-    # The function is cached, so that all models with the same base class have the same type.
+    # `_model_class` is cached, so that all models with the same base class have the same type.
     return cast("Callable[..., ArmModel]", type("Model", (ArmModel, vars(runtime)[base]), {}))
 
 
 def _without_state(base: str) -> ArmModel:
-    """Return a model without attributes, which unpickling adds. base: name of the base class."""
+    """Return a new model without attributes; pickle calls this function, and then sets the attributes.
+
+    base: name of the class of ``spelgen.runtime`` from which the model is derived.
+    """
     model_class = cast("type[ArmModel]", _model_class(base))
     return model_class.__new__(model_class)
 
 
 def _value(item: object, names: dict[str, object]) -> object:
-    """Return the value of an argument: calls are evaluated, and names are replaced by the objects in `names`."""
+    """Return the value of an argument of a ``Call``: calls are evaluated, names are replaced by objects in `names`."""
     if isinstance(item, Code):
         return names[item.text]
     if isinstance(item, tuple):

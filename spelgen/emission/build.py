@@ -1,4 +1,4 @@
-"""The function ``build``: a model in memory from a URDF."""
+"""The function ``build``: an untrained model in memory from a URDF or a loaded arm."""
 
 from pathlib import Path
 

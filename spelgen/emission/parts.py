@@ -1,4 +1,9 @@
-"""The parts of a model, from a ``ModelSpec``; models in memory and the text of modules are made from these parts."""
+"""Conversion of a ``ModelSpec`` to tables and constructor calls of the classes of ``spelgen.runtime``.
+
+The tables have the joints and links of the arm, and the functions and constants of M.
+
+Models in memory (`assemble`) and the source of modules (`text`) are both made from these tables and calls.
+"""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,7 +22,7 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 
 @dataclass(frozen=True)
 class ModelParts:
-    """The tables of an arm, and the constructor call that makes the model from the tables.
+    """The tables of an arm, and the constructor call of its model, whose arguments refer to the tables.
 
     Attributes:
         rows: {name of a table: rows}. The tables are ``JOINTS``, ``LINKS``, ``FUNCTIONS`` and ``CONSTANTS``; a row is a
@@ -34,12 +39,12 @@ class ModelParts:
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
-    """Return the parts of the model that ``spec`` describes."""
+    """Return the tables and the constructor call of the model that ``spec`` describes."""
     rows = {"JOINTS": tuple(map(_joint, spec.joints))}
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # Residual terms of M have bounds in place of mean and scale, so these rows have only the joints.
+        # The functions of the residual terms of M have bounds in place of mean and scale: rows have only the joints.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -57,23 +62,23 @@ def _inputs(spec: ModelSpec) -> Call:
     n = range(len(spec.joints))
     values = {(x.joint, x.motor): x.value for x in spec.inputs}
     matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # `mask` is True for gains that are trained; known gear ratios are constants.
+    # `mask` is True for gains (entries of G) that are trained; known gear ratios are constants.
     trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
     mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    return call("MotorInputs", matrix, **_unless({"trained": mask}, trained=not trained))
+    return call("MotorInputs", matrix, **_without_defaults({"trained": mask}, trained=not trained))
 
 
 def base_class(spec: ModelSpec) -> str:
-    """Return the name of the runtime class of the model."""
+    """Return the name of the class of ``spelgen.runtime`` from which the model that ``spec`` describes is derived."""
     if spec.links:
         return "RigidBodyDynamics" if spec.design.net == "none" else "ResidualDynamics"
     return "DenseInputDynamics" if spec.design.input == "dense-3n" else "NetworkDynamics"
 
 
-def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
-    """Return the keyword arguments that do not have their default values, so that the rows of a module are short.
+def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
+    """Return ``fields`` without arguments that have their default values, so that the rows of a module are short.
 
-    fields: {name of an argument: value}. is_default: True for the names of arguments with their default values.
+    fields: {name of a keyword argument: value}. is_default: True for names of arguments with their default values.
     """
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
@@ -81,12 +86,12 @@ def _unless(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `runtime.rows.Joint` rounds center and half range in the same way, so equal values can be
-        # omitted.
+        # `runtime.rows.Joint` computes center and half range from the limits with the same rounding: a row omits
+        # `typical_range` if it is equal to the computed values.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
-    statements = _unless(
+    statements = _without_defaults(
         fields | {"typical_range": typical}, gear=joint.gear == 1, typical_range=typical == limits
     )
     return call("Joint", joint.name, joint.joint_type, **statements)
@@ -106,7 +111,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
         "offset": link.offset,
         "joint_type": link.joint_type,
     }
-    statements = _unless(
+    statements = _without_defaults(
         fields,
         rotation=np.array_equal(link.rotation, np.eye(3)),
         ratio=link.ratio == 1,
@@ -117,7 +122,7 @@ def _link(spec: ModelSpec, link: LinkSpec) -> Call:
 
 
 def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
-    """Return the keyword arguments of the class of a rigid-body model, without ``joints`` and ``inputs``."""
+    """Return the keyword arguments of the constructor of a rigid-body model, except for ``joints`` and ``inputs``."""
     arguments = {"links": LINKS, "gravity": spec.gravity, "friction": _friction_laws(spec)}
     if spec.motor_speeds:
         arguments["motor_speeds"] = spec.motor_speeds
@@ -126,8 +131,8 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
         arguments["servo"] = call("PositionServo", **columns)
     if spec.design.net != "none":
         terms: dict[str, object] = {"functions": len(spec.outputs), "constants": len(spec.constants)}
-        # The order of `network` and `potential` determines their initial weights, since both use one
-        # generator.
+        # The order of the networks `network` and `potential` determines their initial weights, since both use one
+        # random generator.
         if spec.potential:
             terms["potential_scale"] = spec.potential_scale
         if spec.outputs:
@@ -141,18 +146,22 @@ def _rigid_bodies(spec: ModelSpec) -> dict[str, object]:
 def _friction_laws(spec: ModelSpec) -> Call:
     if spec.design.memory == "none":
         return call("SlidingFriction", JOINTS)
-    # `breakaway` has a row for each joint type of the arm, in the order of BREAKAWAY: the text is deterministic.
+    # The rows of `breakaway`, one per joint type of the arm, have the order of BREAKAWAY, so that the text of a module
+    # is deterministic.
     breakaway = {name: row for name, row in BREAKAWAY.items() if name in spec.joint_types}
     rounding = {"stribeck_rounding": SERVO_STRIBECK_ROUNDING} if spec.servos else {}
     return call("FrictionLaws", JOINTS, breakaway=breakaway, **rounding)
 
 
 def _networks(spec: ModelSpec) -> dict[str, object]:
-    """Return the keyword arguments of the class of a network model; their order determines the initial weights."""
+    """Return the keyword arguments of the constructor of a network model, except for ``joints`` and ``inputs``.
+
+    Their order determines the initial weights, since all networks use one random generator.
+    """
     n = len(spec.joints)
     ones = (1.0,) * n
     mass = _mass(spec)
-    # A constant V also has a network: with one output, which depends on no joint.
+    # A constant V also has a network, since the class requires one: with one output, which depends on no joint.
     potential = _potential(spec) if spec.potential else _network(spec, ((),), (ones, ones), width=1, depth=0)
     scale = spec.potential_scale if spec.potential else 1.0
     arguments = {"mass": mass, "potential": potential, "potential_scale": scale}
@@ -166,7 +175,7 @@ def _mass(spec: ModelSpec) -> Call:
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
-        # M is symmetric, so the text has only the lower triangle of the nominal mean.
+        # M is symmetric, so a module has only the lower triangle of the nominal mean.
         mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
         triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
         return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
@@ -178,16 +187,17 @@ def _mass(spec: ModelSpec) -> Call:
 
 
 def _mass_network(spec: ModelSpec) -> Call:
-    """Return the constructor call of the network whose outputs are the functions of M."""
-    # Each edge into a unit of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
+    """Return the constructor call of the network whose outputs are the learned functions of M."""
+    # Each edge of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
 
 
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
-    """Return the scales of the inputs of the network of M: two rows (n,).
+    """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
-    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q.
+    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. The factors
+    are the sensitivities of M to the coordinates.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
@@ -195,7 +205,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 def _potential(spec: ModelSpec) -> Call:
     # The inputs cos q and sin q of a joint have the same scale.
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
-    # V is a single output, but M has many: for V, a fraction of the hidden units of the networks of M suffices.
+    # The network of V has a single output, the network of M has many: a fraction of its hidden units suffices for V.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
     return _network(spec, (_joint_names(spec, spec.potential),), scales, width=width)
 
@@ -205,12 +215,13 @@ def _friction(spec: ModelSpec) -> Call:
     scale, ones = (TUNING.position_sensitivity,) * n, (1.0,) * n
     if spec.design.dissipation == "per-joint":
         outputs = tuple((name,) for name in spec.joint_names)
-        # The velocity inputs are divided by the typical speed; the inputs qd / |qd| have magnitude one.
+        # The inputs qd of the friction network are divided by the typical speed; its inputs qd / |qd| have magnitude 1.
         speeds = tuple(rounded(1 / joint.speed, 4) for joint in spec.joints)
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    # In the published model (Duong et al., IEEE T-RO 40:3695, 2024) a joint has three axes, of which one moves.
+    # Dense friction of the published model (Duong et al., IEEE T-RO 40:3695, 2024) has three axes per joint, about or
+    # along one of which the joint moves.
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -226,9 +237,15 @@ def _network(
     depth: int | None = None,
     min_units: int = 1,
 ) -> Call:
-    """Return the constructor call of a network.
+    """Return the constructor call of a network, ``MaskedMLP`` or ``MaskedKAN``, as the design states.
 
-    outputs: names of the joints that each output depends on, as a tuple or as an expression of the module.
+    Args:
+        spec: specification of the model, with width and depth of networks.
+        outputs: names of the joints that each output depends on, as a tuple, or as a call that returns them.
+        scales: rows with the scales of the inputs, (n,) each.
+        width: number of hidden units per layer; None: ``units(spec)``.
+        depth: number of hidden layers; None: the option of the specification.
+        min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
     options = {
         "scales": scales,
@@ -238,11 +255,14 @@ def _network(
         "min_units": min_units,
     }
     kind = "MaskedKAN" if spec.design.net == "kan" else "MaskedMLP"
-    return call(kind, GENERATOR, JOINTS, **_unless(options, min_units=min_units == 1))
+    return call(kind, GENERATOR, JOINTS, **_without_defaults(options, min_units=min_units == 1))
 
 
 def units(spec: ModelSpec) -> int:
-    """Return the number of units of a hidden layer; Kolmogorov-Arnold networks, with a grid per edge, have fewer."""
+    """Return the number of units of a hidden layer: the option ``width``, or fewer for Kolmogorov-Arnold networks.
+
+    Kolmogorov-Arnold networks need fewer units, because each edge has several weights.
+    """
     width = spec.options.width
     return width if spec.design.net == "mlp" else max(TUNING.min_units, round(TUNING.kan_fraction * width))
 
@@ -252,37 +272,42 @@ def _joint_names(spec: ModelSpec, joints: Sequence[int]) -> tuple[str, ...]:
 
 
 def rounded(value: float, digits: int = 6) -> float:
-    """Return a value, rounded to significant digits."""
+    """Return ``value`` rounded to ``digits`` significant digits."""
     return float(f"{value:.{digits}g}")
 
 
 Sums = list[tuple[float, int]]
-"""The terms of an entry of M, positive factors first: factor, and index in the list of functions and constants."""
+"""An entry of M as a linear combination: pairs (factor, index of a function or constant), positive factors first."""
 
 
 def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
-    """Return each entry of the lower triangle of M as a linear combination of functions and constants.
+    """Return the entries of the lower triangle of M as linear combinations of its functions and constants.
 
-    The result has a list per row of M, with a list of pairs (factor, index of the function or constant) per entry.
+    The result has a list per row of M, with a list of pairs (factor, index) per entry. An index refers to the list of
+    functions, followed by constants; an entry that is always zero has an empty list.
     """
     cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
     terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)
     for index, term in enumerate(terms):
         for row, column, factor in term.basis:
             cells[row, column].append((factor, index))
-    # Positive factors come first, so that an expression does not start with a minus sign unless all are
-    # negative.
+    # Positive factors come first, so that the expression of an entry of M does not start with a minus sign unless all
+    # factors are negative.
     ordered = {entry: sorted(sums, key=lambda term: term[0] < 0) for entry, sums in cells.items()}
     return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 
 
 def term_names(spec: ModelSpec) -> list[str]:
-    """Return the names of the terms of M: f1, f2, ... for functions, then c1, c2, ... for constants."""
+    """Return the names of the terms of M in a module: f1, f2, ... for functions, then c1, c2, ... for constants."""
     return [f"f{k + 1}" for k in range(len(spec.outputs))] + [f"c{k + 1}" for k in range(len(spec.constants))]
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the nominal mean of M without armature, (n, n), to six digits, with zeros above the diagonal."""
+    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
+
+    The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
+    outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
+    """
     mean = np.zeros((n, n))
     for constant in constants:
         for row, column, value in constant.basis:

@@ -1,4 +1,4 @@
-"""The function ``derive_spec``: the ``ModelSpec`` of an arm, from the arm's structure and nominal values."""
+"""The function ``derive_spec``: the ``ModelSpec`` of an arm, from its structure, nominal values and settings."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -38,7 +38,7 @@ from spelgen.structure.structure import Structure, derive
 
 
 def derive_spec(arm: Arm, options: Options) -> ModelSpec:
-    """Return the specification of the model of ``arm`` with these options.
+    """Return the specification of the model of ``arm`` for the preset or design and the other values in ``options``.
 
     Raises SettingsError for position servos with a design without bristle friction.
     """
@@ -50,8 +50,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
             expected="a preset with bristle friction, which position servos need", do="--preset closed-form",
         )  # fmt: skip
     structure = derive(arm.chain, options.assume)
-    # Magnitudes of M, V and torques are the scales of networks and friction. The magnitudes are computed with the
-    # inertials of the URDF or, if they are absent or inconsistent, with default inertials.
+    # `sizes`: typical magnitudes of M, V and torques, by which networks and friction are scaled. They are computed with
+    # the inertials of the URDF or, if the inertials are absent or inconsistent, with default inertials.
     sizes = nominal(arm.chain, structure)
     coordinates = arm.chain.coordinates
     drives = [arm.settings.joint(x.name) for x in coordinates]
@@ -59,7 +59,7 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
     links: tuple[LinkSpec, ...] = ()
     min_armatures = np.zeros(len(drives))
     if design.mass == "closed-form":
-        # A URDF may have inertials that are not physically consistent; `_links` corrects them.
+        # A URDF may have inertials that are not physically consistent; `_links` corrects the inertials.
         links = _links(arm.chain, exact_inertias(arm.chain, sizes.from_urdf))
         min_armatures = TUNING.min_armature * np.diagonal(mean_mass(len(drives), outputs, constants))
     rows = enumerate(zip(coordinates, drives, min_armatures.tolist(), strict=True))
@@ -78,8 +78,8 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
         constants=constants,
         potential=tuple(range(len(joints))) if design.potential == "dense" else structure.potential,
         potential_scale=sizes.potential_scale,
-        # The lower bound of the eigenvalues of M is rounded to one digit, so that rounding errors of nominal values
-        # do not change the text of the module.
+        # The lower bound of the eigenvalues of M (relative to the nominal mean of M) is rounded to one digit, so that
+        # rounding errors of nominal values do not change the text of the module.
         margin=float(f"{max(TUNING.margin * sizes.min_eigenvalue, 1e-4):.0e}"),
         started_from_urdf=sizes.from_urdf,
         links=links,
@@ -90,9 +90,9 @@ def derive_spec(arm: Arm, options: Options) -> ModelSpec:
 
 
 def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
-    """Return the nonzero entries of the input matrix G.
+    """Return the nonzero entries of the input matrix G; trained entries have an initial value.
 
-    The result is empty if each input is the torque of its own joint, or if a network gives G.
+    The result is empty if each input is the torque of its own joint (G is the identity), or if a network gives G.
     """
     entries = actuation.entries
     if design.input != "derived" or (actuation.direct and len(entries) == actuation.joints):
@@ -101,7 +101,10 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` for each learned function of M."""
+    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale.
+
+    structure: terms of M. sizes: nominal means and standard deviations of the functions.
+    """
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
         joints = output.joints
@@ -113,7 +116,10 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` for each constant of M."""
+    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale.
+
+    structure: terms of M. sizes: nominal values of the constants.
+    """
     values = zip(structure.constants, sizes.constants, sizes.constant_scales, strict=True)
     return tuple(
         ConstantSpec(_entries(constant.basis), initial, scale) for constant, initial, scale in values
@@ -121,9 +127,9 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 
 
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
-    """Return the rows of the matrix C, with C qd the motor velocities; () if each motor moves only its own joint."""
+    """Return the rows of the matrix C, for which C qd are the motor velocities; () if C is the identity."""
     speeds = actuation.drives().speeds
-    # Most arms have uncoupled motors, whose module needs no matrix.
+    # The motors of most arms are not coupled: C is the identity, and the module has no matrix.
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
     return tuple(map(tuple, speeds.tolist()))
@@ -132,20 +138,25 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(
     coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
 ) -> JointSpec:
-    """Return the ``JointSpec`` of coordinate number ``index``, with the settings of its drive.
+    """Return the ``JointSpec`` of a coordinate: limits, and typical values of motion, friction and armature.
 
-    min_armature: armature if the rotor inertia is unknown [kg m^2, kg].
+    Args:
+        coordinate: joint with the limits of the URDF.
+        sizes: typical magnitudes of M, V and torques.
+        index: index of the coordinate, from 0.
+        drive: settings of the joint's drive.
+        min_armature: armature if the rotor inertia, the effort or the speed is unknown [kg m^2, kg].
     """
-    # The inputs of networks are scaled with a working range, which exists even if the URDF has no limits.
+    # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
     lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     speed = _plausible(coordinate.velocity, TUNING.largest_speed)
-    # Without a given rotor inertia, the armature is such that full effort accelerates it to full speed in
-    # ``rise`` seconds.
+    # If the rotor inertia is unknown, the armature is such that full effort accelerates it to full speed in ``rise``
+    # seconds.
     armature = TUNING.rise * effort / speed if effort and speed else 0.0
-    # The torque of a wrist joint may be negligible, but its gear has friction: at least 1 % of the largest
-    # torque is assumed.
+    # Typical friction is a fraction of the joint's torque. The torque of a wrist joint may be negligible, but its gear
+    # has friction: at least 1 % of the largest torque of all joints is assumed.
     torque = max(sizes.joint_torque[index], 0.01 * max(sizes.joint_torque))
     friction = TUNING.friction_of_effort * effort if effort else TUNING.friction_of_torque * torque
     default_speed = TUNING.angular_speed if coordinate.joint_type == "revolute" else TUNING.linear_speed
@@ -166,7 +177,10 @@ def _joint(
 
 
 def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
-    """Return the servo of a joint; an unknown kp gives the full effort at the position error `full_effort_at`."""
+    """Return the ``ServoSpec`` of a joint with a position servo: kp, kd and torque limit.
+
+    An unknown kp is initially such that the servo has its full effort at the position error `full_effort_at`.
+    """
     effort = _plausible(coordinate.effort, TUNING.largest_effort)
     # A known kp stays constant; a guessed kp is trained.
     kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
@@ -174,7 +188,10 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 
 
 def _plausible(limit: float | None, largest: float) -> float | None:
-    """Return a limit of the URDF, or None for a placeholder: some tools write 0 or 1e16 for an unknown limit."""
+    """Return a limit of the URDF, or None if it is a placeholder: some tools write 0 or 1e16 for an unknown limit.
+
+    largest: largest value that is not regarded as a placeholder.
+    """
     return limit if limit and limit <= largest else None
 
 
@@ -183,11 +200,10 @@ def _entries(weights: Weights) -> Entries:
 
 
 def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
-    """Return the links of ``arm`` with these inertial parameters, made physically consistent if necessary.
+    """Return a ``LinkSpec`` for each body of ``arm``, with inertial parameters that are physically consistent.
 
-    Args:
-        arm: the arm.
-        inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint's frame, (10,).
+    inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint frame, (10,) each. They
+    are changed if they are not physically consistent.
     """
     specs = []
     for body, ten in zip(arm.bodies, inertias, strict=True):
@@ -211,7 +227,7 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 
 
 def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
-    """Return inertial parameters, (10,), of a body with mass, changed if they are not physically consistent."""
+    """Return the inertial parameters ``ten`` of a body, (10,), changed if they are not physically consistent."""
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
@@ -221,7 +237,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # Smaller second moments are raised to twice the bound; all others and the principal directions are unchanged.
+    # Second moments below the bound are raised to twice the bound. All others and the principal directions are
+    # unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))
@@ -230,13 +247,16 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
 def _about_center(
     ten: Sequence[Fraction | float],
 ) -> tuple[float, Triple, tuple[float, float, float, float, float, float]]:
-    """Return mass [kg], center of mass [m], and inertia about it [kg m^2]: computed exactly, then rounded."""
+    """Return mass [kg], center of mass (3,) [m], and inertia about the center of mass, (6,) [kg m^2], of a body.
+
+    ten: inertial parameters about the origin of the joint frame, (10,). Results are computed exactly, then rounded.
+    """
     m, hx, hy, hz, *tensor = [Fraction(value) for value in ten]
     x, y, z = hx / m, hy / m, hz / m
     steiner = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
     inertia = [value - m * square for value, square in zip(tensor, steiner, strict=True)]
-    # If `_consistent` changed the parameters, they have rounding errors of floating point: entries of the size of these
-    # errors become zero.
+    # If `_consistent` has changed the parameters, they have rounding errors of floating point: elements of the inertia
+    # that are as small as these errors become zero.
     noise = max(map(abs, inertia)) / 10 ** (TUNING.inertia_digits + 3)
     inertia = [value if abs(value) > noise else Fraction(0) for value in inertia]
     mass, cx, cy, cz, xx, xy, xz, yy, yz, zz = _significant([m, x, y, z, *inertia])
@@ -244,7 +264,7 @@ def _about_center(
 
 
 def _significant(values: Iterable[Fraction | float]) -> list[float]:
-    """Return values rounded to the significant digits of inertial parameters."""
+    """Return values rounded to `inertia_digits` significant digits."""
     # Adding 0.0 changes -0.0 to 0.0.
     return [rounded(float(value), TUNING.inertia_digits) + 0.0 for value in values]
 

@@ -1,4 +1,4 @@
-"""Source text of values: calls, tuples and dictionaries, broken into readable lines."""
+"""Python source text of values (calls, tuples, dictionaries, numbers, texts), broken into readable lines."""
 
 import ast
 import json
@@ -6,19 +6,22 @@ from dataclasses import dataclass
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
-SKIP = "  # fmt: skip"  # With this comment, ruff does not reformat rows of numbers.
+SKIP = "  # fmt: skip"  # With this comment in a module, ruff does not reformat its rows of numbers.
 
 
 @dataclass(frozen=True)
 class Code:
-    """A name in source code."""
+    """A name in source code, such as the name of a table; texts that are not names are ``str``."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Call:
-    """A call in source code. arguments: name and value; a positional argument has the name None."""
+    """A call of a class or function in source code.
+
+    arguments: pairs (name, value); the name of a positional argument is None.
+    """
 
     callee: str
     arguments: tuple[tuple[str | None, object], ...]
@@ -31,17 +34,23 @@ def call(callee: str, *positional: object, **named: object) -> Call:
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
-    """Return the text ``start`` followed by the source text of ``value``.
+    """Return the text ``start`` followed by the source text of ``value``, in one line or several lines.
 
-    The result is one line if this text and ``reserved`` further characters fit into a line, otherwise several lines.
+    The result is one line if the text and ``reserved`` more characters fit into ``WIDTH`` columns.
+
+    Args:
+        start: text before the value, such as "name=".
+        value: the value.
+        indent: column at which the text starts.
+        reserved: number of characters that the caller adds after the text, such as a comment.
     """
     text = start + flat(value)
-    if indent + len(text) + reserved < WIDTH or not _items(value) or _alike(value):
+    if indent + len(text) + reserved < WIDTH or not _items(value) or _is_repeated(value):
         return text
     inner = " " * (indent + _STEP)
     opening, closing = "{}" if isinstance(value, dict) else "()"
     callee = value.callee if isinstance(value, Call) else ""
-    # Lines are filled with items. An item that has several lines starts on its own line.
+    # Each line is filled with as many items as fit. An item that has several lines starts on its own line.
     lines = [f"{start}{callee}{opening}", inner]
     for key, item in _items(value):
         text = f"{filled(key, item, indent + _STEP)},"
@@ -56,20 +65,20 @@ def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
 
 
 def listed_call(start: str, value: Call, indent: int) -> str:
-    """Return ``start`` and the text of a call with one line per argument."""
+    """Return ``start`` followed by the source text of a call with one line per argument; indent: column of the call."""
     inner = " " * (indent + _STEP)
     lines = [f"{inner}{filled(key, item, indent + _STEP)}," for key, item in _items(value)]
     return "\n".join([f"{start}{value.callee}(", *lines, " " * indent + ")"])
 
 
 def flat(value: object) -> str:
-    """Return the source text of a value in one line; texts become string literals of ASCII characters."""
+    """Return the source text of a value in one line. Texts become string literals of ASCII characters."""
     if isinstance(value, Code):
         return value.text
     if isinstance(value, str):
         return json.dumps(value) if value.isascii() and value.isprintable() else _escaped(value)
     if isinstance(value, tuple):
-        if _alike(value):
+        if _is_repeated(value):
             return f"({flat(value[0])},) * {len(value)}"
         return f"({flat(value[0])},)" if len(value) == 1 else f"({_joined(value)})"
     if isinstance(value, dict):
@@ -78,9 +87,10 @@ def flat(value: object) -> str:
 
 
 def _escaped(text: str) -> str:
-    """Return a string literal of ASCII characters, with Python's 32-bit escapes for all others.
+    """Return a string literal for ``text``, in which characters that are not ASCII are Python's 32-bit escapes.
 
-    JSON has only 16-bit escapes, and needs two of them for a larger code point.
+    json.dumps is not used for these characters: it has only 16-bit escapes, and two of them for a larger code point,
+    which Python does not join.
     """
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
@@ -97,7 +107,7 @@ def _items(value: object) -> list[tuple[str, object]]:
     return [("", item) for item in value] if isinstance(value, tuple) else []
 
 
-def _alike(value: object) -> bool:
+def _is_repeated(value: object) -> bool:
     """Return True for a tuple of more than three equal items, which is written as a product: ``(0.0,) * 6``."""
     return isinstance(value, tuple) and len(value) > 3 and value.count(value[0]) == len(value)
 

@@ -1,4 +1,4 @@
-"""The functions ``make_spec``, the specification of a model from a URDF, and ``generate``, the source of its module."""
+"""The functions ``make_spec`` (URDF to ``ModelSpec``), ``generate`` (URDF to a module's source), and ``find_urdf``."""
 
 import os
 from dataclasses import replace
@@ -43,8 +43,13 @@ def make_spec(
     assume: Assume = "kinematics",
     module: Path | None = None,
 ) -> ModelSpec:
-    """Return the specification of the model of an arm; arguments and errors as for ``generate``."""
-    # Imported here: commands that have a specification do not derive one.
+    """Return the specification of the model of an arm, from which a model or a module is made.
+
+    module: path of the module; the specification then contains the path of the URDF relative to the module's folder.
+    None: the specification contains only the file name of the URDF.
+    Other arguments and errors as for ``build``.
+    """
+    # `derive_spec` is imported here, because commands that have a specification do not need it.
     from spelgen.emission.plan import derive_spec
 
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
@@ -70,18 +75,20 @@ def make_spec(
 
 
 def arm_of_spec(spec: ModelSpec | None, urdf: str | Path) -> Arm:
-    """Return the arm of a specification, read from this URDF with its options; None: with the default options.
+    """Return the arm that a model was built for, read again from ``urdf`` with the options of the specification.
 
-    Raises UrdfError, ArmError or SettingsError.
+    The options are joints, tip and angle tolerance; their defaults are used if ``spec`` is None. Raises UrdfError,
+    ArmError or SettingsError.
     """
     options = Options() if spec is None else spec.options
     return load_arm(urdf, options.joints, options.tip, options.angle_tolerance)
 
 
 def find_urdf(module: Path, name: str) -> Path:
-    """Return the path of the URDF ``name``. Raises ModuleError if it is not found.
+    """Return the path of the URDF of a module. Raises ModuleError if the URDF is not found.
 
-    It is searched in the module's folder, in the current folder, and in the subfolders robots/ of both.
+    module: path of the module. name: name or relative path of the URDF in the module's specification. It is searched in
+    the module's folder, in the current folder, and in the subfolders robots/ of both.
     """
     # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
@@ -96,7 +103,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the name of the URDF if it is in a folder that ``find_urdf`` searches, else its relative path."""
+    """Return the URDF's file name if ``find_urdf`` finds it by name, else its path relative to the module's folder."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

@@ -1,4 +1,4 @@
-"""The definitions of ``spelgen.runtime`` that a standalone module contains, and the import statements they need."""
+"""Source of the runtime in standalone modules: the definitions of ``spelgen.runtime`` that a model needs."""
 
 import ast
 from collections import defaultdict
@@ -15,7 +15,7 @@ _OURS = "spelgen.runtime."
 
 
 class Definition(NamedTuple):
-    """A class, function or constant of the runtime: source text with comments, and names that occur in it."""
+    """A class, function or constant of the runtime: source text with comments, and names that occur in the text."""
 
     text: str
     uses: frozenset[str]
@@ -24,11 +24,11 @@ class Definition(NamedTuple):
 
 @dataclass(frozen=True)
 class Runtime:
-    """The source of the runtime.
+    """The source of all files of ``spelgen.runtime``.
 
     Attributes:
-        definitions: definitions by name, in an order in which they can be executed.
-        imports: import statements of other packages.
+        definitions: {name: definition}, in an order in which they can be executed.
+        imports: import statements of other packages and of the standard library.
         rows: names of the classes in rows.py, which must be defined before the tables of an arm.
     """
 
@@ -47,7 +47,10 @@ class Bundle(NamedTuple):
 
 
 def bundle(arm: str, model: str) -> Bundle:
-    """Return the definitions of the runtime that the source texts of an arm and its model need, directly or not."""
+    """Return the source of the runtime that a standalone module needs, directly or through other definitions.
+
+    arm, model: source texts of the module's tables and of its class ``Model``.
+    """
     runtime = load_runtime()
     used = names_in(ast.parse(f"{arm}\n{model}"))
     pending = list(used)
@@ -66,7 +69,7 @@ def bundle(arm: str, model: str) -> Bundle:
 
 
 def _joined(definitions: Iterable[Definition]) -> str:
-    """Return the text of definitions: blank lines separate classes and functions, but not constants."""
+    """Return the joined source text of definitions; blank lines separate classes and functions, but not constants."""
     text, previous_is_block = "", True
     for definition in definitions:
         separate = definition.is_block or previous_is_block
@@ -83,7 +86,7 @@ def load_runtime() -> Runtime:
         for path in (files("spelgen") / "runtime").iterdir()
         if path.name.endswith(".py")
     }
-    # File systems list files in different orders; sorting makes the text of a module the same everywhere.
+    # The files are sorted, because file systems list files in different orders: a module's text must be deterministic.
     trees = {name: ast.parse(texts[name]) for name in sorted(texts)}
     del trees["__init__"]
     order: TopologicalSorter[str] = TopologicalSorter()
@@ -107,7 +110,7 @@ def load_runtime() -> Runtime:
 
 
 def _imported(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """Return the import statements at the top level of a file."""
+    """Return the import statements at the top level of a file's syntax tree."""
     return [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
@@ -130,7 +133,7 @@ def _text(node: ast.stmt, source: str) -> str:
 
 
 def _imports(used: set[str], runtime: Runtime) -> str:
-    """Return the import statements of the used names: standard library, then torch, each in ruff's order."""
+    """Return import statements for the names in ``used``: standard library, then torch, each in ruff's order."""
     plain = set()
     members: defaultdict[str, set[str]] = defaultdict(set)
     for node in runtime.imports:

@@ -1,7 +1,7 @@
-"""Conversion of a ``ModelSpec`` to the text of a module, and back. Equal specifications give equal bytes.
+"""Conversion of a ``ModelSpec`` to the source of a module, and back. Equal specifications give equal bytes.
 
-Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module that is
-read is parsed, but not executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. To read the
+specification of a module, its source is parsed, but not executed.
 """
 
 import ast
@@ -31,7 +31,7 @@ _COMMENTS = {
 }
 _EXAMPLE = """\
     import torch
-    from {module} import Model
+    from {module} import Model  # if this file is {module}.py
 
     model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
     q, qd, tau = torch.zeros(3, 100, {n}, dtype=torch.float64)  # any batch, joints last
@@ -40,7 +40,7 @@ _EXAMPLE = """\
     tau = model.inverse_dynamics(q, qd, qdd)
     V = model.potential_energy(q)  # (100,) [J]
     H = model.hamiltonian(q, model.momentum(q, qd))"""
-# [bytes] Largest module that is read, ten times the size of the largest that `spelgen build` writes.
+# [bytes] Largest file that is read as a module: ten times the size of the largest module that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
 
@@ -72,7 +72,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
         return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
     # A module imports only the names that occur in its text.
     used = names_in(ast.parse(f"{arm}\n{model}")) & _public_names()
-    # ruff's order of imported names: classes first.
+    # The imported names have ruff's order: classes first.
     ordered = sorted(used, key=lambda name: (not name[0].isupper(), name))
     return render("module.py.jinja", names=ordered, has_tensor=parts.MASS_ENTRIES.text in names, **context)
 
@@ -80,14 +80,14 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
 @cache
 def _public_names() -> frozenset[str]:
     """Return the names that a module can import from ``spelgen.runtime``."""
-    # The source is read, because the import of the package would import torch.
+    # The source of ``spelgen.runtime`` is parsed, because an import of the package would import torch.
     source = (files("spelgen") / "runtime" / "__init__.py").read_text(encoding="utf-8")
     imports = [node for node in ast.parse(source).body if isinstance(node, ast.ImportFrom)]
     return frozenset(alias.name for node in imports for alias in node.names)
 
 
 def class_summary(spec: ModelSpec) -> str:
-    """Return a description of the model in one line."""
+    """Return a sentence about the model: its bodies or networks. It is the docstring of the class ``Model``."""
     if spec.links:
         residual = ", and residual terms" if spec.design.net != "none" else ""
         return (
@@ -112,7 +112,7 @@ def header(spec: ModelSpec) -> str:
 
 
 def description(spec: ModelSpec) -> str:
-    """Return sentences about a model: its robot, its parts, and the joints that V depends on."""
+    """Return sentences about a model: robot, bodies or networks, the joints that V depends on, and inputs."""
     kind = class_summary(spec)
     lines = [f"Robot {_quoted(spec.robot)}. {kind[0].upper()}{kind[1:]}"]
     if spec.links and spec.design.net != "none":
@@ -129,14 +129,17 @@ def description(spec: ModelSpec) -> str:
 
 
 def module_name(spec: ModelSpec) -> str:
-    """Return the name of the module that `spelgen build` writes by default, without its folder."""
+    """Return the default name of the module of a URDF, without folder and suffix: `ur5_spel` for ur5.urdf."""
     stem = spec.urdf.rpartition("/")[2].rpartition(".")[0]
     name = re.sub(r"[^0-9A-Za-z_]+", "_", stem) or "arm"
     return f"{'_' if name[0].isdigit() else ''}{name}_spel"
 
 
 def _picture(spec: ModelSpec) -> str:
-    """Return a picture of the lower triangle of M as text: per entry, the joints that the entry depends on."""
+    """Return a text table of the lower triangle of M: for each entry, the joints that it depends on, C or 0.
+
+    C: the entry is constant. 0: the entry is always zero.
+    """
     cells = {}
     for row, column, kind, joints in spec.entries:
         cells[row, column] = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
@@ -169,7 +172,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
-    """Return the statements that define the tables ``JOINTS``, ``LINKS``, ..., with comments about units above."""
+    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: a statement each, below comments about units."""
     statements = []
     for name, rows in assembly.rows.items():
         about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
@@ -183,13 +186,13 @@ def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
 
 
 def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return {name of a term of M: entries of M that contain the term, and the unit of the first entry}."""
+    """Return {name of a term of M: description}: entries of M that contain the term, and unit of the first entry."""
     descriptions = {}
     bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
     for name, basis in zip(parts.term_names(spec), bases, strict=True):
         entries = [entry_name(row, column) for row, column, _ in basis]
         row, column, _ = basis[0]
-        # The unit of an entry is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
+        # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
         slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
         suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
         descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
@@ -210,8 +213,8 @@ def _mass_entries(spec: ModelSpec) -> str:
     for row, cells in enumerate(parts.entry_sums(spec)):
         texts = [_sum(sums, names) for sums in cells]
         for column, text in enumerate(texts):
-            # Sums are assigned to variables, so that a row of M fits on a line; single terms are used
-            # directly.
+            # Entries that are sums are assigned to variables, so that a row of M fits on a line. Entries that are
+            # single terms are used directly.
             if " " in text or text.startswith("-"):
                 texts[column] = entry_name(row, column).lower().replace(",", "_")
                 body.append(f"    {texts[column]} = {text}")
@@ -223,7 +226,10 @@ def _mass_entries(spec: ModelSpec) -> str:
 
 
 def _sum(sums: parts.Sums, names: list[str]) -> str:
-    """Return the expression of a linear combination of terms; ``0`` if there are no terms."""
+    """Return the source of a linear combination of terms, such as ``f1 - 2 * c1``; ``0`` if there are no terms.
+
+    sums: pairs (factor, index of a term). names: names of all terms.
+    """
     text = ""
     for factor, index in sums:
         term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"
@@ -235,14 +241,14 @@ def _sum(sums: parts.Sums, names: list[str]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return the shortest text that gives exactly this number."""
-    # The form with six digits is tried first: most numbers of a URDF have no more digits.
+    """Return a short source text of ``value`` that gives exactly this number."""
+    # The text with six digits is tried first: most numbers of a URDF have no more digits.
     short = f"{value:g}"
     return short if float(short) == value else repr(value)
 
 
 def read_source(path: Path) -> str:
-    """Return the text of the module at ``path``. Raises ModuleError if the file cannot be read as a module."""
+    """Return the text of the module at ``path``. Raises ModuleError if the file is absent, too large or not UTF-8."""
     if not path.exists():
         raise ModuleError("no such file", file=path, do="build it with `spelgen build`")
     content = read_bytes(path, ModuleError, _EXPECTED, MAX_MODULE)
@@ -253,12 +259,15 @@ def read_source(path: Path) -> str:
 
 
 def read_spec(path: Path | str) -> ModelSpec:
-    """Return the specification in the module at ``path``. Raises ModuleError if the file has none."""
+    """Return the specification in the module at ``path``. Raises ModuleError if the file has no specification."""
     return parse_spec(read_source(Path(path)), Path(path))
 
 
 def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a module's text, which may have been edited. Raises ModuleError if it has none."""
+    """Return the specification in a module's text, without a check whether the text was edited.
+
+    Raises ModuleError if the text has no specification. file: path of the module for the error.
+    """
     values = {}
     try:
         for node in ast.parse(text).body:
@@ -277,10 +286,10 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
-    """Return the specification in a module's text. Raises ModuleError if the text was changed since it was built."""
+    """Return the specification in a module's text; raise ModuleError if the text was edited since `spelgen build`."""
     spec = parse_spec(text, file)
-    # The whole text is compared, since a model is assembled from the specification only: any other edit would
-    # be ignored.
+    # The whole text is compared with the text that the specification gives. A model is assembled from the specification
+    # only: an edit of any other text would be ignored.
     if text in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         return spec
     raise ModuleError(

@@ -1,7 +1,7 @@
 """Selection of the motions that charts show.
 
 Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion of median error and
-the motion of largest error.
+the motion of largest error. A predictor is the trained model or a baseline.
 """
 
 import math
@@ -30,10 +30,10 @@ from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnMotion:
-    """Positions q (T, n) [rad, m] along a segment of a log, at times t (T,) [s] since its first sample.
+    """Base class of the motions that charts show: positions q (T, n) [rad, m] along a segment of a log.
 
-    which: "typical" for the motion of median error, "worst" for the motion of largest error. error: error of the model
-    on this motion; None if not finite.
+    t: times (T,) [s] since the first sample of the segment. which: "typical" for the motion of median error, "worst"
+    for the motion of largest error. error: error of the model on this motion; None if not finite.
     """
 
     which: str = ""
@@ -48,7 +48,7 @@ class PredictedMotion(DrawnMotion):
     """A measured motion and its prediction, (T, n) each: a predicted window of a log, or a replayed log.
 
     Attributes:
-        start: Time of the first sample of the window since the start of the log [s]; None for a replayed log.
+        start: Time t of the first sample of the window in the log [s]; None for a replayed log.
         predicted_q: Predicted positions, (T, n) [rad, m].
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
@@ -67,7 +67,7 @@ class PredictedMotion(DrawnMotion):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TorqueTrace(DrawnMotion):
-    """Measured joint torques along ten seconds of a log, and the torques of the predictors.
+    """Measured joint torques along ten seconds of a log, and the torques of the predictors (model and baselines).
 
     Attributes:
         error: Normalised mean squared error (nMSE) of the torques of the model.
@@ -75,7 +75,8 @@ class TorqueTrace(DrawnMotion):
         predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
         parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the
             model.
-        energy: {name of a term: energy since the first sample, (T,) [J]}, for the terms of the energy balance.
+        energy: {name of a term: energy since the first sample, (T,) [J]}, for the work of the drives, the stored
+            energy, the work of friction, and the work of the torque residual.
     """
 
     qd: Curve
@@ -89,7 +90,10 @@ Drawn = TypeVar("Drawn", bound=DrawnMotion)
 
 
 def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
-    """Return the motion of median error and, if there are several motions, the motion of largest error."""
+    """Return the motion of median error and the motion of largest error; a single motion is returned once.
+
+    The field `which` of the returned motions is set to "typical" and "worst".
+    """
     # Sorting keeps the order of motions with equal errors, so the same logs always give the same page.
     ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
     if not ordered:
@@ -101,7 +105,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return every k-th sample of the motion, with the smallest k that gives at most `max_samples` samples."""
+    """Return every k-th sample of a motion for a chart, with the smallest k that gives at most `max_samples`."""
     # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
@@ -110,7 +114,11 @@ def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
 
 
 def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
-    """Return the measured motion and the predicted states of window k of a trajectory."""
+    """Return the measured and the predicted motion of window k, for a chart.
+
+    trajectory: name of the log. windows: measured motion of W windows. states: predicted q and qd of the windows after
+    their first sample, (W, T-1, n) each. The first sample of the prediction is the measured one.
+    """
     predicted_q, predicted_qd = states
     return PredictedMotion(
         trajectory=trajectory,
@@ -123,7 +131,7 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int =
 
 
 def replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
-    """Return the measured and the predicted motion of a replayed log of position servos.
+    """Return the measured and the predicted motion along a replayed log of position servos, for a chart.
 
     error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first.
     """
@@ -155,7 +163,10 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
-    """Return mean motion, acceleration and torque per sample interval, for a log of low sample rate."""
+    """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
+
+    The mean acceleration is the change of qd divided by the duration of the interval.
+    """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
     q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()
@@ -164,7 +175,10 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques of all predictors on these samples, and the terms of the model's torque."""
+    """Return the torques and energies along `samples` that charts show: all predictors, and the terms of the model.
+
+    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`.
+    """
     model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():

@@ -116,7 +116,11 @@ def evaluate(
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing of test logs: `chosen`, else the preprocessing of the fit, else the default."""
+    """Return the preprocessing (filter, torque delay) of test logs: `chosen`, or by default the one of the fit.
+
+    used: preprocessing of the fit; None if the model has no fit. chosen: preprocessing that the user passed; None if
+    the user passed none. Without both, default settings are used.
+    """
     if chosen is None and used is not None:
         return used
     preprocessing = chosen or Preprocessing()
@@ -137,7 +141,18 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of the inverse dynamics, and of the motion that is predicted under the logged torques."""
+    """Return the errors of an arm under torques: inverse dynamics, and motion predicted under the logged torques.
+
+    Args:
+        tested: the model with the data of its fit.
+        logs: test logs with torques.
+        notes: notes about the logs and the evaluation, to which notes are appended.
+        used: preprocessing of the logs.
+        baselines: {name: dynamics} of further baselines.
+        ahead: prediction horizons, in samples and in seconds.
+        truth: true arm of simulated logs, or the path of its URDF; None if unknown.
+        progress: function called before each horizon, see `evaluate`.
+    """
     samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in samples if len(sample.q)]
     # A rollout needs at least two samples: the initial state and one prediction.
@@ -195,9 +210,9 @@ def _evaluate_torques(
 def _results(
     tested: Subject, logs: Sequence[Trajectory], notes: Sequence[Diagnostic], traces: Traces
 ) -> Results:
-    """Return results with the names of the arm, joints and logs, the notes and the curves.
+    """Return results that contain the names of the arm, joints and logs, the notes and the curves, but no errors yet.
 
-    The results have no errors yet: the caller adds them.
+    The caller adds the errors with `replace`.
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,

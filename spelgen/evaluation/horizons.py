@@ -1,4 +1,7 @@
-"""Predictions of the motion in test logs over several horizons; all predictors start from the same samples."""
+"""Predictions of the motion in test logs over several horizons; all predictors start from the same samples.
+
+A predictor is the trained model or a baseline.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +25,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of sample intervals before a prediction in which the momentum observer runs.
+    """Return the number of sample intervals before a prediction from which a momentum observer estimates a disturbance.
 
     rate: sample rate [Hz].
     """
@@ -79,7 +82,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
 
 def without_past(windows: Windows, past: int) -> Windows:
-    """Return the windows without their first `past` steps.
+    """Return the windows without their first `past` steps, the steps in which a momentum observer runs.
 
     The friction state z is not advanced: it remains the state at the first sample of the given windows.
     """
@@ -151,28 +154,28 @@ class EvaluatedLogs:
 
     @property
     def rate(self) -> float:
-        """Mean sample rate [Hz]."""
+        """Mean sample rate of the test logs [Hz]."""
         return sum(x.sample_rate for x in self.pieces) / len(self.pieces)
 
     @property
     def longest(self) -> int:
-        """Length of the longest piece [steps between samples]."""
+        """Length of the longest segment without gaps [steps between samples]."""
         return max(map(len, self.pieces)) - 1
 
     def stride(self, span: int, window_count: int) -> int:
-        """Return the number of samples between the starts of consecutive windows.
+        """Return the number of samples between the starts of consecutive windows of `span` steps.
 
-        With this stride, all pieces together contain about `window_count` windows of `span` steps.
+        With this stride, all segments without gaps together contain about `window_count` windows.
         """
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
     def starts(self, span: int, window_count: int) -> list[tuple[Trajectory, int]]:
-        """Return (piece, index of the first sample) of each of about `window_count` windows of `span` steps."""
+        """Return (segment, index of the first sample) of each of about `window_count` windows of `span` steps."""
         stride = self.stride(span, window_count)
         return [(piece, k) for piece in self.pieces for k in range(0, len(piece) - span, stride)]
 
     def windows(self, span: int, window_count: int) -> Windows:
-        """Return about `window_count` windows of `span` steps; if no piece has `span` steps, windows are shorter."""
+        """Return about `window_count` windows of `span` steps; if no segment is as long, the windows are shorter."""
         span = min(span, self.longest)
         stride, measured = self.stride(span, window_count), self.used.filtered
         return cut_windows(self.pieces, span + 1, stride, measured=measured, reach=self.reach)
@@ -182,9 +185,9 @@ class EvaluatedLogs:
 class Predictions:
     """Predictions of all predictors for W windows of K samples.
 
-    windows: measured motion. starts: (piece, index of the first sample) of each window. states: {key: (q, qd)},
-    predicted positions and velocities at the samples after the first, (W, K-1, n) each [rad, m; rad/s, m/s]. The keys
-    are the keys of `Horizon.errors`.
+    windows: measured motion. starts: (segment of a log, index of the first sample) of each window. states: {key: (q,
+    qd)}, predicted positions and velocities at the samples after the first, (W, K-1, n) each [rad, m; rad/s, m/s]. The
+    keys are the keys of `Horizon.errors`.
     """
 
     windows: Windows
@@ -197,7 +200,8 @@ def horizon_lengths(
 ) -> dict[str, int]:
     """Return {name of a horizon, such as "1 s": length [samples]}.
 
-    A horizon that is longer than every trajectory is omitted, and a note is appended to `notes`.
+    The horizons are given by `steps` [samples] and `seconds` [s]. A horizon that is longer than every trajectory is
+    omitted, and a note is appended to `notes`.
     """
     lengths = {counted(k, "step"): k for k in steps}
     lengths |= {f"{duration:g} s": round(duration * logs.rate) for duration in seconds}
@@ -266,11 +270,15 @@ def predict(
 def end_errors(
     states: States, windows: Windows, joint_types: Sequence[str], tip: TipPosition | None
 ) -> StateErrors:
-    """Return the errors at the last sample of W windows of K samples.
+    """Return the errors of a prediction at the last sample of W windows of K samples.
 
-    states: predicted q [rad, m] and qd [rad/s, m/s] at the samples after the first, (W, K-1, n) each.
+    Args:
+        states: predicted q [rad, m] and qd [rad/s, m/s] at the samples after the first, (W, K-1, n) each.
+        windows: measured motion.
+        joint_types: "revolute" or "prismatic" for each joint.
+        tip: position of the tip as a function of q; None if the tip is unknown.
     """
-    q, qd = (predicted[:, -1] for predicted in states)  # (W, n) each
+    q, qd = (predicted[:, -1] for predicted in states)  # predicted q and qd: (W, n) each
     measured_q, measured_qd = windows.q[:, -1], windows.qd[:, -1]
     # Angles of revolute joints are compared modulo a revolution. The RMS is used instead of the mean absolute error,
     # since large errors decide whether a simulation is usable.
@@ -289,5 +297,5 @@ def end_errors(
 
 
 def _rms(values: Tensor) -> Tensor:
-    """Return the root mean square of values (W, ...) over the W windows, (...)."""
+    """Return the root mean square over W windows of values (W, ...), an array of shape (...)."""
     return values.square().mean(dim=0).sqrt()

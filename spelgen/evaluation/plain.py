@@ -9,7 +9,7 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 
 def number(value: float) -> float | None:
-    """Return a number rounded to five digits; None if it is not finite."""
+    """Return a number for JSON, rounded to five digits; None if it is not finite."""
     # JSON has no infinity and no NaN. Five digits exceed the accuracy of every figure, and keep pages small.
     if math.isfinite(value):
         return float(f"{value:.5g}")
@@ -17,14 +17,14 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array of any shape as nested lists of numbers."""
+    """Return an array of any shape as nested lists of numbers for JSON: rounded to five digits, None if not finite."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))
 
 
 def array(values: object) -> np.ndarray:
-    """Return the array for nested lists from `listed`; None becomes NaN."""
+    """Return the array of floats that `listed` has converted to nested lists; None becomes NaN."""
     return np.array(values, dtype=float)
 
 
@@ -38,5 +38,5 @@ def record(value: object) -> dict[str, object]:
 
 
 def finite(values: np.ndarray | torch.Tensor) -> tuple[float | None, ...]:
-    """Return the values of an array (T,) as floats, not rounded; None in place of NaN and infinity."""
+    """Return the values of an array (T,) as floats for JSON, not rounded; None in place of NaN and infinity."""
     return tuple(x if math.isfinite(x) else None for x in values.tolist())

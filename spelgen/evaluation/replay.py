@@ -19,7 +19,7 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 
 @dataclass(frozen=True)
 class ReplayErrors:
-    """Root mean square position errors of one predictor [rad, m].
+    """RMS errors of the positions that one predictor gives under the commands of test logs [rad, m].
 
     trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
     and all logs, (n,).
@@ -46,7 +46,7 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 
 
 class ServoModel:
-    """The trained model as a `CommandFollower`: it predicts positions under position commands."""
+    """The trained model as a predictor of positions under position commands (`CommandFollower`), like the baselines."""
 
     about = "the model"
 
@@ -54,10 +54,15 @@ class ServoModel:
         self._model = without_idle_residuals(model)
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions of each part: an array (K, n) [rad, m] for a part of K + 1 samples.
+        """Return the predicted positions of each part, (K, n) [rad, m] for a part of K + 1 samples.
 
-        The first sample, the initial state, is not predicted. Parts are padded to one length for the rollout; the
-        padding is removed from the result. q, qd: initial positions and velocities of the parts, (parts, n).
+        A part is a segment of a log, whose commands the model replays from the state at the first sample. The first
+        sample is not predicted. Parts are padded to one length for the rollout; the padding is removed from the result.
+
+        Args:
+            parts: (log, slice of its samples) of each part.
+            q: (parts, n) initial positions [rad, m].
+            qd: (parts, n) initial velocities [rad/s, m/s].
         """
         # All parts form one batch, because a rollout of many parts takes about as long as a rollout of one part. A
         # batch has one number of integrator steps per interval: the number for the part that needs most steps.
@@ -112,10 +117,16 @@ def replays(
 def _replay(
     name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
-    """Return the errors of all predictors, and the position errors of the model on each part.
+    """Return the errors of all predictors, and the position errors of the model, on replayed segments of logs.
 
-    The position errors are (K, n) [rad, m] for a part of K + 1 samples; the first sample, the initial state, has no
-    error. qd: (parts, n) initial velocities [rad/s, m/s].
+    The position errors are (K, n) [rad, m] for a segment of K + 1 samples; the first sample, the initial state, has no
+    error.
+
+    Args:
+        name: description of the segments, for example "whole log".
+        predictors: {name: predictor of positions}, the model and the baselines.
+        parts: (log, slice of its samples) of each segment.
+        qd: (parts, n) initial velocities [rad/s, m/s].
     """
     q = np.stack([log.q[rows.start] for log, rows in parts])
     measured = [log.q[rows][1:] for log, rows in parts]
@@ -128,13 +139,12 @@ def _replay(
 
 
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
-    """Return RMS errors per log and per joint.
+    """Return the RMS position errors of one predictor per log and per joint.
 
-    names: name of the log of each part. errors: position errors of each part, (K, n) [rad, m] for a part of K + 1
-    samples.
+    names: name of the log of each segment. errors: position errors of each segment, (K, n) [rad, m] for K + 1 samples.
     """
     by_name: dict[str, list[np.ndarray]] = {}
-    # A log with gaps consists of several parts with the same name.
+    # The errors of a log with gaps are joined: it consists of several segments with the same name.
     for name, error in zip(names, errors, strict=True):
         by_name.setdefault(name, []).append(np.square(error))
     trajectories = {name: float(np.sqrt(np.concatenate(x).mean())) for name, x in by_name.items()}

@@ -25,7 +25,7 @@ SCHEMA = 11
 
 @dataclass(frozen=True)
 class Verdict:
-    """An assessment in words.
+    """The assessment of an evaluation in words.
 
     sentence: suitable and unsuitable uses of the model, and motions to record next. because: errors and reasons that
     support the sentence.
@@ -79,7 +79,10 @@ class Results:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, object]) -> Results:
-        """Return the results from an object that `to_dict` has returned. Raises ValueError for other content."""
+        """Return the results of an evaluation from an object that `to_dict` has returned.
+
+        Raises ValueError for other content.
+        """
         return TypeAdapter(cls).validate_python(content)
 
     def text(self) -> str:

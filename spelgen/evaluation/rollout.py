@@ -62,11 +62,12 @@ def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
 
     The result is positive if M is positive definite at all of these positions.
     """
-    # The seed is fixed, so that the result is reproducible.
+    # The seed of the random positions is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)
     count = TUNING.sampled_positions
     q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    chunks = q.chunk(10)  # One batch of all positions would need gigabytes of memory.
+    # M is computed for a tenth of the positions at a time: a batch of all would need gigabytes.
+    chunks = q.chunk(10)
     eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(chunk)) for chunk in chunks])
     return (eigenvalues.min() / eigenvalues.mean().abs()).item()
 
@@ -80,7 +81,7 @@ def energy_rise(model: ArmModel, windows: Windows) -> float | None:
     q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
     no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
     q, qd = rollout(model, q, qd, no_input, 1e-3)
-    # The first state is omitted: it is measured, and only later states are computed by the model.
+    # The first state of each motion is omitted: it is measured, and only later states are computed by the model.
     q, qd = q[:, 1:], qd[:, 1:]
     energy = model.hamiltonian(q, model.momentum(q, qd))
     kinetic = (energy - model.potential_energy(q)).max().item()

@@ -28,7 +28,7 @@ from spelgen.urdf.read import read_urdf
 
 
 class Subject:
-    """The evaluated model, with data about its fit; a model without a fit has none.
+    """The evaluated model, with data about its fit; for a model without a fit, these data are None or empty.
 
     Attributes:
         model: The evaluated model.
@@ -46,7 +46,7 @@ class Subject:
     """
 
     def __init__(self, tested: ArmModel | Fit | Path | str, arm: Arm | Path | str | None) -> None:
-        """Initialize from a model, a fit or the folder of a run.
+        """Collect the evaluated model and the data of its fit from a model, a fit or the folder of a run.
 
         arm: arm, or path of its URDF; None: the arm of the fit.
         """
@@ -58,7 +58,8 @@ class Subject:
         self.spec = spec_of(self.model)
         self.joints = tuple(self.model.joint_names)
         reach = bristle_reach(self.model)
-        # Defaults are needed if the model has no bristles: the baseline of least squares may have bristles.
+        # If the model has no bristles, default break-away displacements are used: the baseline of least squares may
+        # have bristles.
         self.reach = reach if reach.elements else reach_of(self.model.joint_types)
         self.urdf, self.window = urdf_path(arm), TUNING.model_window
         self.fitted_urdf: Path | None = None
@@ -76,13 +77,19 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the fitted baselines; None if there are none. Raises UrdfError, ArmError or SettingsError."""
+        """Arm of the baselines that were fitted to the training logs; None if there are none.
+
+        Raises UrdfError, ArmError or SettingsError.
+        """
         if self.fitted_urdf is None or not self.baselines:
             return None
         return arm_of_spec(self.spec, self.fitted_urdf)
 
     def assessed(self, results: Results) -> Results:
-        """Return the results of the evaluation of this model, with the assessment added."""
+        """Return the results of an evaluation of this model with an assessment in words added.
+
+        The assessment uses the range of the training logs and the joint limits of the specification.
+        """
         limits, independent = [], []
         if self.spec is not None:
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}

@@ -30,19 +30,19 @@ LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 
 @dataclass(frozen=True)
 class Row:
-    """Row of a table: one quantity, with a number per column. ranked: whether the smallest number is best."""
+    """Row of a table: one quantity, with a number per column. ranked: True if the smallest number is the best one."""
 
     label: str
     values: Numbers
     ranked: bool = True
 
     def text(self, column: str) -> str:
-        """Return the number of a column as text; an empty text if the column has no number."""
+        """Return the number of a column in this row as text; an empty text if the column has no number."""
         return number(self.values[column]) if column in self.values else ""
 
     @property
     def best(self) -> list[str]:
-        """Return the names of the columns with the smallest number; [] if the row has one column or is not ranked."""
+        """Names of the columns that have the smallest number of this row; [] for a row of one column, or not ranked."""
         if not self.ranked or len(self.values) < 2:
             return []
         smallest = min((value for value in self.values.values() if value is not None), default=None)
@@ -62,7 +62,7 @@ class Table:
 
     @property
     def columns(self) -> list[str]:
-        """Return the names of all columns, in the order of their first occurrence in the rows."""
+        """Names of all columns, in the order of their first occurrence in the rows."""
         return list(dict.fromkeys(name for row in self.rows for name in row.values))
 
     def text(self) -> str:
@@ -70,7 +70,7 @@ class Table:
         return self.listing().text()
 
     def listing(self) -> Listing:
-        """Return the table with its numbers converted to text."""
+        """Return the table with its numbers as text, for display; a star marks the smallest number of each row."""
         lines, columns = [], self.columns
         for row in self.rows:
             # Numbers without a star end with a blank, so that the digits of a column are aligned.
@@ -81,7 +81,10 @@ class Table:
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return a table of ranked rows. rows: label of each row, and the numbers of the row per column."""
+    """Return a table in which the smallest number of each row is the best one.
+
+    rows: {label of a row: {name of a column: number}}. note: explanation below the table.
+    """
     return Table(title, tuple(map(Row, rows, rows.values())), note)
 
 
@@ -94,7 +97,7 @@ def result_tables(results: Results) -> list[Table]:
 
 
 def _without_empty_baselines(full: Table) -> Table:
-    """Return the table without the columns of baselines that have no number."""
+    """Return the table without the columns of baselines that have no number in any row."""
     # The column of the model is kept even without numbers: it shows that the model has no result.
     columns, rows = {MODEL}, []
     for row in full.rows:
@@ -105,7 +108,10 @@ def _without_empty_baselines(full: Table) -> Table:
 
 
 def joined(runs: Mapping[str, Results]) -> list[Table]:
-    """Return the tables and rows that all runs have, with a column for the model of each run."""
+    """Return tables that compare runs: one column per run, with the numbers of the run's model.
+
+    Tables and rows that not all runs have are omitted. runs: {name of a run: its results}.
+    """
     tables: dict[str, dict[str, dict[str, float | None]]] = {}
     for run, results in runs.items():
         for one_table in result_tables(results):
@@ -146,14 +152,14 @@ def summary(results: Results) -> Listing | None:
     lines = []
     for label, values in rows.items():
         numbers = [values.get(name) for name in names]
-        # The row of M exists only if the true M is known.
+        # The row of the mass matrix M is shown only if the true M is known.
         if values:
             lines.append((label, *("-" if value is None else share(value) for value in numbers)))
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
 def _horizon_tables(results: Results) -> list[Table]:
-    """Return tables of the errors per horizon, and of the errors per joint at the last horizon."""
+    """Return tables of the prediction errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
     relative, tips, note = {}, {}, ""
@@ -163,7 +169,7 @@ def _horizon_tables(results: Results) -> list[Table]:
             head = f"{head} ({horizon.seconds:.3g} s)"
         relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
         tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
-        # On short logs there are no predictions with an observer, so the note does not explain it.
+        # The note explains the observer, if there are predictions with an observer: there are none on short logs.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
     q = {name: errors.q for name, errors in horizon.errors.items()}
@@ -196,7 +202,7 @@ def _torque_tables(results: Results) -> list[Table]:
 
 
 def _replay_tables(results: Results) -> list[Table]:
-    """Return the tables of replayed commands: per trajectory and per joint."""
+    """Return the tables of position errors under replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
         rows = {}
@@ -221,8 +227,12 @@ def _by_joint(
 ) -> Table:
     """Return a table of the errors of all predictors, with one row per joint.
 
-    title: title with the placeholder {} for the unit. quantity: position, velocity or torque, for the unit. errors:
-    {predictor: errors of all joints}.
+    Args:
+        results: the evaluation, for the names and types of the joints.
+        title: title with the placeholder {} for the unit.
+        quantity: "position", "velocity" or "torque", which determines the unit.
+        errors: {predictor: errors of all joints}.
+        note: explanation below the table.
     """
     units = [asdict(UNITS[joint_type])[quantity] for joint_type in results.joint_types]
     # If all joints have the same unit, it is in the title: a unit in each row would widen the first column.
@@ -252,7 +262,7 @@ class Figure:
     value: float
 
     def text(self) -> str:
-        """Return the value with its unit."""
+        """Return the value of the figure as text, with its unit."""
         if self.unit in ("variance", "motion"):
             return share(self.value, self.unit)
         return f"{number(self.value)} {self.unit}"

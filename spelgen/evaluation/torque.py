@@ -1,4 +1,4 @@
-"""Torque errors of inverse dynamics on measured trajectories, by one protocol for all predictors."""
+"""Torque errors of inverse dynamics on measured trajectories, by one protocol for the model and all baselines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,12 +40,16 @@ class TorqueErrors:
 
     @property
     def worst_nmse(self) -> float | None:
-        """Return the nMSE of the worst joint; None if all torques are constant."""
+        """Largest nMSE (squared error / variance of the torque) of all joints; None if all torques are constant."""
         return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
 
 
 def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueErrors:
-    """Return the torque errors of the dynamics on these samples; only `nmse_with_pauses` includes pauses."""
+    """Return the torque errors of the inverse dynamics of a predictor on `samples`.
+
+    dynamics: the model or a baseline. samples: motion and torques of each trajectory. Samples of pauses between motions
+    are used only for `nmse_with_pauses`.
+    """
     errors_by_log, by_trajectory = [], {}
     for sample in samples:
         residual, rows = predicted_torques(dynamics, sample) - sample.tau, is_moving(sample.qd)
@@ -64,7 +68,7 @@ def torque_errors(dynamics: Any, samples: Sequence[DynamicsSamples]) -> TorqueEr
 
 
 def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
-    """Return the torques of the inverse dynamics on these samples, (T, n) [Nm, N]."""
+    """Return the torques of the inverse dynamics for the motion in `samples`, (T, n) [Nm, N]."""
     motion = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
         torques: np.ndarray = dynamics.inverse_dynamics(*motion, *friction_past(dynamics, samples)).numpy()
@@ -72,7 +76,7 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the friction state (T, n, K) of K bristles and the direction of motion (T, n), in [-1, 1].
+    """Return the past of the motion on which friction depends: bristle state (T, n, K) and direction (T, n) in [-1, 1].
 
     The methods of `dynamics` that compute friction take these values as their last arguments. A value that they do not
     take is omitted (see `known_past`).
@@ -82,15 +86,18 @@ def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]
 
 
 def mean_nmse(residual: np.ndarray, torque: np.ndarray) -> float | None:
-    """Return the mean nMSE over joints; None if all torques are constant, or an error is not finite.
+    """Return the mean over joints of the nMSE, the mean squared torque error divided by the variance of the torque.
 
-    residual, torque: (T, n) [Nm, N].
+    None is returned if all torques are constant, or if an error is not finite. residual, torque: (T, n) [Nm, N].
     """
     return _mean(_nmse(residual, torque))
 
 
 def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """Return the nMSE of each joint, (n,), for residual and torque (T, n); NaN for a joint of constant torque."""
+    """Return the nMSE of each joint, (n,): the mean squared residual divided by the variance of the torque.
+
+    It is NaN for a joint of constant torque. residual, torque: (T, n) [Nm, N].
+    """
     deviation = torque.std(axis=0)
     largest = np.abs(torque).max(axis=0, initial=0.0)
     # A torque is treated as constant if its standard deviation is at the level of rounding errors.
@@ -103,7 +110,10 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def _mean(nmse: np.ndarray) -> float | None:
-    """Return the mean nMSE over the joints of varying torque; None without such a joint, or if an nMSE is infinite."""
+    """Return the mean of nMSE values (n,) over the joints of varying torque, i.e. without NaN.
+
+    None is returned without such a joint, or if an nMSE is infinite.
+    """
     varying = nmse[~np.isnan(nmse)]
     return finite(varying.mean(keepdims=True))[0] if varying.size else None
 
@@ -125,7 +135,7 @@ def coarse_torques(
             steps[joint] = step
             message = (
                 f"the torque of {joint} is logged in steps of {step:.3g}, as large as the torque itself: "
-                "its error is that of the log, and the assessment omits this joint"
+                "these steps determine its error, and the assessment omits this joint"
             )
             notes.append(Diagnostic("warning", "coarse-torque", "logs", None, message))
     return steps

@@ -68,7 +68,7 @@ class MassCurves:
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """Entries of M along a trajectory at times t (T,) [s]. by: {predictor: entries}."""
+    """M along a trajectory at times t (T,) [s]. by: {predictor: entries of M along the trajectory}."""
 
     trajectory: str
     t: Curve
@@ -117,14 +117,18 @@ def motion_traces(
     predictions: Predictions | None,
     tip: TipPosition | None,
 ) -> Traces:
-    """Return all curves of an arm under torques.
+    """Return all curves of the evaluation of an arm under torques.
 
-    dynamics: dynamics by the name of the predictor. predictions: predictions over the longest horizon.
+    Args:
+        dynamics: {name of a predictor (the model or a baseline): dynamics}.
+        logs: test logs.
+        predictions: predictions over the longest horizon; None if no horizon was evaluated.
+        tip: position of the tip as a function of q; None if the tip is unknown.
     """
     growth = None
     predicted: tuple[PredictedMotion, ...] = ()
-    # If the arm is at rest, relative errors would be divided by a change of zero, so the curves of predicted motion are
-    # omitted.
+    # If the arm is at rest in the windows, relative errors would be divided by a change of zero, so the curves of
+    # predicted motion are omitted.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions, errors, tip)
@@ -142,7 +146,10 @@ def motion_traces(
 
 
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
-    """Return the curves of an arm under position servos: the replayed logs of median and of largest error."""
+    """Return the curves of the evaluation of an arm under position servos, from the replayed logs.
+
+    The logs of median and of largest error are shown. errors: position errors of the model along each replayed log.
+    """
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
 
@@ -166,7 +173,7 @@ def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> di
 def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
     windows = predictions.windows
     seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
-    # Times are spaced geometrically, because errors grow by orders of magnitude.
+    # The times of the curve are spaced geometrically, because errors grow by orders of magnitude.
     times = np.unique(np.geomspace(1, len(seconds), TUNING.curve_times).round().astype(int)) - 1
     relative, tips = {}, {}
     for name, (q, _) in predictions.states.items():
@@ -187,13 +194,13 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
         motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
-        start = number(piece.t[first] - piece.t[0])
+        start = number(piece.t[first])
         motions.append(replace(thinned(motion, TUNING.curve_samples), start=start, error=number(error)))
     return typical_and_worst(motions)
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the quantiles over W windows of values at T times, (W, T), each (T,); NaN is treated as infinity."""
+    """Return the 10, 50 and 90 % quantiles over W windows, (T,) each, of errors (W, T) at T times; NaN is infinity."""
     ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
     last = len(ordered) - 1
     return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
@@ -215,13 +222,13 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
 
 def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Trajectory]) -> FrictionTrace:
     q = joined_column(pieces, "q")
-    # The largest speed of a joint's curve is a quantile of the logged speeds and not their maximum, because velocities
-    # that were differentiated from positions often have spikes.
+    # The largest speed of a joint's friction curve is a quantile of the logged speeds and not their maximum, because
+    # velocities that were differentiated from positions often have spikes.
     fast = np.quantile(np.abs(joined_column(pieces, "qd")), 0.995, axis=0)
-    # The grid is finer near zero, where the sign of friction changes.
+    # The grid of speeds is finer near zero, where the sign of friction changes.
     grid = np.sinh(np.linspace(-4, 4, 81)) / np.sinh(4)
-    speeds = torch.from_numpy(grid[:, None] * fast)  # (81, n): 81 speeds of each joint
-    # (81, n, n): entry [k, j] is a velocity vector at which only joint j moves.
+    speeds = torch.from_numpy(grid[:, None] * fast)  # speeds: (81, n), 81 speeds of each joint
+    # velocity vectors (81, n, n): entry [k, j] is the vector at which joint j has its speed k and the other joints rest
     alone = torch.diag_embed(speeds)
     positions = torch.from_numpy(q.mean(axis=0)).expand_as(alone)
     curves = {}

@@ -59,7 +59,7 @@ class EvaluationTuning:
     # [s] Length of the windows that are replayed from a measured state.
     replay_window: float = 1.0
 
-    # Resolution of the curves of a report.
+    # The following constants are the resolution of the curves of a report.
 
     # [s] Length of the part of a log of which charts show the torques.
     torque_seconds: float = 10.0

@@ -31,7 +31,7 @@ Limits = Sequence[tuple[float, float] | None]
 
 @dataclass
 class _Uses:
-    """Uses of a model.
+    """Uses of a model, which the assessment functions fill in.
 
     good: uses for which the model is sufficient. bad: uses for which the model is not sufficient. proofs: texts with
     the errors from which this was decided.
@@ -91,7 +91,10 @@ def verdict(
 
 
 def _assess_torques(results: Results, uses: _Uses) -> None:
-    """Add the uses that the torque error of the worst joint permits, since a mean over joints would hide this joint."""
+    """Add to `uses` the uses for which the model's torque error is small enough, and the error as a proof.
+
+    The joint with the largest error decides, since a mean over joints would hide this joint.
+    """
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
         return
@@ -153,13 +156,13 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean of RMS error / RMS change over the horizon; infinity if this relative error is unknown."""
+    """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
     error = None if errors is None else errors.mean_relative_rms
     return math.inf if error is None else error
 
 
 def _better_baselines(results: Results) -> list[str]:
-    """Return sentences about the horizons at which constant velocity or another baseline has a smaller error."""
+    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque."""
     times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -210,7 +213,8 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)  # None becomes NaN.
+        # An unknown error (None) becomes NaN.
+        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
@@ -246,9 +250,15 @@ def _recommendations(
     worst: str,
     speed: str,
 ) -> dict[str, str]:
-    """Return motions to record, with reasons, the most useful first.
+    """Return {motion to record: reason}, the most useful motion first.
 
-    worst, speed: name of the worst joint and words for its worst speed, see `_worst_joint`.
+    Args:
+        results: the evaluation.
+        identified: content of least_squares.json, with the range of motion of the training logs.
+        limits: position limits of the joints.
+        independent: names of joints on whose position the dynamics do not depend.
+        worst: name of the worst joint, see `_worst_joint`.
+        speed: words for the speed at which its error is largest, see `_worst_joint`.
     """
     recommendations = {}
     trained = identified.get("coverage") or {}
@@ -293,7 +303,7 @@ def _outside(
         for name, inner, outer in ranges:
             if quantity == "q" and name in independent:
                 continue
-            # 10 % is tolerated, because models extrapolate over small distances.
+            # An excess of 10 % of the range is tolerated, because models extrapolate over small distances.
             room = 0.1 * (inner["high"] - inner["low"])
             if outer["low"] < inner["low"] - room or outer["high"] > inner["high"] + room:
                 exceeded.append(f"{word} of {name}")

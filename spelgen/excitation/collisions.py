@@ -115,7 +115,7 @@ class Collisions:
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first contact of a motion; None if there is none.
+        """Return the first distance of a motion that is below the clearance; None if there is none.
 
         Distances are computed at selected positions of the motion. From one selected position to the next, a distance
         changes by at most 1.5 times the clearance. Between two selected positions it therefore differs by at most 0.75
@@ -207,7 +207,8 @@ class Collisions:
         """
         neighbour = {}
         for index, body in enumerate(chain.bodies):
-            # The shapes of a body and of its parent overlap. A parent without a shape is replaced by its own parent.
+            # Shapes of a body and its parent overlap at the joint, so this pair is not checked. If the parent has no
+            # shape, the next ancestor with a shape is used.
             parent = body.parent
             while parent >= 0 and parent not in self._bodies:
                 parent = chain.bodies[parent].parent

@@ -48,7 +48,7 @@ class Criterion:
         self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd at the samples of the criterion, (3, T, n), for parameters (size,)."""
+        """Return q, qd and qdd for parameters (size,) at the T times of the criterion, (3, T, n)."""
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:
@@ -93,7 +93,10 @@ class Criterion:
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor of K parameters, (T, n, K): bodies, then armature and friction (`FRICTION.columns`)."""
+        """Return the regressor of the torque for states (3, T, n), (T, n, K), with K parameters.
+
+        The parameters are the inertial parameters of the bodies, then armature and friction (`FRICTION.columns`).
+        """
         q, qd, qdd = states
         direction = (qd / FRICTION.coulomb_smoothing_velocity).tanh()
         effects = torch.stack([qdd, qd, direction, torch.ones_like(qd)])

@@ -45,9 +45,9 @@ def excite(
 ) -> Excitation:
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    The motion keeps the limits of position and velocity, also of <mimic> joints. It keeps effort limits, too, if the
-    URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision geometry and
-    Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
+    The motion keeps the limits of position and velocity, also of <mimic> joints. The motion keeps effort limits, too,
+    if the URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision
+    geometry and Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
 
     Args:
         arm: configured arm.
@@ -129,9 +129,9 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of acceleration, and the limit of the approach, (n,).
+    """Return the bounds with a limit of the acceleration, and the acceleration limits of the approach, (n,).
 
-    Without a limit, the approach reaches its largest speed in one second.
+    Without an acceleration limit, the approach reaches its largest speed in one second.
     """
     if acceleration is None:
         return bounds, bounds.speed
@@ -178,7 +178,7 @@ def _collisions(
 def _start(
     start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
 ) -> np.ndarray:
-    """Return the position from which the approach starts, (n,) [rad, m].
+    """Return the position at which the approach to the exciting motion starts, (n,) [rad, m].
 
     Raises SettingsError for an invalid position, and ArmError for a position with a contact.
     """
@@ -215,7 +215,10 @@ def _improved(
         return initial
 
     def evaluate(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,), and store the parameters if the criterion is the smallest."""
+        """Return the criterion and its gradient (size,) at parameters (size,), for the optimizer.
+
+        The parameters are stored in `best` if the criterion is smaller than at all earlier parameters.
+        """
         nonlocal best, lowest, done
         value, gradient = criterion.value_and_gradient(parameters)
         done += 1

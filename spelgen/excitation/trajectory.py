@@ -36,7 +36,7 @@ class Motion:
     qdd: np.ndarray
 
     def then(self, later: Motion) -> Motion:
-        """Return this motion followed by a later one, which must begin at the last position of this motion."""
+        """Return this motion followed by `later`, a motion that begins at the last position of this motion."""
         second = later.t + self.t[-1], later.q, later.qd, later.qdd
         # The first sample of the later motion is omitted: it repeats the last position of this motion.
         pairs = zip((self.t, self.q, self.qd, self.qdd), second, strict=True)
@@ -96,7 +96,7 @@ class ExcitationTrajectory:
 
     @property
     def size(self) -> int:
-        """Number of parameters."""
+        """Number of parameters of a motion: 2 H + 2 per joint, with the number H of harmonics."""
         return self.joints * (2 * self.harmonics + 2)
 
     def motion(self, parameters: np.ndarray, t: np.ndarray) -> Motion:
@@ -107,9 +107,9 @@ class ExcitationTrajectory:
     def states(self, parameters: Tensor, t: Tensor) -> Tensor:
         """Return q, qd and qdd, (3, T, n), for parameters (size,) at times t (T,) [s].
 
-        The motion keeps its bounds at all times. They are enforced at grid points with a safety factor: the maximum of
-        a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per period of the
-        highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
+        The motion keeps its bounds at all times. The bounds are enforced at grid points with a safety factor: the
+        maximum of a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per
+        period of the highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
         points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
@@ -123,10 +123,11 @@ class ExcitationTrajectory:
         if self.bounds.acceleration is not None:
             strongest = accelerations.abs().amax(dim=0) / GRID_RATIO
             largest = torch.minimum(largest, torch.from_numpy(self.bounds.acceleration) / strongest)
-        # Any value of the parameter gives an amplitude between zero and the largest amplitude within the bounds.
+        # Any value of the amplitude parameter gives an amplitude between zero and the largest amplitude within the
+        # bounds.
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
         # `free` is the width of the range of offsets for which the motion keeps the position range, (n,). The tanh maps
-        # any value of the parameter into this range.
+        # any value of the offset parameter into this range.
         free = room - 2 * amplitude * half
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)
@@ -137,7 +138,7 @@ class ExcitationTrajectory:
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the sine and cosine coefficients (2, H, n) and the offset parameters (n,) for parameters (size,)."""
+        """Return sine and cosine coefficients (2, H, n) and offset parameters (n,) for parameters (size,)."""
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
         k = self._numbers()
@@ -152,9 +153,9 @@ class ExcitationTrajectory:
 
         coefficients: sine and cosine coefficients, (2, H, n).
         """
-        frequencies = self._numbers() * 2 * pi / self.duration  # (H,) [rad/s]
+        frequencies = self._numbers() * 2 * pi / self.duration  # frequencies: (H,) [rad/s]
         angles = torch.outer(t, frequencies)
-        sine, cosine = angles.sin(), angles.cos()  # (T, H) each
+        sine, cosine = angles.sin(), angles.cos()  # sine and cosine: (T, H)
         a, b = coefficients
         first, second = frequencies[:, None], (frequencies**2)[:, None]
         position = sine @ a + cosine @ b

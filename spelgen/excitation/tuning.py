@@ -30,13 +30,13 @@ class ExcitationTuning:
     prismatic_speed: float = 0.25
     # [1] Largest total number of triangles of the collision meshes whose convex hulls are computed.
     faces: int = 20_000
-    # [1] Random positions at which pairs of links are tested for a permanent overlap.
+    # [1] Number of random positions at which pairs of links are tested for a permanent overlap.
     positions: int = 200
     # [1] A pair of links is not compared if it is too close at this fraction of the random `positions` or more, as in
     # MoveIt's setup assistant.
     overlap: float = 0.95
-    # [1] Distance below which the criterion has a penalty, divided by the clearance. It is greater than one, because
-    # the penalty is computed only at samples, between which distances may be smaller.
+    # [1] Distance below which the criterion has a penalty, divided by the clearance. The number is greater than one,
+    # because the penalty is computed only at samples, between which distances may be smaller.
     margin: float = 2.0
     # [1] Weight of the penalty on distances in the criterion. Weights of 10, 1 and 0.1 give condition numbers of 368,
     # 34 and 18 for a Panda with 36 shapes, all without a contact.

@@ -49,8 +49,9 @@ _ENTRIES = (
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
-    """Return the C functions that only the estimator calls: the terms of the momentum balance, and payload torques.
+    """Return the C functions that only the estimator of payload and external torques calls.
 
+    These functions compute the terms of the momentum balance, and payload torques. model: the model as NumPy arrays.
     levels: noise levels; ``levels.point``, the tip in the frame of the last body, is a constant in the C code.
     """
     n, bodies = model.n, model.arm.bodies
@@ -96,8 +97,11 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
 
 
 def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
-    """Return {file name: text} of the estimator's header and source."""
-    # C has no empty arrays, so a model without bristles gets one unused zero.
+    """Return {file name: text} of the C header and source of the estimator of payload and external torques.
+
+    levels: noise levels, which are constants in the C code.
+    """
+    # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
     breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": TUNING.load_prior,
@@ -120,7 +124,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
     }
-    # The generated code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
+    # The generated C code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
     # with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     return {
@@ -130,5 +134,5 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
 
 
 def _numbers(values: Iterable[float]) -> list[str]:
-    """Return C literals that give exactly the same doubles as these values."""
+    """Return the values as C literals that give exactly the same doubles."""
     return ["INFINITY" if math.isinf(value) else repr(float(value)) for value in values]

@@ -18,12 +18,15 @@ from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
-# Warnings are errors here, because users compile the files with the strict flags of their own projects.
+# Compiler warnings are errors, because users compile the files with the strict flags of their own projects.
 _FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-fPIC", "-shared")
 
 
 def export_c(trained: Trained) -> Exported:
-    """Return the C files of a trained model. Raises RunError if their results differ from the results of the model."""
+    """Return the C files of a trained model with a README, checked against the model.
+
+    Raises RunError if results of the C code and of the model differ.
+    """
     files, checked = c_files(trained)
     name = trained.described.name
     use = (
@@ -35,7 +38,10 @@ def export_c(trained: Trained) -> Exported:
 
 
 def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
-    """Return {file name: content} of the C files, and a sentence with the result of the parity check."""
+    """Return {file name: content} of the C files of a model, and a sentence with the result of the parity check.
+
+    Raises RunError if results of the C code and of the model differ.
+    """
     model, levels = trained.described, trained.levels
     entries, texts = dict(trained.entry_points), {}
     if levels is not None:
@@ -59,12 +65,15 @@ def c_files(trained: Trained) -> tuple[dict[str, bytes], str]:
 
 
 def compiler() -> str | None:
-    """Return the path of a C compiler; None if there is none."""
+    """Return the path of the first C compiler on this machine among gcc, clang and cc; None if there is none."""
     return next(filter(None, map(shutil.which, ("gcc", "clang", "cc"))), None)
 
 
 def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -> Path:
-    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages."""
+    """Compile C files to a shared library and return its path. Raises RunError with the compiler's messages.
+
+    program: path of the C compiler. flags: further options of the compiler.
+    """
     sources = [sources] if isinstance(sources, Path) else sources
     library = sources[0].with_suffix(".so")
     command = [program, *_FLAGS, *flags, *map(str, sources), "-o", str(library), "-lm"]
@@ -78,7 +87,10 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function for `check_parity`, which calls an entry point of a compiled export for arrays of states."""
+    """Return a function for `check_parity`, which calls a compiled function, such as inverse_dynamics, per state.
+
+    library: shared library of the export. functions: C functions in the library. dtype: type ``real`` of the C code.
+    """
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
     # The friction state is double even if all other arrays are float.
@@ -97,7 +109,7 @@ def called_by_c(
             # Outputs start as NaN, so that the parity check fails if a function does not write an entry.
             outputs[key] = np.full((states, *shape), np.nan, dtypes.get(key, dtype))
         arguments += outputs.values()
-        # The functions are called once per state, as by a control loop.
+        # The exported C functions have no batch dimension, so each is called once per state.
         for state in range(states):
             rows = [array[state : state + 1] for array in arguments]
             call(*(row.ctypes.data_as(ctypes.c_void_p) for row in rows))

@@ -16,7 +16,7 @@ from spelgen.exporting.model_expressions import RESIDUAL
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.templates import render
 
-_WIDTH = 112  # maximum length of a line
+_WIDTH = 112  # maximum number of characters in a line of a C table
 
 _CALLS = (
     (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
@@ -33,7 +33,10 @@ _CALLS = (
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms."""
+    """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms.
+
+    The statements are the first ones in the C function of an entry point. names: names of `residual_symbols`.
+    """
     uncomputed = set(names)
     symbols = residual_symbols(model)
     variables = []
@@ -149,14 +152,14 @@ def _polynomials(spline: BSpline) -> np.ndarray:
 
 
 def _spline_fields(splines: Mapping[int, BSpline]) -> list[str]:
-    """Return one C initialiser per spline: "joint, first knot, knot spacing"."""
+    """Return one C initialiser per spline: "joint, first knot, knot spacing". splines: {index of a joint: spline}."""
     spacings = [float(np.ptp(spline.t) / (len(spline.t) - 1)) for spline in splines.values()]
     firsts = [float(spline.t[3]) for spline in splines.values()]
     return [f"{joint}, {x!r}, {h!r}" for joint, x, h in zip(splines, firsts, spacings, strict=True)]
 
 
 def _table(name: str, values: np.ndarray) -> str:
-    """Return the definition of a constant C array with unrounded values, (rows,) or (rows, columns)."""
+    """Return the C definition of a constant array `name` with unrounded values, (rows,) or (rows, columns)."""
     scalar = "short" if values.dtype.kind == "i" else "real"
     # repr keeps all digits, so that the C compiler gets the same double.
     size = ""

@@ -13,11 +13,11 @@ from spelgen.exporting.description import EntryPoint, TrainedModel
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.templates import render
 
-_WIDTH = 118  # maximum length of a line
+_WIDTH = 118  # maximum number of characters in a line of a C function
 FRICTION_STATES = ("z", "z_next", "z_start", "low", "high")
 """Inputs and outputs that are friction states, of type double; all others are of type ``real``."""
-# {0} and {1} are operands. SIN, COS and other macros are the functions for float or double. tanh is used only for the
-# friction state, which is always double.
+# C expressions of the operations of CasADi: {0} and {1} are operands. SIN, COS and other macros are the functions for
+# float or double. tanh is used only for the friction state, which is always double.
 _FORMS = {
     ca.OP_NEG: "-{0}",
     ca.OP_SQ: "{0} * {0}",
@@ -41,12 +41,15 @@ _FORMS = {
 
 @dataclass(frozen=True)
 class CFunction:
-    """C code of an entry point.
+    """An entry point, a function of the model such as inverse_dynamics, in C.
 
     Attributes:
+        entry: the entry point.
         symbol: name of the C function.
         shapes: {output: (rows,) or (rows, columns)}.
         about: text of the comment above the function.
+        signature: C declaration of the function, without a semicolon.
+        definition: C definition of the function.
         operations: upper bound of the number of arithmetic operations of a call, without networks.
     """
 
@@ -60,13 +63,13 @@ class CFunction:
 
 
 def c_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> list[CFunction]:
-    """Return the C functions of the entry points of a model."""
+    """Return the C functions of a model for the given entry points (functions such as inverse_dynamics)."""
     expressions = expression_functions(model, entries)
     return [c_function(model, entry, expressions[name]) for name, entry in entries.items()]
 
 
 def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -> Path:
-    """Write the model's header and source into a folder; return the path of the source."""
+    """Write the C header and source of a model into a folder; return the path of the source."""
     source = folder / f"{model.name}.c"
     for suffix, text in c_texts(model, functions).items():
         source.with_suffix(suffix).write_text(text)
@@ -103,7 +106,11 @@ def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, st
 
 
 def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) -> CFunction:
-    """Return the C function of an entry point, which computes the outputs of a CasADi function."""
+    """Return the C function of an entry point, which computes the outputs of a CasADi function.
+
+    entry: function of the model, such as inverse_dynamics. function: CasADi function of scalar expressions, made by
+    `named_function`; its residual terms are computed in C.
+    """
     # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))
     variables, lines = _statements(function, list(entry.outputs))
@@ -142,7 +149,10 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
 
 
 def _parameter(model: TrainedModel, name: str, size: str) -> str:
-    """Return the declaration of an array parameter of a C function; size: number of its entries, a C expression."""
+    """Return the C declaration of a parameter `name` of a function, an array.
+
+    size: number of entries of the array, a C expression.
+    """
     # C has no arrays of length zero: z is a pointer, which may be NULL for a model without bristles.
     return f"double *{name}" if name in FRICTION_STATES else f"{model.name}_real {name}[{size}]"
 
@@ -165,16 +175,18 @@ def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str
         if operation == ca.OP_OUTPUT:
             output, index = writes
             rows, columns = shapes[output]
-            row_by_row = index % rows * columns + index // rows  # index in the row-major C array
+            # `row_by_row`: index in the row-major C array
+            row_by_row = index % rows * columns + index // rows
             lines.append(f"{outputs[output]}[{row_by_row}] = a{reads[0]};")
             continue
         if operation == ca.OP_INPUT:
             value = f"{inputs[reads[0]]}[{reads[1]}]"
         elif operation == ca.OP_CONST:
-            value = f"R({function.instruction_constant(k)!r})"  # the C literal has all digits of the constant
+            # the C literal `value` has all digits of the constant
+            value = f"R({function.instruction_constant(k)!r})"
         else:
             value = _FORMS[operation].format(*(f"a{slot}" for slot in reads))
-        # A dict is used as an ordered set: its keys are unique and in the order of the first assignments.
+        # The dict `variables` is used as an ordered set: its keys are unique and in the order of the first assignments.
         variables[f"a{writes[0]}"] = None
         lines.append(f"a{writes[0]} = {value};")
     return list(variables), lines

@@ -26,7 +26,10 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_casadi(trained: Trained) -> Exported:
-    """Return one file per entry point. Raises RunError if results of a function and of the model differ."""
+    """Return one CasADi file per entry point, a function of the model such as inverse_dynamics, with a README.
+
+    Raises RunError if results of a function and of the model differ.
+    """
     model = trained.described
     functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
@@ -41,7 +44,7 @@ def export_casadi(trained: Trained) -> Exported:
 
 
 def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return {name of an entry point: CasADi function}.
+    """Return {name of an entry point, such as inverse_dynamics: CasADi function}.
 
     Rigid bodies and friction are SX (scalar) expressions; residual terms are MX (matrix) expressions.
     """
@@ -61,9 +64,9 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
-    """Return ``function`` as a function of the inputs of ``entry`` only.
+    """Return a CasADi function that computes the residual terms of a model and passes them to ``function``.
 
-    The result computes the residual terms and passes them to ``function``, whose inputs are the inputs of ``entry``,
+    The inputs of the result are the inputs of the entry point ``entry``. The inputs of ``function`` are these inputs,
     then the residual terms.
     """
     needed = residuals_needed(function)
@@ -77,20 +80,20 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
 
 
 def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the function whose output k is the Jacobian of ``function`` with respect to its input k.
+    """Return the CasADi function of the Jacobians of ``function`` with respect to its inputs, one output per Jacobian.
 
-    entry: entry point of the result; it has at most as many outputs as inputs. function: function with a single output
-    and the inputs of ``entry``.
+    Output k is the Jacobian with respect to input k. entry: entry point of the result; it has at most as many outputs
+    as inputs. function: function with a single output and the inputs of ``entry``.
     """
     arguments = function.mx_in()
     (output,) = function.call(arguments)
-    # Jacobians are dense: callers expect n x n numbers, including structural zeros.
+    # The Jacobians are made dense: callers expect n x n numbers, including structural zeros.
     derivatives = [ca.densify(ca.jacobian(output, x)) for x in arguments[: len(entry.outputs)]]
     return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
 
 
 def _saved(function: ca.Function) -> bytes:
-    # CasADi cannot serialise a function to memory, only to a file.
+    # The function is saved to a file and read again, since CasADi cannot serialise a function to memory.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "function.casadi")
         function.save(str(path))
@@ -116,9 +119,9 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return {name of a symbol in `residual_expressions`: its value as an expression in q and qd}.
+    """Return {name of a residual term, see `residual_expressions`: its value as an expression in q and qd}.
 
-    q, qd: symbols, (n, 1) each; qd is None if no term that depends on velocity is needed.
+    q, qd: symbols, (n, 1) each; qd: None if no term that depends on velocity is needed.
     """
     residuals = model.residuals
     values = {}
@@ -130,7 +133,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
             values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
-        # The gradient in reverse mode takes about as long as one evaluation of the network.
+        # The gradient of V in reverse mode takes about as long as one evaluation of the network.
         values["gravity"] = ca.gradient(values["energy"], q)
     # The torque of splines and ripple is computed as the derivative of their potential energy, so that torque and
     # energy are consistent.
@@ -144,10 +147,10 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
 
 
 def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:
-    """Return the outputs of a network, (outputs, 1), for the inputs cos q, sin q and q, (3 n, 1)."""
+    """Return the outputs of a residual network, (outputs, 1), for its inputs cos q, sin q and q, (3 n, 1)."""
     layer = encoded
     for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
-        # CasADi has no sigmoid function.
+        # CasADi has no sigmoid function, so it is computed from exp.
         layer = 1 / (1 + ca.exp(-(constant(weight) @ layer + bias)))
     return constant(network.weights[-1]) @ layer + network.biases[-1]
 

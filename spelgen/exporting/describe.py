@@ -31,6 +31,8 @@ class Trained:
     """A trained model, its arm, and options of the export.
 
     Attributes:
+        model: the trained model.
+        arm: arm of the model.
         entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
         intervals: tables of the fitted parameters with 95 % intervals, for the README.
         float32: whether ONNX and torch programs compute in float32; otherwise in float64.
@@ -46,17 +48,23 @@ class Trained:
 
     @cached_property
     def described(self) -> description.TrainedModel:
-        """The model with NumPy arrays in place of PyTorch modules. Raises RunError for a model without rigid bodies."""
+        """The trained model with NumPy arrays in place of PyTorch modules.
+
+        Raises RunError for a model without rigid bodies.
+        """
         return describe(self.model, self.arm)
 
     @cached_property
     def entry_points(self) -> dict[str, description.EntryPoint]:
-        """The entry points to export, by name. Raises RunError for unknown names in ``entries``."""
+        """The functions of the model to export, by name, such as inverse_dynamics.
+
+        Raises RunError for unknown names.
+        """
         return description.entry_points(self.described, self.entries)
 
     @property
     def tip(self) -> str:
-        """The name of the tip link."""
+        """Name of the link that is the tip of the arm."""
         return self.arm.tip or self.arm.robot.last_link(self.arm.chain.joint_names)
 
     @property
@@ -66,8 +74,12 @@ class Trained:
 
 
 def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
-    """Return a trained model as NumPy arrays. Raises RunError for a model without rigid bodies."""
-    # A copy in double precision on the CPU: the user's model may be in single precision or on a GPU.
+    """Return a trained model as NumPy arrays, from which C and CasADi code is generated.
+
+    Raises RunError for a model without rigid bodies. loaded: arm of the model.
+    """
+    # The arrays are made from a copy in double precision on the CPU: the user's model may be in single precision or on
+    # a GPU.
     exact = copy.deepcopy(model).double().cpu().requires_grad_(False)
     if not isinstance(exact, RigidBodyDynamics):
         preset = model.spec.options.preset
@@ -104,7 +116,7 @@ def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
 
 
 def identifier(text: str) -> str:
-    """Return a text as an identifier that is valid in all exported languages: ASCII letters, digits and _."""
+    """Return `text` as an identifier that is valid in all exported languages: ASCII letters, digits and _."""
     plain = _letters_and_digits(text)
     if not plain or plain[0].isdigit() or keyword.iskeyword(plain):
         return f"arm_{plain}".rstrip("_")
@@ -123,7 +135,7 @@ def array(value: Tensor) -> np.ndarray:
 
 
 def servos_of(model: ArmModel) -> description.Servos | None:
-    """Return the position servos of a model; None if it has none."""
+    """Return the constants of the position servos of a model as NumPy arrays; None for a model under torques."""
     if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
@@ -131,7 +143,7 @@ def servos_of(model: ArmModel) -> description.Servos | None:
 
 
 def _residuals(model: ArmModel) -> description.Residuals:
-    """Return the residual terms of a model, without the terms that are zero."""
+    """Return the residual terms of a model as NumPy arrays and splines, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
     # The residual term of M is a sum of functions; entries to which no function contributes are omitted.
@@ -185,9 +197,9 @@ def _network(
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
-    """Return {index of a joint: cubic spline}; joints whose coefficients are all zero are omitted.
+    """Return the residual splines of joints: {index of a joint: cubic spline of q}, without splines that are zero.
 
-    weights: coefficients of the B-splines of each joint, (n, splines).
+    terms: residual terms, for the knots. weights: coefficients of the B-splines of each joint, (n, splines).
     """
     splines = {}
     for joint in torch.nonzero(weights.any(dim=1)).flatten().tolist():
@@ -200,11 +212,12 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 
 
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonics, ...]:
-    """Return the torque ripple: up to two elements per joint, for harmonics of the joint and of its motor.
+    """Return the torque ripple of all joints: up to two elements per joint, for harmonics of joint and motor.
 
-    weights: (n, 2 H), coefficients of H cosines, then of H sines. The H frequencies are harmonics of a revolution of
-    the joint, then harmonics of a revolution of the motor. An export computes the harmonics k = 1, 2, ... of one
-    frequency in sequence. Harmonics with zero amplitude are therefore removed only after the last nonzero one.
+    terms: residual terms, for the frequencies. weights: (n, 2 H), coefficients of H cosines, then of H sines. The H
+    frequencies are harmonics of a revolution of the joint, then harmonics of a revolution of the motor. An export
+    computes the harmonics k = 1, 2, ... of one frequency in sequence. Harmonics with zero amplitude are therefore
+    removed only after the last nonzero one.
     """
     ripple = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))

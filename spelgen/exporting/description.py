@@ -38,14 +38,16 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """The residual terms of a model that are not zero. Splines are cubic, and zero outside of their knots.
+    """The nonzero residual terms of a model, which are added to its rigid bodies.
+
+    Splines are cubic, and zero outside of their knots.
 
     Attributes:
         mass: network whose outputs are added to M.
         entries: (row, column) in the lower triangle of M to which each output is added.
         potential: network whose output is added to V.
         torque: {joint: spline of q that is added to dV/dq [Nm, N]}.
-        ripple: further terms of dV/dq [Nm].
+        ripple: harmonics in the position of a joint that are added to dV/dq [Nm].
         friction: {joint: spline of q, logarithm of the factor on the friction of the joint's drive}.
     """
 
@@ -61,12 +63,12 @@ class Residuals:
 
     @property
     def has_torque(self) -> bool:
-        """Whether any joint has a torque spline or ripple."""
+        """True if any joint has a residual torque that depends on its position, a spline or ripple."""
         return bool(self.torque or self.ripple)
 
 
 def spline_energy(spline: BSpline) -> BSpline:
-    """Return the potential energy of a torque spline, its antiderivative.
+    """Return the potential energy [J] of a torque spline as a function of q, its antiderivative.
 
     As in the runtime, its constant is chosen such that the energies at both ends differ only in sign.
     """
@@ -100,10 +102,12 @@ class TrainedModel:
 
     Attributes:
         name: identifier of the robot in code.
+        arm: kinematic chain of the arm.
         joint_labels: names of the joints for comments, only letters, digits and _.
         inertias: (bodies, 10), inertial parameters in the frames of the joints.
         constant_mass: (n, n), armature and constant residual terms of M.
         motors: C, (n, n), motor velocities = C qd.
+        residuals: residual terms that depend on q.
         friction: the ``FrictionConstants`` of the runtime, as arrays.
         breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
         inputs: G, (n, n), joint torques = G times motor torques.
@@ -111,6 +115,8 @@ class TrainedModel:
         torque_offset: (n,), measured torque at zero torque.
         friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
             without measuring it.
+        tip: frame of the tip.
+        servos: position servos of the joints; None for an arm under torques.
     """
 
     name: str
@@ -131,12 +137,12 @@ class TrainedModel:
 
     @property
     def n(self) -> int:
-        """Number of joints."""
+        """Number of joints of the arm."""
         return len(self.arm.coordinates)
 
     @property
     def memory(self) -> int:
-        """Number of bristles, the size of the friction state z."""
+        """Number of friction bristles of all joints, the size of the friction state z; 0 without a state."""
         return int(self.breakaway.size)
 
     @property
@@ -147,7 +153,7 @@ class TrainedModel:
 
 @dataclass(frozen=True)
 class EntryPoint:
-    """A function that exports contain, with the names of its arguments and results.
+    """A function of the model that exports contain, such as inverse_dynamics.
 
     Attributes:
         about: description.
@@ -229,21 +235,24 @@ ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 
 
 def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
-    """Return {name: entry point} for the given names. Raises RunError for unknown names.
+    """Return {name: entry point}, the functions of a model that an export contains. Raises RunError for unknown names.
 
-    names: names of entry points; empty: all that the model has, except derivatives.
+    names: names of entry points, such as inverse_dynamics; empty: all that the model has, except derivatives.
     """
     available = list(ENTRY_POINTS)
     if model.servos is None:
         available.remove("servo_torque")
     if not names:
-        # Derivatives are rarely needed, but would be two thirds of the code.
+        # Derivatives are omitted by default: they are rarely needed, but would be two thirds of the code.
         names = [name for name in available if not name.endswith("_derivatives")]
     return {name: ENTRY_POINTS[name] for name in select_names(names, available)}
 
 
 def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
-    """Return the given names in the order of `available`; all if none are given. Raises RunError for unknown names."""
+    """Return the `names` of functions in the order of `available`; all if there are none.
+
+    Raises RunError for names that are not available.
+    """
     options = list(available)
     for name in names:
         if name not in options:

@@ -54,7 +54,7 @@ def export(
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
-    # Only a fit has intervals and noise levels; a model has neither.
+    # Only a fit has intervals of its parameters and noise levels, which the export contains, too; a model has neither.
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:

@@ -14,13 +14,13 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
-# The README of every format states these units, since every export has the model's units.
+# The README of every format states the units of the model, which are the units of every export.
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 
 @dataclass(frozen=True)
 class Exporter:
-    """A format of exports.
+    """A format to which models are exported, such as urdf or onnx.
 
     Attributes:
         function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported
@@ -59,10 +59,11 @@ else:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Exported:
-    """A trained model in the format of another tool.
+    """A trained model in the format of another tool: the content of its files.
 
     Attributes:
         to: name of the format.
+        robot: name of the arm.
         files: {path in the folder: content}. For a format that is a single file, the keys are extensions such as
             ``.urdf``, which replace the extension of the file name.
         summary: sentences for the user.
@@ -95,14 +96,14 @@ class Exported:
 
 
 def format_by_extension(path: Path) -> str:
-    """Return the name of the format with this file name extension. Raises RunError if no format has it."""
+    """Return the name of the export format with the extension of `path`. Raises RunError if no format has it."""
     if path.suffix not in _BY_SUFFIX:
         raise RunError(f"the name {path.name!r}", expected="FILE.urdf, FILE.xml or --to FORMAT")
     return _BY_SUFFIX[path.suffix]
 
 
 def require_fitting(to: str, path: Path) -> None:
-    """Raise RunError if the extension of a path contradicts the format."""
+    """Raise RunError if the extension of an output path contradicts the export format `to`."""
     suffix = EXPORTERS[to].suffix
     if path.suffix == suffix or (not suffix and path.is_dir()):
         return
@@ -123,7 +124,7 @@ def with_readme(
     summary: Sequence[str],
     example: Sequence[str] = (),
 ) -> Exported:
-    """Return an export whose files include a README.
+    """Return an export whose files include a README for its users.
 
     Args:
         trained: the model and its arm.

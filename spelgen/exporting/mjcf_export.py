@@ -37,7 +37,7 @@ Links have contacts with other objects but not with each other, since shapes of 
 
 
 def export_mjcf(trained: Trained) -> Exported:
-    """Return the MJCF file of a trained model.
+    """Return the MJCF file of a trained model with a README, checked in MuJoCo.
 
     If the model computes M by networks, the file has the rigid bodies that approximate it best (see
     `rigid_body_projection`). Raises RunError if M, bias or forward dynamics of MuJoCo differ from these rigid bodies.
@@ -70,16 +70,21 @@ def export_mjcf(trained: Trained) -> Exported:
 
 
 def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNING.states) -> Parity:
-    """Compare M, bias and frictionless forward dynamics of MuJoCo and of the rigid bodies; return the differences.
+    """Compare MuJoCo's simulation of an MJCF file with the exported rigid bodies; return the differences.
 
-    The inputs of the actuators are torques, or commands of position servos. Raises RunError if a difference is too
-    large.
+    M, bias and frictionless forward dynamics are compared at random states. The inputs of the actuators are torques, or
+    commands of position servos. Raises RunError if a difference is too large.
+
+    Args:
+        text: content of the MJCF file.
+        projection: rigid bodies and friction of the model.
+        states: number of random states.
     """
     arm, servos = projection.arm.chain, projection.servos
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # The dead zone is omitted, since MuJoCo's position actuators have none.
+        # The dead zone of servos is omitted, since MuJoCo's position actuators have none.
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
@@ -125,14 +130,14 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
-    # The constraint is the linear map from the coordinates to the positions of all joints, including mimic joints.
+    # `constraint` is the linear map from the coordinates to the positions of all joints, including mimic joints.
     constraint = body_constraint(arm)
     # The rows of the map are sorted in MuJoCo's order of joints, the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
     jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
     data = mujoco.MjData(model)
-    # MuJoCo stores a sparse M, which mj_fullM expands into this array.
+    # `full`: MuJoCo stores a sparse M, which mj_fullM expands into this array.
     full = np.zeros((model.nv, model.nv))
     values: dict[str, list[np.ndarray]] = {"mass_matrix": [], "bias": [], "forward_dynamics": []}
     for position, velocity, control in zip(q, qd, controls, strict=True):
@@ -159,11 +164,12 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
-    # MuJoCo's default unit is degrees. With autolimits each given range is a limit.
+    # MuJoCo's default unit of angles is degrees. With autolimits each given range is a limit.
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
-    # If the speed of a motor depends on several joints, its inertia is the armature of a tendon instead of a joint.
+    # `is_coupled`: motors whose speed depends on several joints; their inertia is the armature of a tendon, not of a
+    # joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
     for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
@@ -199,13 +205,13 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         if not len(section):
             root.remove(section)
     omitted = _add_shapes(root, elements, projection.arm)
-    # Indentation makes the file readable.
+    # The XML is indented, so that the file is readable.
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
-    """Return the MJCF attributes of the joint with the coordinate k.
+    """Return the MJCF attributes of the joint with the coordinate k: armature, friction and limits.
 
     is_coupled: (n,), True for a motor whose speed depends on several joints.
     """
@@ -224,7 +230,10 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
-    """Add a motor for each column of G: at a joint, or at a tendon if the motor acts on several joints."""
+    """Add a MuJoCo motor for each column of G: at a joint, or at a tendon if the motor acts on several joints.
+
+    actuators, tendons: elements of the MJCF to which motors and tendons are added.
+    """
     joints = projection.arm.chain.coordinates
     for k, column in enumerate(projection.inputs.T):
         name, driven = joints[k].name, np.flatnonzero(column)
@@ -237,7 +246,7 @@ def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: 
 
 
 def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos: Servos) -> None:
-    """Add a position actuator for each joint. The delay of the servos cannot be represented in the file."""
+    """Add a MuJoCo position actuator for each joint. The delay of the servos cannot be represented in the file."""
     for k, joint in enumerate(joints):
         limit = servos.limit[k]
         # MuJoCo refuses an infinite force range; without the attribute the force is unlimited.
@@ -249,7 +258,10 @@ def _add_servos(actuators: etree._Element, joints: Sequence[Coordinate], servos:
 def _add_tendon(
     tendons: etree._Element, name: str, joints: Sequence[Coordinate], coefficients: np.ndarray
 ) -> etree._Element:
-    """Add a tendon, whose length is the sum of coefficients (n,) times joint positions; return its element."""
+    """Add a tendon to an MJCF; return its element.
+
+    The length of the tendon is the sum of the coefficients (n,) times the joint positions.
+    """
     tendon = _add(tendons, "fixed", name=name)
     for joint, coefficient in zip(joints, coefficients, strict=True):
         if coefficient:
@@ -258,14 +270,14 @@ def _add_tendon(
 
 
 def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
-    """Add the shapes of all links to a model; return the names of links whose shapes are omitted.
-
-    Args:
-        root: root element of the model, to which meshes are added.
-        elements: elements of the world and of the bodies, in the order of the arm.
-        arm: arm whose URDF has the shapes.
+    """Add the visual and collision shapes of all links to an MJCF; return the names of links with omitted shapes.
 
     The names are separated by commas. A shape is omitted if it is flat or cannot be read.
+
+    Args:
+        root: root element of the MJCF, to which meshes are added.
+        elements: elements of the world and of the bodies, in the order of the arm.
+        arm: arm whose URDF has the shapes.
     """
     names = [link.name for link in arm.robot.links]
     assets = etree.SubElement(root, "asset")
@@ -282,7 +294,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
                 continue
             carrier, pose = poses[shape.link]
             pose = pose @ shape.pose
-            form = _form(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
+            form = _geom(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
             # Shapes have no mass, since the <inertial> of the body has the whole mass.
             _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
     if not len(assets):
@@ -290,33 +302,33 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     return ", ".join(omitted)
 
 
-def _form(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
-    """Return type and size of a geom as attributes; a mesh is also added to the assets."""
+def _geom(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
+    """Return type and size of the geom of a shape as attributes; a mesh is also added to `assets`."""
     if shape.mesh is None:
         sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}
         return {"type": shape.kind, "size": sizes.get(shape.kind, shape.size)}
     vertices, faces = shape.mesh
-    # Vertices have six digits only, since a mesh has thousands of numbers.
+    # Vertices of meshes have six digits only, since a mesh has thousands of numbers.
     rows, name = " ".join(f"{x:.6g}" for x in vertices.ravel().tolist()), f"mesh{len(assets) + 1}"
     _add(assets, "mesh", name=name, vertex=rows, face=faces, inertia="shell")
     return {"type": "mesh", "mesh": name}
 
 
 def _is_flat(vertices: np.ndarray) -> bool:
-    """Whether the V vertices (V, 3) of a mesh lie in a plane, so that the convex hull has no volume."""
+    """Return True if the V vertices (V, 3) of a mesh lie in a plane, so that the convex hull has no volume."""
     # A flat mesh may lie in any plane, so its thickness is the smallest singular value.
     extents = np.linalg.svd(vertices - vertices.mean(axis=0), compute_uv=False)
     return len(extents) < 3 or bool(extents[2] <= TUNING.flat * extents[0])
 
 
 def _add(parent: etree._Element, tag: str, **attributes: object) -> etree._Element:
-    """Add an element and return it; attributes that are None are omitted."""
+    """Add an XML element to `parent` and return it; attributes that are None are omitted."""
     texts = {name: _text(value) for name, value in attributes.items() if value is not None}
     return etree.SubElement(parent, tag, texts)
 
 
 def _text(value: object) -> str:
-    """Return the value of an attribute: a text unchanged, numbers with all digits and separated by blanks."""
+    """Return the value of an XML attribute: a text unchanged, numbers with all digits and separated by blanks."""
     if isinstance(value, str):
         return value
     return " ".join(f"{float(number):.17g}" for number in np.ravel(value))  # type: ignore[call-overload]

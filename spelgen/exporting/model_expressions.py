@@ -26,7 +26,7 @@ Outputs = dict[str, tuple[ca.SX, ...]]
 
 
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
-    """Return {name of an entry point: CasADi function}.
+    """Return {name of an entry point, such as inverse_dynamics: CasADi function of scalar expressions}.
 
     The inputs of a function are the inputs of the entry point, then the residual terms on which it depends. The outputs
     are dense.
@@ -49,9 +49,15 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
 def named_function(
     entry: EntryPoint, expressions: tuple[ca.SX, ...], inputs: Symbols, residuals: Symbols
 ) -> ca.Function:
-    """Return the CasADi function of an entry point, with dense outputs.
+    """Return the CasADi function of an entry point (such as inverse_dynamics) for its expressions, with dense outputs.
 
     Its inputs are the inputs of the entry point, then the residual terms on which the expressions depend.
+
+    Args:
+        entry: the entry point.
+        expressions: expression of each output.
+        inputs: {name: symbol} of all inputs of entry points.
+        residuals: {name: symbol} of the residual terms, see ``residual_symbols``.
     """
     outputs = list(map(ca.densify, expressions))
     arguments = {key: inputs[key] for key in entry.inputs}
@@ -59,12 +65,12 @@ def named_function(
         if symbols.nnz() and ca.depends_on(ca.veccat(*outputs), symbols):
             arguments[RESIDUAL + key] = symbols
     labels = list(arguments), list(entry.outputs)
-    # With cse, common subexpressions are computed once.
+    # With the option cse of CasADi, common subexpressions are computed once.
     return ca.Function(entry.name, list(arguments.values()), outputs, *labels, {"cse": True})
 
 
 def residuals_needed(function: ca.Function) -> list[str]:
-    """Return the names of the residual terms that are inputs of a function made by ``expression_functions``."""
+    """Return the names of the residual terms on which a function made by ``expression_functions`` depends."""
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
 
 
@@ -128,12 +134,20 @@ def _expressions(
 
 
 def joint_mass(model: TrainedModel, residuals: Symbols) -> ca.SX:
-    """Return the part of M that is due to rotors and residual terms, (n, n)."""
+    """Return the part of the mass matrix M that is due to rotors and residual terms, (n, n)."""
     return constant(model.constant_mass) + symmetric(model, residuals["mass"])
 
 
 def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: ca.SX, z: ca.SX) -> ca.SX:
-    """Return joint friction torques, (n, 1) [Nm, N]; gravity: gravity torques of the rigid bodies, (n, 1) [Nm, N]."""
+    """Return joint friction torques, (n, 1) [Nm, N], of drives whose friction depends on speed, load and history.
+
+    Args:
+        model: the model as NumPy arrays.
+        residuals: symbols of the residual terms, for the factors on friction.
+        qd: joint velocities, (n, 1).
+        gravity: gravity torques of the rigid bodies, (n, 1) [Nm, N].
+        z: friction state of K bristles per joint, (n K, 1).
+    """
     motors = constant(model.motors)
     # Power is equal at motors and joints, so the gravity torques ``load`` of the motors satisfy C^T load = gravity.
     load = constant(np.linalg.inv(model.motors).T) @ gravity
@@ -165,7 +179,7 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # squaring three times gives the eighth power
+    for _ in range(3):  # squaring `slow` three times gives its eighth power
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)
@@ -173,7 +187,10 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
 
 
 def _smooth_sign(velocity: ca.SX, width: np.ndarray) -> ca.SX:
-    """Return smooth signs of velocities (n, 1). width: velocity at which the sign is 1 / sqrt(2), (n,)."""
+    """Return v / sqrt(v^2 + width^2), the smooth sign of velocities v, (n, 1).
+
+    width: velocity at which the sign is 1 / sqrt(2), (n,).
+    """
     return velocity / ca.sqrt(velocity**2 + width**2)
 
 
@@ -184,7 +201,7 @@ def sliding_bristles(model: TrainedModel, qd: ca.SX) -> ca.SX:
 
 
 def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
-    """Return the friction state z, (n K, 1), after a displacement of the motors without reversals.
+    """Return the friction state z, (n K, 1), after a displacement of the motors without reversals: z + dq, clipped.
 
     Args:
         breakaway: break-away displacements of K bristles per motor, (n, K) [rad, m].
@@ -196,12 +213,15 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return (n K, 1): each of the values (n, 1) repeated K times, once per bristle of the motor."""
+    """Return the values (n, 1) of n motors repeated for each of their K bristles, (n K, 1)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 
 def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
-    """Return the torque of position servos, (n, 1), for q and qd, (n, 1) each; u: delayed commands, (n, 1)."""
+    """Return the torque of position servos, (n, 1) [Nm, N], at positions q and velocities qd, (n, 1) each.
+
+    u: delayed commands, (n, 1) [rad, m].
+    """
     error = u - q
     if servos.dead_zone.any():
         error -= ca.fmin(ca.fmax(error, -servos.dead_zone), servos.dead_zone)

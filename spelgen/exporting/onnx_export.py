@@ -23,7 +23,10 @@ from spelgen.exporting.tuning import TUNING
 
 
 def export_onnx(trained: Trained) -> Exported:
-    """Return an .onnx file for each entry point. Raises RunError if results of ONNX Runtime and the model differ."""
+    """Return an .onnx file for each entry point, a function of the model such as inverse_dynamics, with a README.
+
+    Raises RunError if results of ONNX Runtime and of the model differ.
+    """
     model = torch_export.prepared(trained)
     models, files = {}, {}
     for name in torch_export.program_names(trained):
@@ -45,7 +48,7 @@ def export_onnx(trained: Trained) -> Exported:
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
-    """Return the serialised ONNX model of an entry point."""
+    """Return the serialised ONNX model of an entry point, a function of the model such as inverse_dynamics."""
     # Functions without an ONNX operator are replaced already while torch traces the program.
     with _silent_exporter():
         with _Decomposed():
@@ -80,7 +83,10 @@ def _silent_exporter() -> Iterator[None]:
 
 
 def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
-    """Return the cross product along a dimension of size 3; a, b: (...,), of equal shapes."""
+    """Return the cross product of a and b, (...,) of equal shapes, along the dimension `dim` of size 3.
+
+    It replaces torch.linalg.cross, which has no ONNX operator.
+    """
     second, third = torch.tensor([1, 2, 0]), torch.tensor([2, 0, 1])
     forward = a.index_select(dim, second) * b.index_select(dim, third)
     return forward - a.index_select(dim, third) * b.index_select(dim, second)
@@ -89,11 +95,12 @@ def _cross(a: Tensor, b: Tensor, *, dim: int) -> Tensor:
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), by Gauss-Jordan elimination without pivoting.
 
-    matrix: (..., n, n), positive definite, or triangular with a unit diagonal. right: (..., n, columns).
+    It replaces torch.linalg.solve, which has no ONNX operator. matrix: (..., n, n), positive definite, or triangular
+    with a unit diagonal. right: (..., n, columns).
     """
-    n = matrix.shape[-1]  # a Python integer, so that tracing unrolls the loop
+    n = matrix.shape[-1]  # `n` is a Python integer, so that tracing unrolls the loop over k
     identity = torch.eye(n, dtype=matrix.dtype)
-    # Either of the matrix and the right-hand side may have no batch dimension.
+    # Either `matrix` or `right` may have no batch dimension: both are expanded to the batch of the other one.
     batch = torch.broadcast_shapes(matrix.shape[:-2], right.shape[:-2])
     # The elimination transforms matrix and right-hand side together, as columns of one array.
     rows = torch.cat([matrix.expand(*batch, n, n), right.expand(*batch, *right.shape[-2:])], dim=-1)
@@ -107,7 +114,8 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) with a unit diagonal.
 
-    The values on the diagonal are not used: all calls of the runtime have ``unitriangular=True``.
+    It replaces torch.linalg.solve_triangular, which has no ONNX operator. The values on the diagonal are not used: all
+    calls of the runtime have ``unitriangular=True``.
     """
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
@@ -121,8 +129,8 @@ class _Cholesky(NamedTuple):
 def _cholesky_ex(matrix: Tensor) -> _Cholesky:
     """Return the matrix (..., n, n) and info (...): 0 if the matrix is positive definite, otherwise 1.
 
-    The matrix is returned in place of its Cholesky factor: of the results of torch's ``cholesky_ex``, models use only
-    info.
+    It replaces torch.linalg.cholesky_ex, which has no ONNX operator. The matrix is returned in place of its Cholesky
+    factor, since models use only info.
     """
     rows = matrix
     info = torch.zeros(matrix.shape[:-2], dtype=torch.int32)
@@ -135,7 +143,7 @@ def _cholesky_ex(matrix: Tensor) -> _Cholesky:
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return an ONNX constant in double precision; torch's own translation would round it to float32."""
+    """Return the ONNX constant of a number in double precision; torch's own translation would round it to float32."""
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)
@@ -147,7 +155,7 @@ def _softplus(x: Tensor) -> Tensor:
 
 
 class _Decomposed(TorchFunctionMode):
-    """Context in which torch functions without ONNX operators are replaced by decompositions into other functions."""
+    """Context in which torch functions without ONNX operators, such as solve, are replaced by decompositions."""
 
     functions: ClassVar[dict[object, Callable[..., object]]] = {
         torch.nn.functional.softplus: _softplus,
@@ -164,7 +172,7 @@ class _Decomposed(TorchFunctionMode):
         args: tuple[object, ...] = (),
         kwargs: dict[str, object] | None = None,
     ) -> object:
-        """Call the decomposition of a torch function if ``functions`` has one, otherwise the function itself."""
+        """Call the torch function ``func``, or its replacement if the class attribute ``functions`` has one."""
         return self.functions.get(func, func)(*args, **(kwargs or {}))
 
 
@@ -188,5 +196,5 @@ def onnx_session(content: bytes) -> onnxruntime.InferenceSession:
     # One thread is used, since synchronising several takes longer than operations with small matrices.
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # Only errors are printed, no warnings of unused inputs.
+    options.log_severity_level = 3  # with level 3, only errors are printed, no warnings of unused inputs
     return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])

@@ -24,7 +24,7 @@ Called = Callable[[str, Values], Mapping[str, np.ndarray]]
 
 
 def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
-    """Return the two columns kinetic energy and potential energy, (states, 2) [J], at q and qd, (states, n)."""
+    """Return kinetic and potential energy of the torch model, two columns (states, 2) [J], at q and qd, (states, n)."""
     kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
     return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
 
@@ -47,7 +47,7 @@ _REFERENCES: dict[str, Callable[..., Tensor]] = {
 
 @dataclass(frozen=True)
 class Parity:
-    """Result of a parity check.
+    """Result of the comparison of an export with the torch model.
 
     differences: {entry point: largest difference between export and torch model, divided by the largest value of the
     torch model}. summary: sentence for the user with the largest of these differences.
@@ -58,12 +58,12 @@ class Parity:
 
 
 def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
-    """Return the differences as a ``Parity``. Raises RunError if a difference is above the tolerance.
+    """Return the differences between export and model as a ``Parity``. Raises RunError if one is above the tolerance.
 
     differences: {entry point: largest relative difference}. states: number of random states, for the summary.
     """
     for name, difference in differences.items():
-        if not difference <= tolerance:  # The negated comparison is True for NaN, too.
+        if not difference <= tolerance:  # The comparison is negated, so that NaN raises the error, too.
             raise RunError(
                 f"{name} differs from the model by {difference:.1e}",
                 element="parity check",
@@ -107,16 +107,18 @@ def check_parity(
     for name in names:
         outputs = called(name, inputs)
         expected = _expected(exact, trained, name, inputs)
-        # The outputs are reshaped, since for an arm of one joint some formats return a vector in place of a matrix.
+        # The outputs of the export are reshaped, since for an arm of one joint some formats return a vector in place of
+        # a matrix.
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
         differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
     return require_parity(differences, tolerance, states)
 
 
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
-    """Return {input of entry points: random values}, (states, n) each, and (states, memory) for z.
+    """Return {input of the dynamics, such as q: random values for comparisons}, (states, n) each.
 
-    The seed is fixed, so that exports are reproducible. memory: number of values in the friction state z.
+    The friction state z is (states, memory). The seed is fixed, so that exports are reproducible. memory: number of
+    values in the friction state z.
     """
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
@@ -127,7 +129,8 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
-        # The standard deviation of z has the size of break-away displacements, fractions of a milliradian.
+        # The standard deviation of the friction state z has the size of break-away displacements, fractions of a
+        # milliradian.
         "z": 1e-4 * random.standard_normal((states, memory)),
         # Forward dynamics are linear in tau, so the size of tau has no influence on the relative difference.
         "tau": 10.0 * random.standard_normal(q.shape),
@@ -136,7 +139,10 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return the URDF's velocity limits, (n,) [rad/s, m/s]; joints without a limit get a nominal speed."""
+    """Return the velocity limits of the joints in the URDF, (n,) [rad/s, m/s], to scale random velocities.
+
+    Joints without a limit get a nominal speed.
+    """
     nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
     return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
 
@@ -152,9 +158,13 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
-    """Return {output: array (states, ...)} of one entry point, computed by the torch model.
+    """Return {output: array (states, ...)} of one function of the torch model, such as inverse_dynamics, as reference.
 
-    name: name of the entry point. inputs: {input: array (states, n)}.
+    Args:
+        model: the torch model in double precision.
+        trained: the model with its arm, for the friction state and the tip.
+        name: name of the function (entry point).
+        inputs: {input: array (states, n)}.
     """
     entry = ENTRY_POINTS[name]
     arguments = []

@@ -27,7 +27,7 @@ Scalars = TypeVar("Scalars", ca.SX, ca.MX)
 
 
 def residual_symbols(model: TrainedModel) -> Symbols:
-    """Return {name: symbol} of all residual terms; terms that the model does not have are structural zeros."""
+    """Return {name: CasADi symbol} of all residual terms of a model; absent terms are structural zeros."""
     n = model.n
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
@@ -38,7 +38,7 @@ def residual_symbols(model: TrainedModel) -> Symbols:
         # network; the Jacobian `first` would take n passes.
         "rate": (entries, entries, 1),
         "kinetic": (entries, n, 1),
-        # `first`, `second` and the slopes occur only in derivatives of the dynamics.
+        # `first`, `second`, `torque_slope` and `factor_slope` occur only in derivatives of the dynamics.
         "first": (entries, entries, n),
         "second": (entries, entries, n * n),
         "energy": (has_potential, 1, 1),
@@ -79,7 +79,7 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return c, (m, 1), with 1/2 qd^T R qd = c^T mass; qd: (n, 1).
+    """Return the coefficients c, (m, 1), with which 1/2 qd^T R qd = c^T mass; qd: (n, 1).
 
     R is the residual term of M, `mass` (m, 1) are the m nonzero entries in its lower triangle.
     """
@@ -107,5 +107,5 @@ def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX,
         (symbols["gravity"], symbols["stiffness"]),
         (symbols["torque"], ca.diag(symbols["torque_slope"])),
     ]
-    # Terms that the model does not have are structural zeros and are omitted.
+    # Residual terms that the model does not have are structural zeros and are omitted.
     return [(symbol, jacobian) for symbol, jacobian in jacobians if symbol.nnz()]

@@ -26,6 +26,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class NearestFriction(NamedTuple):
     """Viscous and Coulomb friction that approximate the friction of a model best, (n,) each.
 
+    A URDF or MuJoCo can represent this friction, but not the friction of a model.
+
     Attributes:
         viscous: coefficients [Nm s/rad, N s/m].
         forward, backward: Coulomb torques [Nm, N] in both directions of motion, backward <= 0 <= forward.
@@ -46,13 +48,16 @@ class NearestFriction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigidBodyProjection:
-    """Parameters of an arm of n joints in the form that a URDF and a settings file can contain.
+    """A trained model approximated by rigid bodies, in the form that a URDF and a settings file can contain.
 
     Attributes:
+        arm: arm of the model, with n joints.
         inertias: (bodies, 10), inertial parameters in the frames of the joints.
         armature: (n,) [kg m^2, kg], rotor inertia of the motors.
         motors: C, (n, n), motor velocities = C qd.
+        friction: viscous and Coulomb friction that approximate the model's friction.
         inputs: G at q = 0, (n, n), joint torques = G times motor torques.
+        servos: position servos of the model; None for an arm under torques.
         exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
             it.
         mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
@@ -74,7 +79,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Two sentences about the differences from the trained model: one on rigid bodies, one on friction."""
+        """Two sentences for the user about differences from the trained model: of the rigid bodies, and of friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"
@@ -91,10 +96,11 @@ class RigidBodyProjection:
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the rigid bodies and the friction that approximate a trained model of ``arm`` best."""
-    # A copy in double precision, so that the user's model is not changed.
+    # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
-    # The rigid bodies of a model are used if it has some; its residual terms are omitted, as the summary states.
+    # The model's own rigid bodies are used if it has some; its residual terms are omitted. The summary of the export
+    # states this.
     exact = isinstance(model, RigidBodyDynamics)
     bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
@@ -113,7 +119,10 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
 
 
 def sampled_positions(arm: Chain) -> Tensor:
-    """Return random positions in the joints' ranges, (positions, n) [rad, m]; the seed is fixed."""
+    """Return random positions (positions, n) [rad, m] in the joints' ranges, at which models are compared.
+
+    The seed is fixed, so that the result is reproducible.
+    """
     return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
@@ -132,7 +141,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the cost plus the ridge penalty, ()."""
+        """Return the cost of the rigid bodies plus the ridge penalty, a scalar."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
         # The parameters represent differences from the values in the URDF. The ridge penalty towards the URDF is
@@ -166,9 +175,9 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))
     positions = q[:: TUNING.positions // TUNING.friction_positions]
-    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # (positions, speeds, n)
+    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # positions: (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
-    torques = model.friction_torque(positions, qd).numpy()  # (positions, speeds, n)
+    torques = model.friction_torque(positions, qd).numpy()  # torques: (positions, speeds, n)
     rows = []
     for joint, speed in enumerate(speeds.T):
         # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
@@ -177,7 +186,7 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))
         residual = torque - columns @ (viscous, forward, backward)
-        # A joint without friction has the error zero, not 0 / 0.
+        # The error of a joint without friction is zero, not 0 / 0.
         error = np.linalg.norm(residual) / (np.linalg.norm(torque) or 1.0)
         rows.append((viscous, forward, -backward, float(error)))
     return NearestFriction(*np.array(rows).T)

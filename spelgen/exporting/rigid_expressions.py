@@ -43,7 +43,7 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
 
 
 class RigidBodies:
-    """The rigid bodies of an arm at a position q, (n, 1).
+    """The rigid bodies of an arm at a position q, (n, 1): functions that return expressions of torque and momentum.
 
     inertias: inertial parameters, (bodies, 10), or one CasADi vector (10, 1) per body; structural zeros cause no
     operations.
@@ -63,7 +63,7 @@ class RigidBodies:
 
         Structural zeros of qd cause no operations.
         """
-        # The list has the motion of the base, then of each body, in the frame of the body: angular velocity w, angular
+        # `motions` has the motion of the base, then of each body, in the frame of the body: angular velocity w, angular
         # acceleration w', acceleration of the frame's origin, and the matrix skew(w') + w w^T - |w|^2 1 (`spin`).
         # Gravity is represented by an upward acceleration of the base.
         gravity = np.array(self.arm.gravity, dtype=float)
@@ -84,18 +84,18 @@ class RigidBodies:
             else:
                 # 2 w x v is the Coriolis acceleration, with the velocity v along the prismatic joint.
                 acceleration = acceleration + _Z * added + 2 * turning
-            # With this matrix, spin @ p is the acceleration of a point p of the body relative to the origin.
+            # With the matrix `spin`, spin @ p is the acceleration of a point p of the body relative to the origin.
             spin = ca.skew(rate) + w @ w.T - ca.dot(w, w) * ca.SX.eye(3)
             motions.append((w, rate, acceleration, spin))
             # Newton's equation gives the force; Euler's equation about the origin of the frame gives the torque.
             force = mass * acceleration + spin @ moment
             torque = ca.cross(moment, acceleration) + inertia @ rate
             wrenches.append((force, torque + ca.cross(w, inertia @ w)))
-        self._carry(wrenches)
+        self._accumulate(wrenches)
         torques = ca.SX(len(self.arm.coordinates), 1)
         for body, wrench in reversed(list(zip(self.bodies, wrenches, strict=True))):
             # A mimic joint has the coordinate of its leader, so its torque is added there, times its multiplier.
-            torques[body.coordinate] += float(body.multiplier) * _along(body, wrench)
+            torques[body.coordinate] += float(body.multiplier) * _axis_component(body, wrench)
         return torques
 
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -104,7 +104,7 @@ class RigidBodies:
         Both are projections of the spatial momentum of all bodies that a joint carries: M qd onto the joint axis S, the
         gradient onto dS/dt = twist x S.
         """
-        # The twist of the base and then of each body, in its own frame: angular velocity, and velocity of the
+        # `twists` has the twist of the base, then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
         momenta = []
@@ -115,14 +115,14 @@ class RigidBodies:
             w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
             twists.append((w, v))
             momenta.append((mass * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
-        self._carry(momenta)
+        self._accumulate(momenta)
         momentum, gradient = ca.SX(qd.shape[0], 1), ca.SX(qd.shape[0], 1)
         for body, (w, v), (linear, angular) in zip(self.bodies, twists[1:], momenta, strict=True):
             turned = ca.dot(ca.cross(w, _Z), linear)
             if body.joint_type == "revolute":
                 turned = ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
             ratio = float(body.multiplier)
-            momentum[body.coordinate] += ratio * _along(body, (linear, angular))
+            momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
 
@@ -130,8 +130,11 @@ class RigidBodies:
         """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
         return zip(self.bodies, self.inertias, self.frames, strict=True)
 
-    def _carry(self, wrenches: list[Wrench]) -> None:
-        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place."""
+    def _accumulate(self, wrenches: list[Wrench]) -> None:
+        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
+
+        wrenches: one per body, in the frame of the body, parents first.
+        """
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent
             if parent >= 0:
@@ -142,7 +145,7 @@ class RigidBodies:
                 wrenches[parent] = force + added, torque + turned
 
 
-def _along(body: Body, wrench: Wrench) -> ca.SX:
+def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
     """Return the force along a prismatic joint's axis, or the torque about a revolute joint's axis, (1, 1)."""
     return wrench[1][2] if body.joint_type == "revolute" else wrench[0][2]
 
@@ -157,7 +160,7 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     result = energies(model.arm, positions, model.inertias.tolist(), float)
     mass = ca.SX(model.n, model.n)
     for (row, column), entry in result.mass.items():
-        # Both triangles have the same expression, which CasADi computes once.
+        # Both triangles of M have the same expression, which CasADi computes once.
         mass[row, column] = mass[column, row] = entry
     return mass, ca.SX(result.potential)
 
@@ -169,7 +172,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 
     carrier: index of the body that carries the frame; -1: the root link. pose: pose in the frame of this body, (4, 4).
     """
-    # The list has the poses of the root link and of all bodies; CasADi removes poses on which the result does not
+    # `poses` has the poses of the root link and of all bodies; CasADi removes poses on which the result does not
     # depend.
     poses = [ca.SX.eye(4)]
     for body, frame in zip(bodies, body_frames(bodies, q), strict=True):
@@ -178,7 +181,7 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
     jacobian = ca.SX(6, q.shape[0])
     while carrier >= 0:
         body = bodies[carrier]
-        # The joint axis is the z axis of the body's frame.
+        # the joint axis is the z axis of the body's frame
         axis, origin = poses[carrier + 1][:3, 2], poses[carrier + 1][:3, 3]
         column = ca.vertcat(axis, ca.SX(3, 1))
         if body.joint_type == "revolute":

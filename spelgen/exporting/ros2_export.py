@@ -22,13 +22,16 @@ _CONTROLLER_DEPENDENCIES = (
     "controller_interface", "geometry_msgs", "hardware_interface", "rcl_interfaces", "rclcpp_lifecycle",
     "sensor_msgs", "std_msgs", "trajectory_msgs",
 )  # fmt: skip
-# Paths in the package; each file has a template of its name.
+# Paths of files in the ROS 2 package; each file has a template of its name.
 _PATHS = ("package.xml", "CMakeLists.txt", "solver.xml", "src/solver.cpp")
 _CONTROLLER_PATHS = ("controller.xml", "config/controller.yaml", "src/controller.cpp", "src/control.hpp")
 
 
 def export_ros2(trained: Trained) -> Exported:
-    """Return the colcon package. Raises RunError if results of the C code differ from the model's."""
+    """Return the colcon package of ROS 2 with the model's C code.
+
+    Raises RunError if results of C code and model differ.
+    """
     model, missing = trained.described, _missing_part(trained)
     # The inverse_dynamics_solver plugin is part of each package; controller and estimator are optional.
     controller, estimator = missing is None or missing[0] != "controller", missing is None
@@ -51,7 +54,7 @@ def export_ros2(trained: Trained) -> Exported:
         "initialize resets it."
     )
     summary = [checked] if missing is None else [checked, f"no {missing[0]}: {missing[1]}"]
-    use = _use(package, model.name, controller=controller)
+    use = _usage(package, model.name, controller=controller)
     return with_readme(trained, "ros2", files, use=use, about=about, summary=summary)
 
 
@@ -73,8 +76,11 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
     return None
 
 
-def _use(package: str, name: str, *, controller: bool) -> str:
-    """Return the line of the README about the use of the package."""
+def _usage(package: str, name: str, *, controller: bool) -> str:
+    """Return the line of the README about the use of the ROS 2 package.
+
+    controller: True if the package contains the controller.
+    """
     use = (
         f"Put this folder into a workspace and run colcon build --packages-select {package}. "
         f"{package}/Solver is an inverse_dynamics_solver::InverseDynamicsSolver."
@@ -90,7 +96,7 @@ def _use(package: str, name: str, *, controller: bool) -> str:
 
 
 def _controller_numbers(trained: Trained) -> dict[str, object]:
-    """Return {variable of the templates: C++ or YAML text} with names, limits and the pose of the tip."""
+    """Return {variable of the controller's templates: C++ or YAML text}: names, limits and the pose of the tip."""
     model, coordinates = trained.described, trained.arm.chain.coordinates
     names = trained.arm.chain.joint_names
     revolute = np.array([joint.joint_type == "revolute" for joint in coordinates])
@@ -98,7 +104,7 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
     rotation = (f"{{{_listed(row)}}}" for row in model.tip.pose[:3, :3])
     return {
         "joint_names": ", ".join(map(cpp_string, names)),
-        # A JSON string is also a valid YAML string.
+        # Names are JSON strings, which are also valid YAML strings.
         "yaml_joints": ", ".join(map(json.dumps, names)),
         "yaml_references": ", ".join(json.dumps(f"{model.name}_controller/{x}") for x in names),
         # An effort limit that the URDF does not specify is 0; the user must set it.
@@ -124,7 +130,7 @@ def _velocity_limit(velocity: float | None) -> float:
 
 
 def _listed(numbers: Iterable[float] | np.ndarray) -> str:
-    """Return numbers as text, separated by commas, without rounding."""
+    """Return numbers as text for C++ or YAML, separated by commas, without rounding."""
     return ", ".join(repr(float(number)) for number in numbers)
 
 

@@ -35,7 +35,10 @@ FRICTION_STATE = ("friction_step", "friction_memory")
 
 
 def export_torch(trained: Trained) -> Exported:
-    """Return a .pt2 file per entry point and model.safetensors. Raises RunError if results differ from the model's."""
+    """Return a .pt2 file per function of the model, such as inverse_dynamics, and its parameters as model.safetensors.
+
+    Raises RunError if results of the programs and of the model differ.
+    """
     model = prepared(trained)
     programs, files = {}, {}
     for name in program_names(trained):
@@ -58,7 +61,7 @@ def export_torch(trained: Trained) -> Exported:
 
 
 def prepared(trained: Trained) -> PreparedModel:
-    """Return the copy of the model from which programs are made.
+    """Return a copy of the model from which torch and ONNX programs are made.
 
     It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
     """
@@ -67,15 +70,22 @@ def prepared(trained: Trained) -> PreparedModel:
 
 
 def program_names(trained: Trained) -> list[str]:
-    """Return the names of the programs to export. Raises RunError for unknown names."""
+    """Return the names of the functions to export as programs, such as inverse_dynamics.
+
+    Raises RunError for unknown names.
+    """
     available = [name for name in PROGRAMS if trained.memory or name not in FRICTION_STATE]
     return select_names(trained.entries, available)
 
 
 def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> Parity:
-    """Compare programs with the torch model; return the differences. Raises RunError if one is too large.
+    """Compare exported programs with the torch model; return the differences. Raises RunError if one is too large.
 
-    tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
+    Args:
+        called: function that evaluates an exported program.
+        trained: the model and its arm.
+        names: names of the programs.
+        tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
     """
     if trained.float32:
         return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32)
@@ -83,12 +93,12 @@ def check_programs(called: Called, trained: Trained, names: Sequence[str], toler
 
 
 def number_type(model: PreparedModel) -> str:
-    """Return the name of the model's number type: ``float32`` or ``float64``."""
+    """Return the name of the type of the numbers of an exported model: ``float32`` or ``float64``."""
     return str(model.dtype).removeprefix("torch.")
 
 
 def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str) -> list[str]:
-    """Return lines of Python for the README, which call each program.
+    """Return lines of Python for the README of an export, which call each exported program.
 
     friction_memory is called first and friction_step last, as in a control loop.
 
@@ -110,7 +120,7 @@ def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str)
 
 
 def _saved(program: torch.export.ExportedProgram) -> bytes:
-    """Return the content of the .pt2 file of a program."""
+    """Return the content of the .pt2 file of an exported program."""
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns of constants that share memory, which is harmless
@@ -135,7 +145,11 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
 
 
 class _Program(nn.Module):
-    """A module whose forward method is one entry point, as torch.export requires."""
+    """A module whose forward method is one entry point of a model; torch.export requires such a module.
+
+    model: the model with precomputed parameters. name: name of the entry point. flat_state: True if the friction state
+    z is (batch, n K) instead of (batch, n, K) for K bristles per joint.
+    """
 
     def __init__(self, model: PreparedModel, name: str, flat_state: bool) -> None:
         super().__init__()
@@ -157,9 +171,10 @@ class _Program(nn.Module):
 def export_program(
     model: PreparedModel, name: str, *, flat_state: bool = False
 ) -> torch.export.ExportedProgram:
-    """Return the program of an entry point, with inputs (batch, n) for any batch size.
+    """Return the torch.export program of a function of the model, such as inverse_dynamics, for any batch size.
 
-    The friction state z is (batch, n, K), or (batch, n K) if ``flat_state``.
+    The inputs are (batch, n). The friction state z of K bristles per joint is (batch, n, K), or (batch, n K) if
+    ``flat_state``.
     """
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(program_inputs(model, name), (model.n,))
     if "z" in shapes:
@@ -172,12 +187,12 @@ def export_program(
 
 
 def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
-    """Return the names of an entry point's inputs, without z if the model has no friction state."""
+    """Return the names of the inputs of a function such as inverse_dynamics, without z if friction has no state."""
     inputs = ENTRY_POINTS[name].inputs
     return inputs if model.elements else tuple(key for key in inputs if key != "z")
 
 
 def program_output(name: str) -> str:
-    """Return the name of the single output of an entry point."""
+    """Return the name of the single output of a function such as inverse_dynamics: "tau"."""
     (output,) = ENTRY_POINTS[name].outputs
     return output

@@ -32,7 +32,7 @@ _SERVO = "clip(kp d - kd qd, -limit, limit), with d = u - q less the dead zone, 
 
 
 def export_urdf(trained: Trained) -> Exported:
-    """Return three files of a trained model: the URDF, the settings, and the friction model."""
+    """Return a trained model as three files with a README: the URDF, the settings, and the friction model."""
     projection = rigid_body_projection(trained.model, trained.arm)
     use = (
         "The .urdf contains inertials, viscous and Coulomb friction, which simulators ignore; the .yaml beside it, "
@@ -48,7 +48,7 @@ def export_urdf(trained: Trained) -> Exported:
 
 
 def _urdf_text(projection: RigidBodyProjection) -> bytes:
-    """Return the content of the arm's URDF with new inertials and friction.
+    """Return the content of the arm's URDF with the inertials and the friction of the model.
 
     A body may consist of several links with fixed joints. The child link of its moving joint gets the <inertial> of the
     whole body; the <inertial> of its other links is removed.
@@ -71,13 +71,13 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
         for link in body.links:
             _remove(links[link.name], "inertial")
         name = body.joint.child
-        # This rotation maps from the body frame, whose z axis is the joint axis, to the link frame.
+        # `rotation` maps from the body frame, whose z axis is the joint axis, to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
         _set_inertial(links[name], *about_center(inertia), rotation)
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
-        # Existing <dynamics> are removed: with two of them, some tools read the first and some the last.
+        # Existing <dynamics> of a joint are removed: with two of them, some tools read the first and some the last.
         _remove(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
@@ -85,10 +85,10 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
 
 
 def _settings_text(projection: RigidBodyProjection) -> str:
-    """Return the arm's settings as YAML with new rotor inertia and friction."""
+    """Return the arm's settings as YAML with the rotor inertia and the friction of the model."""
     path = projection.arm.robot.path.with_suffix(".yaml")
     content: dict[str, dict[str, dict[str, object]]] = {}
-    # All other settings in the user's file are kept.
+    # The user's settings file of the arm is copied, with new rotor inertias and friction.
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
@@ -111,7 +111,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
         "viscous_coulomb": "viscous qd + coulomb[0] where qd > 0, + coulomb[1] where qd < 0",
     }
     coulomb = np.stack([projection.friction.forward, projection.friction.backward], axis=1)
-    # {section: {name: array (n,), or (n, K) with K values per joint}}.
+    # `sections`: {section: {name: array (n,), or (n, K) with K values per joint}}.
     sections = {"viscous_coulomb": {"viscous": projection.friction.viscous, "coulomb": coulomb}}
     # Only rigid-body models have a friction model with constants; others have friction networks.
     if projection.exact:
@@ -132,7 +132,7 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return {name: constants of the friction model in SI units}: (n,), or (n, K) for K values per joint."""
+    """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint."""
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
@@ -143,7 +143,7 @@ def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[st
 
 
 def _plain(value: npt.ArrayLike) -> object:
-    """Return a number, or an array as a list, rounded to twelve digits, more than any fit determines."""
+    """Return a number, or an array as nested lists, rounded to twelve digits, more than any fit determines."""
     rounded = np.vectorize(lambda x: float(_number(x)), otypes=[float])
     return rounded(value).tolist()
 

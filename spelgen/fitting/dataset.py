@@ -72,7 +72,7 @@ class FitRequest:
 
     @property
     def recordings(self) -> list[Trajectory]:
-        """All trajectories, for training and validation."""
+        """All trajectories of the fit, for training and validation."""
         return [*self.logs, *(() if isinstance(self.validation, float) else self.validation)]
 
 
@@ -114,14 +114,14 @@ class TrainingData(PreparedLogs):
 
 
 def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
-    """Check the logs, split them and cut windows. Raises LogError.
+    """Check the logs of a fit, split them into training and validation, and cut windows. Raises LogError.
 
     Args:
         request: arguments of the fit; the model, the logs and their preprocessing are used.
         window: number of samples per window.
         stride: number of samples between the starts of successive windows.
     """
-    # Whole trajectories are set aside: neighbouring windows of one motion are not independent.
+    # Whole trajectories are set aside for validation: neighbouring windows of one motion are not independent.
     if isinstance(request.validation, float):
         split = split_validation(request.logs, request.validation, request.seed)
     else:
@@ -148,7 +148,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     return TrainingData(
         training=training,
         validation=validation,
-        # The scales are computed from the training windows only, since validation logs must not change the loss
+        # The loss scales are computed from the training windows only, since validation logs must not change the loss
         # function.
         scales=loss_scales(training, model.joint_types),
         preprocessing=resolved,
@@ -162,7 +162,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
 
 
 def digest(trajectories: Iterable[Trajectory]) -> str:
-    """Return the SHA-256 digest of all numbers of the trajectories."""
+    """Return the SHA-256 digest of all numbers of the trajectories, by which a resumed fit recognizes its logs."""
     numbers = hashlib.sha256()
     for x in trajectories:
         for array in (x.t, x.q, x.qd, x.tau, x.u):
@@ -198,7 +198,8 @@ class Validation:
         # Validation batches are four times as large as training batches: no derivatives are computed, which saves
         # memory.
         self.batches = data.validation.to(device).split(4 * batch)
-        # The windows are evenly spread, so that the probe contains fast and slow motion.
+        # The windows of the probe, on which the number of integration steps is chosen, are evenly spread over the
+        # training windows: they contain fast and slow motion.
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:

@@ -1,4 +1,4 @@
-"""Constants of drives whose intervals a posterior states, and the straight line that approximates friction."""
+"""Constants of drives whose 95 % intervals are in a posterior, and the straight line that approximates friction."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,7 +14,11 @@ from spelgen.runtime.motors import MotorInputs
 
 
 class DriveQuantity(NamedTuple):
-    """A quantity of joints. unit: format string for the `UNITS` of a joint's type. joints: joints that have it."""
+    """A constant of drives that has one value per joint.
+
+    unit: format string for the `UNITS` of a joint's type. positive: True if all values are positive. joints: indices of
+    the joints that have this constant.
+    """
 
     name: str
     unit: str
@@ -29,13 +33,14 @@ TORQUE_UNITS = {
     "offset": "{0.torque}",
     "gain": "",
 }
-"""Unit of each constant of drives that are given torques."""
+"""Unit of each constant of drives whose input is a torque, as a format string for `UNITS`."""
 
 
 def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-    """Return the constants of drives that are given torques, and the function that returns their values, (4 or 5, n).
+    """Return the constants of drives whose input is a torque, and the function that returns their values.
 
-    Viscous and Coulomb friction approximate the friction by least squares up to the typical speed.
+    The function returns (4, n) for a model, or (5, n) with trained motor gains. Viscous and Coulomb friction
+    approximate the friction by least squares up to the typical speed.
     """
     line = friction_line(model)
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
@@ -48,7 +53,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return the constants of the drives, (4 or 5, n), in the order of `TORQUE_UNITS`."""
+        """Return the constants of the drives, (4, n), or (5, n) with motor gains, in the order of `TORQUE_UNITS`."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
@@ -58,12 +63,12 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
 
 
 def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
-    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n).
+    """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n) [Nm s/rad, N s/m; Nm, N].
 
-    They are the slope and the intercept of a straight line through the friction torque at speeds up to the typical
-    speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and the
-    factor of the residual terms at these positions are computed only once, from the argument ``model``: they are also
-    used for models with other friction parameters.
+    The coefficients are the slope and the intercept of a straight line through the friction torque at speeds up to the
+    typical speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and
+    the factor by which residual terms multiply friction at these positions are computed only once, from the argument
+    ``model``: the same load and factor are also used for models with other friction parameters.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
@@ -72,13 +77,13 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
         # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # The speeds are in units of the typical speed. They are dense at low speeds, where the Stribeck effect determines
-    # the intercept of the line.
+    # The speeds are in units of the typical speed. The speeds are dense at low speeds, where the Stribeck effect
+    # determines the intercept of the line.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 
     def line_of(model: ArmModel) -> Tensor:
-        """Return viscous and Coulomb friction coefficients, (2, n), of a model with the same bodies."""
+        """Return viscous and Coulomb friction coefficients of `model`, (2, n), for the precomputed load and factor."""
         friction = model.friction
         speed = torch.from_numpy(speeds)[:, None] * friction.speed
         slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)

@@ -181,7 +181,7 @@ class _Fitting:
         self.baselines = run.read_baselines()
 
     def _save(self) -> None:
-        """Write the checkpoint, the best weights and the history."""
+        """Write the checkpoint, the best weights and the history into the run folder, if there is one."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
             # The metrics are written before the checkpoint: after an interruption between the two, a resumed run
@@ -228,7 +228,7 @@ class _Fitting:
 
 
 def objective_of(request: FitRequest) -> Objective:
-    """Return the objective of a request. Raises OptionError if it does not apply to the model."""
+    """Return the `Objective` that a request names. Raises OptionError if it does not apply to the request's model."""
     name = request.config.objective
     objective: type[Objective] = pkgutil.resolve_name(OBJECTIVES[name])
     under = request.model.input_quantity

@@ -75,12 +75,12 @@ class Fit:
 
     @property
     def epochs(self) -> int:
-        """Number of completed epochs."""
+        """Number of completed epochs of the fit."""
         return self.checkpoint.epoch
 
     @property
     def steps(self) -> int:
-        """Number of optimizer steps on windows."""
+        """Number of optimizer steps on windows in the fit."""
         return self.checkpoint.step
 
     @property
@@ -135,7 +135,7 @@ class Fit:
 
         Raises RunError unless rigid bodies were fitted to torques, or to positions under position servos.
         """
-        # Imported here, because evaluation needs no posterior.
+        # The posterior is imported here, since an evaluation does not need it.
         from spelgen.fitting.posterior import posterior_of
 
         delay = self.record.preprocessing.torque_delay or 0.0
@@ -190,7 +190,8 @@ class Fit:
         samples = [x for x in samples if len(x.q)]
         if not samples:
             raise LogError(
-                "no motion to judge torques on", expected=f"samples at {SLOWEST:g} Hz or more that move"
+                "no motion for an evaluation of torques",
+                expected=f"samples at {SLOWEST:g} Hz or more that move",
             )
         scores = []
         for x in samples:
@@ -227,7 +228,7 @@ class Fit:
         None if unknown.
         """
         like = next(self.model.parameters())
-        # Filters return views with negative strides. They are copied, since torch does not accept them.
+        # Filters return views with negative strides. The views are copied, since torch does not accept them.
         inputs = [torch.as_tensor(np.ascontiguousarray(x)).to(like) for x in motion if x is not None]
         with torch.no_grad():
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
@@ -251,7 +252,7 @@ class Fit:
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:
-    """Return the specification of a model, which a run folder contains. Raises RunError for a model without one."""
+    """Return the specification of a model that was loaded from a run folder. Raises RunError if it has none."""
     if isinstance(model, ArmModel):
         return model.spec
     raise RunError(
@@ -269,7 +270,8 @@ def load_run(folder: Path | str) -> Fit:
     run = RunFolder(folder)
     # The record is read first, so that a missing run is reported before its model is assembled.
     record = run.read_record()
-    # A loaded model is used for predictions only. With gradients enabled, each prediction would store its graph.
+    # The gradients of a loaded model are disabled: the model is used for predictions only, and each prediction would
+    # store its graph.
     return Fit(
         model=fitted_model(run).requires_grad_(False).eval(),
         history=run.read_metrics(),

@@ -35,9 +35,9 @@ class NormalEquations(NamedTuple):
     descent: Tensor
 
     def step(self, damping: float | Tensor = 0.0) -> Tensor:
-        """Return the steps (H + damping diag H)^-1 (-g), (..., k).
+        """Return the steps (H + damping diag H)^-1 (-g), (..., k), with the Hessian H and the gradient g.
 
-        damping: a number for all systems of equations, or (...), one for each.
+        damping: one number for all systems of equations, or (...), one number per system.
         """
         factor = torch.as_tensor(damping, dtype=self.curvature.dtype)[..., None, None]
         # Marquardt's scaling by diag H instead of Levenberg's identity: steps are independent of the parameters' units.
@@ -46,7 +46,10 @@ class NormalEquations(NamedTuple):
         return result
 
     def predicted_decrease(self, step: Tensor) -> float:
-        """Return the decrease of the cost by a step s (k,) in the quadratic model of the cost: -g^T s - s^T H s / 2."""
+        """Return the decrease of the cost by a step s (k,) in its quadratic model: -g^T s - s^T H s / 2.
+
+        H is the Gauss-Newton Hessian, g the gradient of the cost.
+        """
         return float(step @ (self.descent - self.curvature @ step / 2))
 
 
@@ -55,7 +58,9 @@ class SolverState(Generic[Parameters]):
     """Iterate of the solver.
 
     Attributes:
+        x: parameters.
         residual: residual of the problem at x, from which the normal equations are computed.
+        cost: cost at x.
         damping: damping of the next step.
         steps: number of accepted steps, including earlier calls of the solver.
     """
@@ -71,8 +76,9 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: normal equations at the last iterate if no further step was accepted; if the solver ended right
-    after a step (small decrease, maximum number of steps), at the iterate before this step.
+    normal_equations: the latest computed normal equations. They belong to the last iterate if the solver ended since no
+    step from it was accepted. They belong to the iterate before it if the solver ended directly after an accepted step
+    (small decrease of the cost, maximum number of steps).
     """
 
     state: SolverState[Parameters]
@@ -99,7 +105,7 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return one or more candidates for the parameters after a step (k,) of the k free parameters.
+        """Return one or more candidates x for the parameters that result from a step (k,) of the k free parameters.
 
         The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
         cost divided by the predicted decrease) is low.
@@ -195,7 +201,8 @@ def _best_candidate(
         candidate = initial_state(problem, x, state.damping, state.steps + 1)
         if candidate.cost < best.cost:
             best = candidate
-        # Here the quadratic model predicts the decrease of the cost well: further candidates would lower it little.
+        # At a high gain ratio, the quadratic model predicts the decrease of the cost well: further candidates would
+        # lower the cost little.
         if state.cost - best.cost >= TUNING.min_gain_ratio * predicted:
             break
     return best

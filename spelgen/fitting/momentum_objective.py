@@ -1,6 +1,6 @@
-"""The objective momentum: fit the weak form of the equations of motion.
+"""Objective `momentum`: fit the weak form of the equations of motion.
 
-The objective rollout contains the same minimization as a stage before its epochs.
+The objective `rollout` contains the same minimization as a stage before its epochs.
 """
 
 import copy
@@ -37,7 +37,8 @@ class MomentumObjective(Objective):
     """
 
     name: ClassVar[str] = "momentum"
-    config: WindowConfig  # `prepare` sets the defaults that depend on the number of windows
+    # options of the fit; `prepare` sets the defaults that depend on the number of windows
+    config: WindowConfig
     saved_attributes: ClassVar[tuple[str, ...]] = (
         "epoch", "step", "best_epoch", "best_loss", "best_weights", "seconds", "substeps", "momentum_done",
     )  # fmt: skip
@@ -48,7 +49,7 @@ class MomentumObjective(Objective):
         self.notes: list[Diagnostic] = []
         self.epoch = self.step = self.best_epoch = 0
         minutes = self.config.max_minutes
-        self.allowed = math.inf if minutes is None else 60 * minutes  # time limit [s]
+        self.allowed = math.inf if minutes is None else 60 * minutes  # time limit of the fit [s]
 
     def prepare(self) -> PreparedLogs:
         """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""
@@ -67,7 +68,7 @@ class MomentumObjective(Objective):
         return self.notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume from the best weights in the checkpoint; an incomplete momentum stage is repeated."""
+        """Resume an interrupted fit from the best weights so far; an incomplete momentum stage is repeated."""
         self._set_up()
         for name in self.saved_attributes:
             setattr(self, name, checkpoint[name])
@@ -91,7 +92,7 @@ class MomentumObjective(Objective):
     def _set_up(self) -> None:
         """Move the model and the data to the device, set the batch and epoch sizes, and compute the validation loss."""
         device, config = self.request.options.device, self.config
-        # the time to read and prepare the logs is part of the allowed time
+        # The time to read and prepare the logs counts towards the time limit of the fit.
         self.seconds = time.monotonic() - self.request.began
         self.model.to(device)
         self.training, self.scales = self.data.training.to(device), self.data.scales.to(device)
@@ -121,11 +122,11 @@ class MomentumObjective(Objective):
         return time.monotonic() - self._since
 
     def fraction(self, seconds: float) -> float:
-        """Return ``seconds`` divided by the time limit; 0 without a limit, infinite if the limit is zero."""
+        """Return ``seconds`` divided by the time limit of the fit; 0 without a limit, infinite if the limit is zero."""
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient. generator: for the random order of batches."""
+        """Return an optimizer of the weights that require a gradient. generator: gives the random order of batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
@@ -148,8 +149,8 @@ class MomentumObjective(Objective):
     def _momentum_stage(self, progress: TrainingProgress) -> None:
         """Minimize the momentum loss, which needs no ODE solver.
 
-        If this does not lower the validation loss, the previous weights are restored. A run that is interrupted in this
-        stage repeats the whole stage when it is resumed.
+        If the minimization does not lower the validation loss, the previous weights are restored. A run that is
+        interrupted in this stage repeats the whole stage when it is resumed.
         """
         call, steps = TUNING.epoch_steps, self.config.momentum_steps
         optimizer = self._new_optimizer(torch.Generator().manual_seed(self.request.seed))

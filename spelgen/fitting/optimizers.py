@@ -1,8 +1,8 @@
 """Optimizers of window losses: AdamW on batches, or L-BFGS on all windows at once if there are few.
 
-The gradient of a few hundred windows takes no longer than the gradient of a batch. It has no sampling noise, so L-BFGS
-can estimate the curvature and converges to many digits. This matters for short logs and for simulated logs without
-noise.
+The gradient of a few hundred windows takes no longer than the gradient of a batch. The gradient of all windows has no
+sampling noise, so L-BFGS can estimate the curvature and converges to many digits. Accuracy to many digits matters for
+short logs and for simulated logs without noise.
 """
 
 import inspect
@@ -48,16 +48,19 @@ class WindowOptimizer(ABC):
         return False
 
     def state_dict(self) -> Content:
-        """Return the state from which a run is resumed."""
+        """Return the state of the optimizer, from which a run is resumed."""
         return self._optimizer.state_dict()
 
     def load_state_dict(self, state: Content) -> None:
-        """Restore the state from the result of `state_dict`."""
+        """Restore the state of the optimizer from the result of `state_dict`."""
         self._optimizer.load_state_dict(state)
 
 
 def _trainable(model: torch.nn.Module) -> tuple[list[torch.nn.Parameter], list[torch.nn.Parameter]]:
-    """Return two lists: parameters that require a gradient, and the matrices among them, which have weight decay."""
+    """Return two lists of a model's parameters: all that require a gradient, and the matrices among these.
+
+    Only matrices have weight decay.
+    """
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return parameters, [parameter for parameter in parameters if parameter.dim() > 1]
 
@@ -102,12 +105,13 @@ class MiniBatchAdamW(WindowOptimizer):
         self._optimizer.zero_grad()
         try:
             value = loss(windows)
-        except torch.linalg.LinAlgError:  # the rollout diverged
+        except torch.linalg.LinAlgError:  # LinAlgError: the rollout diverged
             return math.nan
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
-        # The loss is NaN if the gradient is not finite (0 * NaN is NaN): a test on the CPU would wait for a GPU.
+        # A gradient that is not finite makes the returned loss NaN (0 * NaN is NaN): an explicit test would wait for a
+        # GPU.
         return value.detach() + 0.0 * norm
 
 
@@ -176,12 +180,15 @@ class LBFGS(WindowOptimizer):
 
     @property
     def stalled(self) -> bool:
-        """Whether the last two calls lowered neither the loss nor the penalised loss significantly."""
+        """Whether the last two calls of the optimizer lowered neither the loss nor the penalised loss significantly."""
         waits: int = self._optimizer.param_groups[0]["waits"]
         return waits > 1
 
     def _evaluated(self, summands: Summands) -> Tensor:
-        """Compute the gradients and return the penalised loss, (); a large number if any of them is not finite."""
+        """Compute the gradients of the penalised loss; return this loss, (), or a large number if it is not finite.
+
+        The loss is also replaced by the large number if a gradient is not finite.
+        """
         self._optimizer.zero_grad()
         try:
             value = torch.zeros((), dtype=torch.float64)

@@ -81,7 +81,7 @@ class Posterior:
         """
 
         def at(x: Tensor) -> Tensor:
-            """Return the value of the function at the K fitted parameters x, (K,)."""
+            """Return the value (...) of `function` for the model with the K fitted parameters x, (K,)."""
             return evaluate_with(self.model, self._vector.unflatten(x), function)
 
         # Step of the central differences, in standard deviations of the fitted parameters: small enough that the
@@ -123,7 +123,7 @@ class Posterior:
         """
         if self.torque_std is None:
             raise RunError("intervals of torques", expected="a fit to logs with torques, not to commands")
-        # Imported here, because intervals of parameters need no samples.
+        # Jacobian and samples of torques are imported here, since intervals of parameters do not need them.
         from spelgen.fitting.torque.jacobian import TorqueJacobian
         from spelgen.fitting.torque.samples import TorqueSamples
         from spelgen.logs.dynamics_samples import DynamicsSamples
@@ -196,7 +196,7 @@ class Posterior:
 
     @property
     def drive_columns(self) -> dict[str, list[str]]:
-        """{quantity: column of the table of drives}.
+        """Columns of the table of the drives' constants, {quantity: column}.
 
         A column has one text per joint, the value with interval and unit; the text is empty if the joint has no value.
         """
@@ -258,16 +258,22 @@ class Posterior:
 
     @cached_property
     def _constants(self) -> Propagated:
-        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance."""
+        """Inertial parameters of all B bodies, then armatures, (10 B + n,), with a square root of their covariance.
+
+        The square root is (10 B + n, k), see `Propagated`.
+        """
         return self.propagate(_constants)
 
     @cached_property
     def _base_values(self) -> Propagated:
-        """Values of the base parameters, (r,), with a square root of their covariance."""
+        """Values of the r base parameters, (r,), with a square root (r, k) of their covariance."""
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the quantities of the drives, and the function that returns their values (quantities, n)."""
+        """Return the constants of the drives that have intervals, and the function that returns their values.
+
+        The function returns one row per constant for a model, (constants, n).
+        """
         return torque_drive_quantities(self.model)
 
     def _regressor(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
@@ -319,19 +325,22 @@ def posterior_of(
     delay_interval = late if delay else None
     if not servos:
         return Posterior(model, covariance, std, delay_interval)
-    # Imported here, because the file of the derived class imports this one.
+    # `ServoPosterior` is imported here, since its file imports this file.
     from spelgen.fitting.servo.posterior import ServoPosterior
 
     return ServoPosterior(model, covariance, std, delay_interval)
 
 
 def _constants(model: ArmModel) -> Tensor:
-    """Return the inertial parameters of all B bodies, then the armatures, (10 B + n,)."""
+    """Return the inertial parameters of all B bodies of a model, then the n armatures, (10 B + n,)."""
     return torch.cat([model.inertial_parameters.flatten(), model.armature])
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
-    """Return the tensor ``name``; None unless it has this shape, is float64, finite and not zero."""
+    """Return the tensor ``name`` of a posterior's content.
+
+    Return None unless the tensor has the given shape, is float64, finite and not zero.
+    """
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:
         return tensor if tensor.any() and tensor.isfinite().all() else None

@@ -79,7 +79,7 @@ def locked(folder: Path | None) -> Iterator[None]:
     if folder is None:
         yield
         return
-    # These folders are created here, and removed again if the fit writes nothing into them.
+    # `created` are the folders that are created here, and removed again if the fit writes nothing into them.
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     file = folder / LOCK
     # An error is raised at once, without waiting for the lock: the user may not know of the other process.
@@ -94,7 +94,7 @@ def locked(folder: Path | None) -> Iterator[None]:
                 f"{holder} trains in this folder", file=folder, do="wait for it, or -o another"
             ) from None
     try:
-        # another process shows this text in its error message
+        # Another process that finds the lock shows the text of this file in its error message.
         file.write_text(f"process {os.getpid()} on {socket.gethostname()}, since {time.strftime('%F %T')},")
         yield
     finally:
@@ -118,7 +118,8 @@ class TrainingProgress:
         columns = ("{task.description}", BarColumn(12), MofNCompleteColumn(), TimeRemainingColumn())
         self._bar = Progress(*columns, "{task.fields[state]}", console=self._console)
         self._task = self._bar.add_task("training", total=None, visible=False, state="")
-        self._line = ""  # text of the current stage, printed at the end of the stage if there is no terminal
+        # text about the progress of the current stage, printed at the end of the stage if there is no terminal
+        self._line = ""
 
     def __enter__(self) -> TrainingProgress:
         if self._show and self._console.is_terminal:
@@ -128,7 +129,8 @@ class TrainingProgress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._bar.live.is_started:  # rich prints an empty line for a bar that was not started
+        # A progress bar that was not started is not stopped either: rich would print an empty line.
+        if self._bar.live.is_started:
             self._bar.stop()
         self._end_stage()
 

@@ -62,7 +62,8 @@ def roll_out(
     # The integrator returns the velocity at the start of each interval. The first velocity is measured and not
     # returned; the last one is computed here.
     velocities = [*velocities[1:], model.velocity(model.at(q, prepared=prepared), p)]
-    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)  # each (W, K-1, n)
+    # positions and velocities, (W, K-1, n) each
+    return torch.stack(positions, dim=1), torch.stack(velocities, dim=1)
 
 
 def _adaptive_step(
@@ -84,10 +85,14 @@ def _adaptive_step(
         z: friction state of K bristles per joint, (W, n, K).
         step: duration of the interval [s].
     """
-    from torchdiffeq import odeint  # imported only if needed, since the import takes half a second
+    # torchdiffeq is imported only if needed, since its import takes half a second.
+    from torchdiffeq import odeint
 
     def rate(t: Tensor, state: Tensor) -> Tensor:
-        """Return d(q, p) / dt, (W, 2 n), of W windows, with t: time divided by the duration of the interval."""
+        """Return the derivative of the state (q, p), (W, 2 n), with respect to t = time / duration of the interval.
+
+        state: (W, 2 n) for W windows. The duration `step` converts the derivative with respect to time.
+        """
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
 
@@ -105,8 +110,8 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # The number of turns is constant for the gradient: the derivative of the wrapped difference with respect to the
-    # predicted position is one.
+    # The number of turns between both positions is constant for the gradient: the derivative of the wrapped difference
+    # with respect to the predicted position is one.
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
@@ -125,12 +130,12 @@ class LossScales(NamedTuple):
     tau: Tensor
 
     def to(self, device: str | torch.device) -> LossScales:
-        """Return the scales on another device."""
+        """Return the loss scales on another device."""
         return LossScales(*(x.to(device) for x in self))
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the scales of the losses for windows of logs.
+    """Return the divisors of the errors in the losses for windows of logs.
 
     A joint that hardly moves has 1 % of the largest scale of all joints. Raises LogError if no joint moves, since
     windows at rest do not determine a model.
@@ -151,7 +156,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: Tensor) -> Tensor:
-    """Return the square roots of mean squares (..., n), each at least 1 % of the largest root of the n joints."""
+    """Return the loss scales for mean squares (..., n) of n joints: square roots, at least 1 % of the largest root."""
     root = mean_square.sqrt()
     # The bound 1e-9 keeps the scale positive even if nothing varies, since errors are divided by the scale.
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
@@ -185,10 +190,10 @@ def rollout_loss(
 def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tensor:
     """Return the mean squared residual of the weak form of the equations of motion, a dimensionless scalar.
 
-    The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. It is
-    divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The impulse is the
-    trapezium sum along the measured samples: neither an ODE solver nor accelerations are needed. The velocity error
-    M(q)^-1 times the residual is not used, since it would favour an M that is too large.
+    The residual is p(t) - p(0), with the momentum p = M(q) qd, minus the impulse of all forces from 0 to t. The
+    residual is divided by t, which gives a mean torque, and by the standard deviation of the joint's torque. The
+    impulse is the trapezium sum along the measured samples: neither an ODE solver nor accelerations are needed. The
+    velocity error M(q)^-1 times the residual is not used, since it would favour an M that is too large.
 
     Args:
         model: model with the momentum M(q) qd.
@@ -211,14 +216,14 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
     residual = (p[:, 1:] - p[:, :1] - (dt * mean).cumsum(dim=1)) / dt.cumsum(dim=1)
     with torch.no_grad():
         inputs = model.input_matrix(q).abs()
-    # The scales of motor torques are converted to joint torques, since there may be gears between them.
+    # The scales of motor torques are converted to joint torques, since there may be gears between motors and joints.
     unit = (inputs @ scales.tau).mean(dim=(0, 1))
     result: Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
     return result
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout of a window diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -243,8 +248,8 @@ def integration_error(coarse: Tensor, fine: Tensor) -> float:
 def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start: int = 1) -> int:
     """Return a number of rk4 steps per sample interval that makes the integration error small.
 
-    It is the first of start, 2 start, 4 start, ... with an `integration_error` below `TUNING.integration_fraction`. The
-    search ends at `TUNING.max_substeps` even if the error is larger.
+    The number is the first of start, 2 start, 4 start, ... with an `integration_error` below
+    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger.
     """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:

@@ -1,4 +1,4 @@
-"""The objective rollout: minimize the error of predicted windows in epochs, and repeat epochs that diverged."""
+"""Objective `rollout`: minimize the error of predicted windows in epochs, and repeat epochs that diverged."""
 
 import copy
 import math
@@ -46,12 +46,14 @@ class RolloutObjective(MomentumObjective):
             if samples is not None:
                 self.notes += fit_torques(self.model, samples, TorqueFit())[0]
             else:
-                message = f"no torque fit: no log that moves has {SLOWEST:g} Hz for a second; windows alone are fitted"
+                message = (
+                    f"no torque fit: no log has a second of motion at {SLOWEST:g} Hz; only windows are fitted"
+                )
                 self.notes.append(Diagnostic("warning", "no-torque-fit", "logs", None, message))
         return super().begin()
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume from the last complete epoch."""
+        """Resume an interrupted fit after its last complete epoch."""
         super().resume(checkpoint, history)
         self.optimizer = self._optimizer()
         self.model.load_state_dict(checkpoint["model"])
@@ -88,7 +90,10 @@ class RolloutObjective(MomentumObjective):
         self._step_seconds, self._validation_seconds = 0.0, 0.0
 
     def _optimizer(self) -> WindowOptimizer:
-        """Return a new optimizer of all weights that are not fixed. Gradients of fixed weights are disabled."""
+        """Return a new optimizer of all weights that are not fixed. Gradients of fixed weights are disabled.
+
+        In the first stage, the residual terms that the torque fit did not select are fixed.
+        """
         for name, parameter in self.model.named_parameters():
             parameter.requires_grad_(name not in self.fixed)
         return self._new_optimizer(self.generator)
@@ -98,7 +103,7 @@ class RolloutObjective(MomentumObjective):
         return rollout_loss(self.model, windows, scales, self.substeps, solver) + self.penalty()
 
     def _end(self) -> Status | None:
-        """Return the status with which the current stage ends; None if it continues."""
+        """Return the status with which the current stage of epochs ends; None if the stage continues."""
         if self.epoch >= self.config.epochs or self.optimizer.stalled:
             return "finished"
         patience = self.config.patience
@@ -113,10 +118,10 @@ class RolloutObjective(MomentumObjective):
     def _run_epoch(self) -> Content:
         """Run one epoch and return its line of metrics.jsonl; repeat it at half the learning rate if it diverges."""
         while True:
-            # This is the state before the epoch, from which a diverged epoch is repeated.
+            # `state` is the state of the fit before the epoch: a diverged epoch is repeated from it.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
-            # the mean loss is NaN if the loss or the gradient of any step is not finite
+            # The mean loss of an epoch is NaN if the loss or the gradient of any step is not finite.
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
             self.step, self._step_seconds = self.step + steps, (trained - start) / steps
@@ -137,17 +142,17 @@ class RolloutObjective(MomentumObjective):
         return record
 
     def _steps_in_time(self) -> int:
-        """Return the number of steps of the next epoch, limited by the remaining time."""
+        """Return the number of optimizer steps of the next epoch, limited by the remaining time."""
         if math.isinf(self.allowed):
             return self.epoch_steps
-        # The time per step is still unknown: a short epoch measures it.
+        # In the first epoch, the time per step is still unknown: a short epoch measures it.
         if not self._step_seconds:
             return min(self.epoch_steps, TUNING.epoch_steps)
         remaining = self.allowed - self.seconds_now() - self._validation_seconds
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate of a future step; ahead: its number minus the number of the last completed step."""
+        """Return the learning rate of a later step. ahead: its number minus the number of the last completed step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 

@@ -77,7 +77,7 @@ class RunFolder:
             write_bytes(file, written)
 
     def save(self, weights: Content, checkpoint: Content) -> None:
-        """Write model.pt and checkpoint.pt."""
+        """Write the best weights to model.pt, and the checkpoint to checkpoint.pt."""
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 
@@ -114,18 +114,18 @@ class RunFolder:
         return RunError("no such run", file=self.path, expected=expected, do="make one with `spelgen train`")
 
     def read_record(self) -> Record:
-        """Return config.json.
+        """Return the record of the fit in config.json.
 
         Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
         """
         return require(Record, self.read_json(self.config), self.config)
 
     def read_baselines(self) -> Content:
-        """Return least_squares.json, {} if there is none. Raises RunError if it is broken."""
+        """Return the baselines in least_squares.json, {} if there are none. Raises RunError if the file is broken."""
         return self.read_json(self.baseline) if self.baseline.exists() else {}
 
     def load_checkpoint(self) -> Checkpoint:
-        """Return checkpoint.pt.
+        """Return the checkpoint of the fit in checkpoint.pt.
 
         Raises RunError if the file is absent or broken, lacks a key, or has a key of another type.
         """
@@ -151,7 +151,7 @@ class RunFolder:
         return state
 
     def read_spec(self) -> ModelSpec:
-        """Return spec.json. Raises RunError if there is none, ModuleError if it is no specification."""
+        """Return the specification in spec.json. Raises RunError if there is none, ModuleError if it is not valid."""
         if not self.spec.exists():
             if (self.path / "module.py").exists():
                 raise RunError(
@@ -172,7 +172,7 @@ def _require_unpacked_size(path: Path) -> None:
     """Raise ValueError if the unpacked file is too large: torch allocates memory of the sizes that the file states."""
     with ZipFile(path) as archive:
         size = sum(member.file_size for member in archive.infolist())
-    # 512 MiB, far more than a checkpoint with the state of an optimizer
+    # The limit of 512 MiB is far more than a checkpoint with the state of an optimizer has.
     if size > 2**29:
         raise ValueError(f"{size} bytes, expected at most {2**29}")
 
@@ -186,7 +186,7 @@ def _require_finite(weights: Content, path: Path) -> None:
         # A tensor of a huge shape may repeat a few stored numbers: only the stored numbers are tested.
         if tensor.numel() * tensor.element_size() > stored.nbytes():
             tensor = tensor.new_empty(0).set_(stored)
-        # the limit of a servo without an effort limit is infinite
+        # All weights are finite except `servo.limit`, which is infinite for a servo without an effort limit.
         if tensor.isnan().any() or (name != "servo.limit" and tensor.isinf().any()):
             do = "start a new run"
             raise RunError("no finite numbers", file=path, element=name, expected="weights", do=do)

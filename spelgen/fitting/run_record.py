@@ -75,7 +75,7 @@ class Record(BaseModel):
     @field_validator("config", mode="before")
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
-        """Return the options as an object of the objective's configuration class."""
+        """Return the options of a fit as an object of the configuration class of the fit's objective."""
         # `info.data` has no objective if the objective is invalid. pydantic reports the invalid objective, so the
         # options need no check.
         if "objective" not in info.data:
@@ -95,7 +95,7 @@ class Record(BaseModel):
 
     @property
     def options(self) -> Content:
-        """The options of the fit by name, as JSON."""
+        """The options of the recorded fit by name, as JSON."""
         return self._options(self.config)
 
     @property

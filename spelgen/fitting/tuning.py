@@ -7,7 +7,8 @@ from dataclasses import dataclass
 class FittingTuning:
     """Constants of the solvers and of fits to windows, grouped by the file that uses them."""
 
-    # Damping of Gauss-Newton steps, relative to the diagonal of the curvature (`fitting.levenberg_marquardt`).
+    # Constants of the damping of Gauss-Newton steps, relative to the diagonal of the curvature
+    # (`fitting.levenberg_marquardt`).
 
     # [1] Damping of the first step. Marquardt (J. SIAM 11:431, 1963) uses 1e-2.
     initial_damping: float = 1e-3
@@ -26,14 +27,14 @@ class FittingTuning:
     # too.
     min_gain_ratio: float = 0.5
 
-    # Windows on which a fit is validated (`fitting.dataset`).
+    # Constants of the windows on which a fit is validated (`fitting.dataset`).
 
     # [1] Largest number of validation windows: enough for the mean loss, which is computed after every epoch.
     validation_windows: int = 2048
     # [1] Number of training windows on which the integration error is measured.
     probe_windows: int = 64
 
-    # Steps on windows (`fitting.momentum_objective`).
+    # Constants of optimizer steps on windows (`fitting.momentum_objective`).
 
     # [1] Smallest number of steps per epoch; if there are few windows, an epoch uses each window several times.
     epoch_steps: int = 20
@@ -46,7 +47,7 @@ class FittingTuning:
     # [1] Learning rate of momentum steps, which are cheap and noisy, as a multiple of the configured learning rate.
     momentum_factor: float = 10.0
 
-    # Epochs of predicted windows (`fitting.rollout_objective`).
+    # Constants of epochs of predicted windows (`fitting.rollout_objective`).
 
     # [1] Largest fraction of all steps, or of the time limit, for the first stage. In the first stage, residual terms
     # that the torque fit did not select are fixed.
@@ -60,24 +61,24 @@ class FittingTuning:
     # [1] Number of diverged epochs that are repeated, each at half the learning rate, before a fit ends with an error.
     max_rollbacks: int = 8
 
-    # Integration step of rollouts (`fitting.rollout`).
+    # Constants of the integration step of rollouts (`fitting.rollout`).
 
     # [1] Largest number of rk4 steps per sample interval.
     max_substeps: int = 32
-    # [1] Largest integration error, as a fraction of the model's prediction error.
+    # [1] Largest accepted integration error of a rollout, as a fraction of the model's prediction error.
     integration_fraction: float = 0.03
     # [1] The integration error is compared with the model's prediction error or with this value, whichever is larger;
-    # both are errors divided by the scales of the loss.
+    # both numbers are errors divided by the scales of the loss.
     min_model_error: float = 1e-2
 
-    # Rollouts by dopri5 (`fitting.rollout`).
+    # Constants of rollouts by the adaptive solver dopri5 (`fitting.rollout`).
 
-    # [1] Relative tolerance of a step.
+    # [1] Relative tolerance of a step of dopri5.
     adaptive_rtol: float = 1e-7
-    # [rad, m, Nm s, N s] Absolute tolerance of a step, for positions and momenta.
+    # [rad, m, Nm s, N s] Absolute tolerance of a step of dopri5, for positions and momenta.
     adaptive_atol: float = 1e-9
 
-    # Optimizers of networks (`fitting.optimizers`).
+    # Constants of the optimizers of networks (`fitting.optimizers`).
 
     # [1] Learning rate of constants and biases, as a multiple of the learning rate of matrices.
     number_factor: float = 5.0
@@ -92,7 +93,7 @@ class FittingTuning:
     # [1] Number that replaces a loss that is not finite, so that the line search reduces the step.
     too_large: float = 1e12
 
-    # Regularizer towards the URDF (`fitting.urdf_regularizer`).
+    # Constants of the regularizer towards the URDF (`fitting.urdf_regularizer`).
 
     # [1] Number of random positions at which M and gravity of model and URDF are compared.
     regularizer_points: int = 200

@@ -38,8 +38,9 @@ class UrdfRegularizer(NamedTuple):
     def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
-        The loss is the sum of two mean squares: of the difference of W (M - mean M) W^T, and of the gravity torque's
-        difference divided by its scale.
+        The loss is the sum of two terms, averaged over the positions: the squared Frobenius norm of the difference of
+        W (M - mean M) W^T, divided by n, and the mean square over the joints of the difference of the gravity torque,
+        divided by `gravity_scale`.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -91,7 +92,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
         whitening = torch.linalg.inv(torch.linalg.cholesky(model.mass_matrix(q).mean(dim=0)))
     gravity = dynamics.gravity(q)
     scale = gravity.square().mean(dim=0).sqrt()
-    # If no joint has a gravity torque, the errors are divided by 1.
+    # If no joint has a gravity torque, the errors of the gravity torque are divided by 1.
     scale = scale.clamp(min=TUNING.min_gravity_scale * scale.max().item() or 1.0)
     return UrdfRegularizer(q, whitening, _variation(dynamics.mass_matrix(q), whitening), gravity, scale)
 

@@ -40,12 +40,16 @@ class BaseParameters:
         return len(self.columns)
 
     def formulas(self) -> tuple[str, ...]:
-        """Return the formula of each base parameter, e.g. ``Izz1 + m2 + 0.1 hx2``."""
+        """Return the formula of each base parameter as a sum of parameters, e.g. ``Izz1 + m2 + 0.1 hx2``."""
         rows = zip(self.combination, self.columns, strict=True)
         return tuple(_sum(row, column, self.parameters) for row, column in rows)
 
     def identifiability(self) -> dict[str, str]:
-        """Return the identifiability of each parameter: ``alone``, ``in combination`` with others, or ``never``."""
+        """Return {parameter: its identifiability}, for all K parameters.
+
+        ``alone``: the parameter is a base parameter; ``in combination``: it is a term of base parameters; ``never``: it
+        does not affect the torque.
+        """
         used = self.combination != 0
         alone = set(self.columns[used.sum(axis=1) == 1].tolist())
         result = dict.fromkeys(self.parameters, "never")
@@ -69,7 +73,8 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         names += [f"{effect}{joint + 1}" for joint in range(n)]
     columns = _columns(arm, friction, motors, len(names))
     candidates = np.array([parameter.index for parameter in exact] + list(range(inertial, len(names))))
-    # norm of each column's residual after projection onto all preceding columns; near zero for a dependent column
+    # `remainder`: norm of each column's residual after projection onto all preceding columns; near zero for a dependent
+    # column
     remainder = np.abs(np.diag(np.linalg.qr(columns[:, candidates], mode="r")))
     length = np.maximum(np.linalg.norm(columns[:, candidates], axis=0), 1.0)
     chosen = candidates[remainder > 1e-9 * length]
@@ -78,7 +83,8 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
         for k, weight in parameter.weights:
             combination[row, k] = float(weight)
     drives = np.linalg.lstsq(columns[:, chosen], columns[:, inertial:], rcond=None)[0]
-    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0  # rounding errors
+    # coefficients below this bound are rounding errors
+    drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
     terms = np.count_nonzero(combination, axis=1)
     base_names = [base_name(names[k], x) for k, x in zip(chosen.tolist(), terms.tolist(), strict=True)]
@@ -86,9 +92,14 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
 
 
 def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
-    """Return the regressor (rows, count) of all parameters at random states; count: number of parameters."""
+    """Return the regressor (E, count) of all parameters at random states of the arm: E equations of torques.
+
+    There are more than twice as many equations as parameters. count: number of parameters. motors: (n, n) matrix from
+    joint speeds to drive speeds; None: identity.
+    """
     n = len(arm.coordinates)
-    shape = (2 * count // n + 1, n)  # twice as many equations as parameters
+    # `shape`: random states for at least twice as many equations as parameters
+    shape = (2 * count // n + 1, n)
     q, qd, qdd = np.random.default_rng(0).uniform(-3.0, 3.0, (3, *shape))
     deflection = np.random.default_rng(1).uniform(-1.0, 1.0, (*shape, len(BRISTLES)))
     rows = np.concatenate([regressor(arm, q, qd, qdd), friction.columns(qd, qdd, deflection, motors)], axis=2)

@@ -1,4 +1,4 @@
-"""Faults of the columns of a log: other joints, the opposite sense, another unit."""
+"""Kinds of faults of the columns of a log: columns of other joints, signals of the opposite sense or another unit."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
 class WrongOrder(Fault):
-    """Columns of the joints in another order."""
+    """Kind of fault of a log: the columns of the joints are in another order."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
-        """Define the columns that are in another order.
+        """Define the columns of a log (motion, torques or both) that may belong to other joints.
 
         Args:
             code: code of the finding.
@@ -38,7 +38,7 @@ class WrongOrder(Fault):
         self._rows, self._starts = rows, starts
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the columns of two joints exchanged, for all pairs."""
+        """Yield least-squares fits of the log's torques with the columns of two joints exchanged, for all pairs."""
         return map(problem.fit, self._swapped(base.hypothesis))
 
     def _swapped(self, base: Hypothesis) -> Iterator[Hypothesis]:
@@ -48,14 +48,15 @@ class WrongOrder(Fault):
             yield base.changed(self, source=source)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best orders of all joints, one per start of the search.
+        """Yield least-squares fits of the log's torques with the best orders of all joints, one per start.
 
-        An order is improved by exchanging two joints at a time. The search also starts at random orders, since the
-        cost has local minima for arms with many joints.
+        A search starts at an order of the joints, and improves it by exchanging two joints at a time. It also starts at
+        random orders, since the cost has local minima for arms with many joints.
         """
         joints, rng = problem.arm.joint_names, np.random.default_rng(0)
         present = np.arange(len(joints))
-        # joints may be logged in the alphabetical order of their names
+        # The first three orders: unchanged, reversed, and alphabetical, since joints may be logged in the order of
+        # their names.
         starts = [present, present[::-1], np.argsort(np.argsort(joints))]
         starts += [rng.permutation(len(joints)) for _ in range(6)]
         # fits are cached, since searches from several starts visit the same orders
@@ -80,7 +81,11 @@ class WrongOrder(Fault):
                 yield fit
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the name of the joint in the log if all its columns belong to one joint; else the columns."""
+        """Return the settings that assign the right columns of the log to a joint; {} if it has its own columns.
+
+        If all columns belong to one other joint, the setting is `name`, the name of that joint in the log; otherwise
+        `columns`, the column of each quantity.
+        """
         names, mapping = correction.arm.joint_names, correction.mapping
         motion, torque = (names[k] for k in correction.hypothesis.source[:, joint])
         if correction.by_name and motion == torque != names[joint]:
@@ -94,36 +99,43 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Signals of joints in another sense or unit.
+    """Base class of faults that factors on the motion and on the torques correct: signals of another sense or unit.
 
-    factors: candidates (2, n) for factors on the motion and on the torques of n joints. The settings are the same for
-    all kinds of scales, since the setting `sign` applies to the motion and to the torque of a joint.
+    factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
+
+    All subclasses share `joint_keys`: the setting `sign` reverses both the motion and the torque of a joint, so that a
+    correction of the motion also changes the setting `gain` of the torque.
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
-        """Define the candidates, (2, n) each."""
+        """Define the candidates for factors on the motion and torque of n joints, (2, n) each."""
         self.factors = factors
 
     @abstractmethod
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints with this fault, for factors on their motion and torques (n,)."""
+        """Return the mask (n,) of the joints with this fault, for factors (n,) that correct their motion and torque."""
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with each candidate."""
+        """Yield the least-squares fit of the log's torques with each candidate for factors on motion and torque."""
         return self._scaled_by(self.factors, problem, base)
 
     def _scaled_by(
         self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
     ) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fit of the log's torques with each of the factors (2, n) on motion and torque."""
         reading = base.hypothesis
         for factor in factors:
-            # the offset in the mapping may have been measured with the right or with the wrong sign
+            # Both signs of the offset are tried: the offset in the mapping may have been measured with the right or the
+            # wrong sign.
             offsets = {x.tobytes(): x for x in (reading.offset, np.sign(factor[0]) * reading.offset + 0.0)}
             for offset in offsets.values():
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the sign, the units and the gain of a joint, and the offsets of its position and torque."""
+        """Return the settings that correct the scale of a joint's signals, as far as they change.
+
+        These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
+        """
         if not self.has(*correction.factors)[joint]:
             return {}
         name, (motion, torque) = correction.arm.joint_names[joint], correction.factors[:, joint].tolist()
@@ -151,7 +163,7 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Positions and velocities of a joint that have the opposite sense, with or without its torque."""
+    """Kind of fault of a log: positions and velocities of a joint have the opposite sense, with or without torque."""
 
     code = "joint-sense"
 
@@ -160,11 +172,11 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense."""
+        """Return the mask (n,) of the joints whose motion has the opposite sense: `motion`, (n,), is negative there."""
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return a description of the signals of the opposite sense."""
+        """Return the text about joints of the opposite sense, which states whether it includes their torques."""
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():
@@ -174,7 +186,7 @@ class JointSense(WrongScale):
 
 
 class TorqueSense(WrongScale):
-    """Torques of the opposite sense, of all joints or of one joint."""
+    """Kind of fault of a log: the torques of all joints, or of one joint, have the opposite sense."""
 
     code = "torque-sense"
     description = "torques of the opposite sense"
@@ -183,15 +195,16 @@ class TorqueSense(WrongScale):
         super().__init__([np.stack([np.ones(n), sign]) for sign in (-np.ones(n), *(1.0 - 2.0 * np.eye(n)))])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints of which only the torque has the opposite sense."""
+        """Return the mask (n,) of the joints of which only the torque has the opposite sense (factor below 0)."""
         return np.asarray((torque < 0) & (motion > 0))
 
 
 class TorqueUnit(WrongScale):
-    """Torques in another unit, which has a factor larger than 5.
+    """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
-    The evidence for a factor is the magnitude of the gravity in the torques, and no decrease of the cost is required:
-    light bodies can explain torques that are too small.
+    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
+    candidate need not lower the cost much, unlike other faults: the fit without it explains torques that are too small
+    by light bodies.
     """
 
     code = "torque-unit"
@@ -209,7 +222,10 @@ class TorqueUnit(WrongScale):
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with each candidate, and with a factor of its own for each joint if the factors differ."""
+        """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
+
+        A fit with a separate factor for each joint is added if it is better.
+        """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
         if is_open.all():
@@ -222,7 +238,8 @@ class TorqueUnit(WrongScale):
         if not candidates:
             return
         for factor in candidates:
-            # mNm in the mapping is wrong, whatever the masses of the URDF
+            # Factors near 1000 on torques in mNm become 1000: the torques are in Nm, and the masses of the URDF are
+            # inexact.
             is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
@@ -231,35 +248,41 @@ class TorqueUnit(WrongScale):
         if is_found:
             return
         best = lowest = min(fits, key=lambda fit: fit.cost)
-        # the couplings of the joints show the ratios of the factors, and the URDF's masses a common factor
+        # Factors are optimised for one joint after the other, then for all joints together: the dynamic coupling of the
+        # joints determines the ratios of the factors, and the masses of the URDF determine their common factor.
         for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
             exponent = minimize_scalar(
                 lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # such factors also correct errors of the URDF's masses, and so lower the cost a little; no factor explains a
-        # torque that does not resemble the URDF's, such as its magnitude
+        # Three conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost
+        # a little: one factor must be as large as of another unit, and the cost decrease must be significant. Torques
+        # of another fault, such as torques without sign, are not explained by any factor, so the relative residual of
+        # each joint must be small.
         is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
-        if (
-            is_unit
-            and best.cost < lowest.cost - GEOMETRY.needed
-            and best.errors.max() <= GEOMETRY.unexplained
-        ):
+        is_explained = best.errors.max() <= GEOMETRY.unexplained
+        if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the fit with torques that are multiplied by further factors (n,), rounded to two digits in all."""
+        """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
+
+        The total factor on the torques, relative to the unchanged log, is rounded to two digits.
+        """
         (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
         rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit."""
+        """Return the mask (n,) of the joints whose torque has another unit: `torque`, (n,), is not 1 or -1 there."""
         return np.asarray(np.abs(torque) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the largest factor, and with the sense of the torques if no other fault has it."""
+        """Return the text about torques in another unit: the largest factor, and the opposite sense of the torques.
+
+        The opposite sense is omitted if another fault of the hypothesis, such as `TorqueSense`, has it.
+        """
         torque = correction.factors[1]
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
         senses = (JointSense, TorqueSense)
@@ -271,7 +294,10 @@ class TorqueUnit(WrongScale):
         return f"torques of another unit{sense}, {times}"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return a code for factors between 0.1 and 10; inertials of a URDF are never wrong by a factor of ten."""
+        """Return the code of a warning if all factors on the torques are between 0.1 and 10; else "", for an error.
+
+        Masses of a URDF may be wrong by such a factor, but never by a factor of ten.
+        """
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
 
@@ -282,37 +308,42 @@ def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
 
 
 def rounded_factor(factor: float) -> float:
-    """Return a rounded factor: 0.001, from mNm to Nm, if it is close; else with one significant digit, or with two.
+    """Return a factor on torques, rounded for a message; its sign remains.
 
-    One digit is enough if it changes the factor by less than 10 %.
+    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
+    changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # a tolerance of 50 %, since the factor is only as exact as the masses of the URDF
+        # The bound is wide, since the factor is only as exact as the masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 class PositionUnit(WrongScale):
-    """Positions of all revolute or of all prismatic joints in another unit than the mapping states."""
+    """Kind of fault of a log: positions of all revolute or all prismatic joints in another unit than in the mapping."""
 
     code = "joint-unit"
     rarity = 2
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit."""
+        """Return the mask (n,) of the joints whose positions have another unit: `motion`, (n,), is not 1 or -1."""
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the units."""
+        """Return the text about positions in another unit, which names this unit."""
         joints = np.flatnonzero(self.has(*correction.factors)).tolist()
         return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
 
 
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
-    """Return candidates for factors (2, n) on the motion of all joints of a type, for each other unit.
+    """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
 
-    scale: (n,) factor from logged positions to SI units, with the sign of the joint.
+    There is one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have
+    the factor 1.
+
+    scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
+    `sign: -1`.
     """
     types, candidates = np.array(arm.joint_types), []
     for joint_type, units in UNITS.items():
@@ -324,7 +355,10 @@ def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
 
 
 def position_unit(correction: Correction, joint: int) -> str:
-    """Return the unit of a joint's positions whose factor to SI units is nearest to the factor of the hypothesis."""
+    """Return the unit, such as "deg", that a hypothesis about a log assumes for the positions of a joint.
+
+    It is the unit whose factor to SI units is nearest to the scale of the positions in the hypothesis.
+    """
     scale = abs(float(correction.hypothesis.scale[0, joint]))
     units = UNITS[correction.arm.coordinates[joint].joint_type]
     return min(units, key=lambda unit: abs(np.log(scale / SCALES.get(unit, 1.0))))

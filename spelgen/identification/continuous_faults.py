@@ -1,4 +1,7 @@
-"""Faults of a log with a continuous quantity: zero offsets, delays, the vector of gravity."""
+"""Kinds of faults of a log with a continuous quantity: zero offsets, delays, the vector of gravity.
+
+The quantity of lowest cost is found by Gauss-Newton steps (`GeometryProblem.descend`).
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,15 @@ DIFFERENCE = 1e-4  # [s] step of finite differences with respect to delays
 
 
 class ZeroOffset(Fault):
-    """Positions of a joint with another zero than the URDF's."""
+    """Kind of fault of a log: the positions of a joint have another zero than in the URDF."""
 
     code = "joint-zero"
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best offset of each joint.
+        """Yield, for each joint, the least-squares fit of the log's torques with the best zero offset of its position.
 
-        Offsets as small as calibration errors are omitted, and offsets that hardly improve the fit to the torques.
+        Offsets as small as calibration errors, and offsets that hardly lower the torque residual, are omitted.
         """
         for k, coordinate in enumerate(problem.arm.coordinates):
             yield from self._best(problem, base, k, coordinate.joint_type == "revolute")
@@ -35,17 +38,22 @@ class ZeroOffset(Fault):
     def _best(
         self, problem: GeometryProblem, base: HypothesisFit, joint: int, is_revolute: bool
     ) -> Iterator[HypothesisFit]:
-        """Yield the fit with the offset of minimum cost of a joint, for which multiples of 90 degrees are preferred."""
+        """Yield the least-squares fit with the best zero offset of a joint, if it lowers the torque residual enough.
+
+        Offsets as small as calibration errors are omitted. A multiple of 90 degrees is preferred to the offset of
+        minimum cost if its cost is about equal.
+        """
         reading, unit = base.hypothesis, np.eye(len(base.hypothesis.offset))[joint]
         min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift
 
         def shifted(values: np.ndarray) -> Hypothesis:
-            """Return the hypothesis with another offset of the joint; values: change, (1,) [rad, m]."""
+            """Return the hypothesis in which the joint's zero offset is changed by `values`, (1,) [rad, m]."""
             return reading.changed(self, offset=reading.offset + values * unit)
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # from the unchanged zero, a step as small as calibration errors is no other zero
+        # Length of a step that ends the descent: `min_offset` if it starts at the unchanged zero, since a smaller
+        # offset is only a calibration error; otherwise shorter, since the offset near a right angle has to be accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -66,7 +74,7 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the largest offset of the joints whose sense is right."""
+        """Return the text about zero offsets: the largest offset of the joints that have the right sense."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -76,29 +84,37 @@ class ZeroOffset(Fault):
         return f"positions with another zero, by {size}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the offset of a joint whose sense is right; a wrong sense has another offset, too."""
+        """Return the setting `offset` of a joint if the hypothesis has another zero of its position; {} if not.
+
+        For a joint of the opposite sense, {} is returned, too: `JointSense` returns sign and offset of such a joint,
+        since another sign may need another offset.
+        """
         offset = correction.hypothesis.offset[joint]
         if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
             return {}
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code for offsets as small as errors of a URDF."""
+        """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         return self.code if np.abs(shifts).max() < GEOMETRY.serious_angle else ""
 
 
 class Delay(Fault):
-    """Motion, torque or all signals of a joint, or the torques of all joints, that were logged later or earlier."""
+    """Kind of fault of a log: some signals were logged later or earlier than the others.
+
+    These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
+    """
 
     code = "joint-delay"
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best delay of the signals of each joint, and of all torques.
+        """Yield least-squares fits of the log's torques in which the signals of a joint, or all torques, are delayed.
 
-        Delays as short as the apparent delays that friction causes are omitted, and a second delay. Samples without
-        their neighbours show no delay.
+        Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
+        omitted. Nothing is yielded if the hypothesis of the fit `base` has a delay already, or if the samples lack the
+        preceding and following signals, with which they can be shifted in time.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
@@ -106,10 +122,14 @@ class Delay(Fault):
         for signals in _delayed_signals(len(reading.offset)):
 
             def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
-                """Return the hypothesis in which the signals in a mask (2, n) have this delay, (1,) [s]."""
+                """Return the hypothesis that `signals`, a (2, n) mask of motions and torques, have a delay.
+
+                delay: (1,) [s].
+                """
                 return reading.changed(self, delay=reading.delay + delay * signals)
 
-            # a step from 0 would be too short for noisy torques, whose derivative is mostly noise
+            # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
+            # torques, whose derivative with respect to time is mostly noise.
             starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
             delay, _ = problem.descend(
                 delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
@@ -122,14 +142,14 @@ class Delay(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the longest delay."""
+        """Return the text about delayed signals: which signals of the joints, and the longest delay."""
         delay = correction.hypothesis.delay
         longest = 1e3 * float(delay.ravel()[np.abs(delay).argmax()])
         order = "later" if longest > 0 else "earlier"
         return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the delays of the signals of a joint."""
+        """Return the setting `delay` of a joint's signals; {} if the setting `torque_delay` of the log is enough."""
         mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
         if self.log_keys(correction) or not delays.any():
             return {}
@@ -142,7 +162,7 @@ class Delay(Fault):
         return {"delay": {**present.model_dump(exclude_unset=True), **late}}
 
     def log_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the delay of all torques if it is common to all joints."""
+        """Return the setting `torque_delay` of the log if the torques of all joints have one delay; else {}."""
         delay = correction.hypothesis.delay[1]
         if not delay.any() or (delay != delay[0]).any():
             return {}
@@ -150,14 +170,21 @@ class Delay(Fault):
 
 
 class JointClock(Fault):
-    """Motion, torque or all signals of a joint, or the torques of all joints, whose times are of another clock."""
+    """Kind of fault of a log: some signals have times of another clock, so that their delay changes linearly.
+
+    These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
+    """
 
     code = "joint-clock"
     rarity = 3
     advice = "no setting corrects it: log all joints with one clock"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with a delay that changes, if the base has a constant delay; else near a delay of 0."""
+        """Yield the least-squares fit of the torques with a delay that changes linearly with time.
+
+        The search starts from the delay of `base` or, if there is none, near 0. Nothing is yielded if the delay of
+        `base` already changes.
+        """
         delay = base.hypothesis.delay
         if delay.any() and not base.hypothesis.drift.any():
             faults = tuple(x for x in base.hypothesis.faults if not isinstance(x, Delay))
@@ -191,7 +218,7 @@ class JointClock(Fault):
                 yield from self._best(problem, reading, start, signals)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with the best delays of signals at the start and the end of a recording, if they differ."""
+        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -199,14 +226,18 @@ class JointClock(Fault):
                 starts.append(
                     (problem.fit(self._drifting(problem, reading, delays, signals)).cost, delays, signals)
                 )
-        # the best starts have the right signals and the right sign
+        # Only the three starts of lowest cost are refined: they have the right signals and the right sign of the drift.
         for _, start, signals in sorted(starts, key=itemgetter(0))[:3]:
             yield from self._best(problem, reading, start, signals)
 
     def _best(
         self, problem: GeometryProblem, reading: Hypothesis, start: np.ndarray, signals: np.ndarray
     ) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best delays (2,) at the start and the end, from `start`, if they differ enough."""
+        """Yield the least-squares fit in which some signals have the best delays at the start and end of a recording.
+
+        Nothing is yielded if both delays are about equal. start: (2,) [s] initial delays of the descent. signals: (2,
+        n) mask of the delayed motions and torques.
+        """
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
         )
@@ -217,22 +248,22 @@ class JointClock(Fault):
     def _drifting(
         self, problem: GeometryProblem, reading: Hypothesis, delays: np.ndarray, signals: np.ndarray
     ) -> Hypothesis:
-        """Return the hypothesis with delays (2,) [s] of some signals at the start and the end of a recording.
+        """Return the hypothesis in which the delay of some signals changes linearly during a recording.
 
-        signals: mask (2, n) of these signals.
+        delays: (2,) [s] at the start and the end. signals: (2, n) mask of the delayed motions and torques.
         """
         first, last = delays
         drift = (last - first) / float(problem.samples.times.max())
         return reading.changed(self, delay=first * signals, drift=drift * signals)
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the relative error of the clock."""
+        """Return the text about signals with another clock: which signals, and the error of the clock's rate."""
         drift = correction.hypothesis.drift
         largest = float(drift.ravel()[np.abs(drift).argmax()])
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints with another clock."""
+        """Return the names of the joints that have signals with times of another clock."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 
@@ -249,7 +280,10 @@ def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: Hypothesi
 
 
 def _delayed_signals(n: int) -> list[np.ndarray]:
-    """Return the masks (2, n) of signals with a common delay: all torques, and signals of each of n joints."""
+    """Return masks (2, n) of motion and torque, one per set of signals that may have a common delay.
+
+    The sets: the torques of all n joints; then, for each joint, its motion, its torque, and both.
+    """
     masks = [np.stack([np.zeros(n), np.ones(n)])]
     for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
         masks += [np.outer(rows, unit) for unit in np.eye(n)]
@@ -257,7 +291,7 @@ def _delayed_signals(n: int) -> list[np.ndarray]:
 
 
 def _late_signals(delay: np.ndarray) -> str:
-    """Return the names of the signals whose delay (2, n) is not 0."""
+    """Return words for the delayed signals, such as "torques". delay: (2, n) of motions and torques."""
     names = {
         (0, 1): "torques",
         (1, 0): "positions and velocities",
@@ -267,23 +301,27 @@ def _late_signals(delay: np.ndarray) -> str:
 
 
 class Compensation(Fault):
-    """Torques from which a controller's gravity compensation is missing, entirely or in part."""
+    """Kind of fault of a log: a controller compensates gravity, or a part of it, and the torques lack this part."""
 
     code = "gravity-compensated"
     rarity = 3
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with at most half of gravity, or without gravity if it fits about equally well."""
+        """Yield the least-squares fit of the torques with the best fraction of gravity, or without gravity.
+
+        The fraction is between -0.5 and 0.5. The fit without gravity is preferred if its cost is about equal.
+        """
         present = np.array(base.hypothesis.gravity)
         if not present.any():
             return
 
         def reduced(fraction: np.ndarray) -> Hypothesis:
-            """Return the hypothesis that this fraction, (1,), of gravity is in the torques."""
+            """Return the hypothesis that the torques contain only a fraction of the gravity torque; fraction: (1,)."""
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
-        # a fraction of more than a half in all joints is ascribed to wrong masses of the URDF, not to a compensation
+        # The fraction is bounded: if more than half of gravity remains in all joints, the masses of the URDF are
+        # probably wrong.
         fraction, _ = problem.descend(
             reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
         )
@@ -291,42 +329,42 @@ class Compensation(Fault):
         yield some if some.cost < without.cost - GEOMETRY.ambiguous else without
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the remaining fraction of gravity."""
+        """Return the text about a gravity compensation, with the fraction of gravity that remains in the torques."""
         present = np.array(correction.unchanged.gravity)
         fraction = float(np.array(correction.hypothesis.gravity) @ present / (present @ present))
         return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the vector of gravity."""
+        """Return the setting `gravity` of the robot: the vector of gravity that the hypothesis assumes [m/s^2]."""
         return {"gravity": [plain_number(x) for x in correction.hypothesis.gravity]}
 
 
 class Gravity(Compensation):
-    """Torques of an arm that is mounted in another orientation than the settings state."""
+    """Kind of fault of a log: gravity has another direction, since the arm is not mounted as the settings state."""
 
     code = "gravity"
     rarity = 1
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fit with the best direction of gravity; directions along the axes of the root link are preferred.
+        """Yield the least-squares fit of the torques with the best direction of gravity.
 
-        A direction is omitted if it differs from the present one by less than calibration errors, or if the torques may
-        contain no gravity.
+        Directions along the axes of the root link are preferred. Nothing is yielded if the direction differs from the
+        present one by less than errors of the mounting, or if the torques may contain no gravity.
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
-        standard = size or 9.81  # m/s^2
+        standard = size or 9.81  # [m/s^2] magnitude of gravity
 
         def turned(gravity: np.ndarray) -> Hypothesis:
-            """Return the hypothesis with this vector of gravity, (3,) [m/s^2]."""
+            """Return the hypothesis that gravity is this vector, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
-            """Return the vector of the present magnitude in the direction of `gravity`, (3,) [m/s^2]."""
+            """Return the vector (3,) [m/s^2] in the direction of `gravity`, with the present magnitude."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
-        # gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as
-        # with a vertical prismatic joint
+        # Gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as for
+        # an arm whose only joint that gravity loads is vertical and prismatic.
         starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
         lowest = min(fit.cost for fit in starts)
         start = next(fit for fit in starts if fit.cost < lowest + 1.0)
@@ -339,8 +377,9 @@ class Gravity(Compensation):
                 )
             )
         new, best = min(descents, key=lambda x: x[1].cost)
-        # Without gravity the torques are the same as with gravity along the axes of all joints. Gravity along -z is the
-        # nearest explanation of this, other directions are less likely than a compensation.
+        # Torques without gravity are explained equally well by gravity parallel to the axes of all joints. Of these
+        # directions only -z is accepted; instead of any other direction, a gravity compensation is the more likely
+        # explanation.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
         if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
@@ -349,20 +388,20 @@ class Gravity(Compensation):
             yield axis if is_axis else problem.fit(turned(new.round(3)))
 
     def text(self, correction: Correction) -> str:
-        """Return a description with the angle between both directions of gravity."""
+        """Return the text about the orientation of the arm: the angle between gravity in settings and hypothesis."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code for a tilt as small as errors of the mounting."""
+        """Return the code of a warning if the tilt of gravity may be an error of the mounting; else ""."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""
 
 
 def with_gravity(fault: Fault, base: HypothesisFit, gravity: np.ndarray) -> Hypothesis:
-    """Return the hypothesis of a fit with another vector of gravity (3,) [m/s^2], which corrects a fault."""
+    """Return the hypothesis of `base` with another vector of gravity, (3,) [m/s^2], as a correction of `fault`."""
     x, y, z = (float(value) + 0.0 for value in gravity)
     return base.hypothesis.changed(fault, gravity=(x, y, z))

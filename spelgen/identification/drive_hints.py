@@ -1,8 +1,8 @@
 """Detection of couplings of motors that the settings do not declare, by least squares on a subset of the samples.
 
-The friction model depends on the velocity only. The Gram matrices of the regressor are computed once, since a candidate
-for a coupling changes the columns of two joints only. The best candidate is accepted if it lowers the torque residual
-on held-out blocks of time.
+The friction model depends on the velocity only. The Gram matrices of the regressor are computed once for all joints; a
+candidate for a coupling changes the matrices of two joints only. The best candidate is accepted if it lowers the torque
+residual on held-out blocks of time.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ class Coupling:
 
     @property
     def pair(self) -> list[int]:
-        """Indices of both joints: `joint`, `moved_by`."""
+        """Indices of the coupled joints: the joint that the motor drives, and the joint that also rotates the motor."""
         return [self.joint, self.moved_by]
 
 
 def drive_rows(
     chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, speeds: np.ndarray
 ) -> np.ndarray:
-    """Return the regressor (S, n, K) of the joint torques.
+    """Return the regressor Y (S, n, K) of the joint torques: tau = Y @ parameters at each of S samples.
 
-    The columns belong to the inertial parameters of the bodies, then to each friction effect of all drives. q, qd, qdd:
-    (S, n) [rad, m], per s, per s^2. speeds: matrix C (n, n) from joint speeds to motor speeds, with the declared
-    couplings.
+    The K columns belong to the inertial parameters of the bodies, then to each friction effect of all drives. q, qd,
+    qdd: (S, n) [rad, m] and their derivatives with respect to time [s]. speeds: matrix C (n, n) from joint speeds to
+    motor speeds, with the declared couplings.
     """
     bodies = chain_regressor(chain, q, qd, qdd)
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: MotionSamples) -> DriveProblem:
-    """Return the least-squares problem for the joint torques of samples without time shift."""
+    """Return the least-squares problem of the joint torques of `samples`, without a shift of torques in time."""
     q, qd, qdd = samples.motion
     regressors = drive_rows(chain, q, qd, qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
@@ -91,28 +91,31 @@ class DriveProblem:
 
     @property
     def bodies(self) -> np.ndarray:
-        """Columns of the regressor that belong to the inertial parameters, (S, n, 10 bodies)."""
+        """Columns of the regressor that belong to the inertial parameters of the bodies, (S, n, 10 bodies)."""
         return self.rows[..., : -len(FRICTION.effects) * len(self.size) - 1]
 
     @property
     def free(self) -> list[int]:
-        """Indices of the joints that have no declared coupling and a torque that is not constant."""
+        """Indices of the joints for which a coupling is searched: no coupling declared, and a torque that varies."""
         joins = self.speeds != 0
         return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
-        """Return the problem with the torques replaced by tau (S, n)."""
+        """Return the least-squares problem with other joint torques, tau (S, n) [Nm, N], e.g. without a delay."""
         rows = np.concatenate([self.rows[..., :-1], tau[..., None]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     def in_one_block(self, stride: int) -> DriveProblem:
-        """Return the problem on every `stride`-th sample, in a single block: without held-out samples."""
+        """Return the least-squares problem on every `stride`-th sample, in a single block of time.
+
+        No samples are held out, and fewer samples save time.
+        """
         rows = self.rows[::stride]
         return replace(self, samples=self.samples.every(stride), rows=rows, products=block_products(rows, 1))
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Squared torque residual (B, n) of each joint in each block, divided by the mean squared torque of a block.
+        """Sum of the squared torque residuals of each joint in each block, (B, n), divided by `size` of the joint.
 
         The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """
@@ -123,20 +126,23 @@ class DriveProblem:
         solution = normal_solution(fitted, 1)
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
-        # the residual of an exact model consists of rounding errors
+        # bounded from below: the residual of an exact model consists of rounding errors
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
-        """Return the squared torque residual of both joints with a coupling, divided by the residual without it."""
+        """Return the squared torque residual of two coupled joints, divided by the residual without their coupling."""
         errors = self.coupled(coupling).errors[:, coupling.pair].mean()
         return float(errors / self.errors[:, coupling.pair].mean())
 
     def coupled(self, coupling: Coupling) -> DriveProblem:
-        """Return a copy whose Gram matrices of both coupled joints belong to a model with this coupling."""
+        """Return the least-squares problem of a model in which the motors of two joints are coupled.
+
+        Only the Gram matrices of both coupled joints are recomputed; `rows` remains the regressor without the coupling.
+        """
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = self.samples.motion[1:]
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
-        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects)
+        columns = FRICTION.columns(qd, qdd)[:, 0]  # columns: (S, effects) of the motor
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
         rows = self.rows[:, coupling.pair].copy()
@@ -152,16 +158,18 @@ class DriveProblem:
 def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     """Return the coupling of two neighbouring joints that lowers the torque residual most; None if none is significant.
 
-    The second value is the squared residual of both joints with the coupling, divided by the residual without it.
-    Joints with a declared coupling are omitted.
+    The second value is the squared torque residual of both joints with the coupling, divided by the residual without
+    it. Joints with a declared coupling are omitted.
     """
     # all pairs are compared on every fourth sample with three ratios, which suffices to find the best pair
     coarse = problem.in_one_block(4)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
         if abs(joint - moved_by) > 1:
-            continue  # shafts and belts couple neighbours; fits of other pairs explain other effects, such as springs
-        # the ratio is refined later, within half to twice each of these values
+            # Only neighbours are tried, which shafts and belts couple; fits of other pairs explain other effects, such
+            # as springs.
+            continue
+        # three ratios of motor speed are tried; the best one is refined later, within half to twice its value
         for ratio, sign in product((0.4, 1.0, 2.5), (1.0, -1.0)):
             candidates.append(Coupling(joint, moved_by, sign * ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, sign * ratio, "motors"))
@@ -171,8 +179,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     best = _with_best_ratio(nearest, problem.in_one_block(1).cost)
     logged = problem.errors[:, best.pair].mean(axis=1)
     coupled = problem.coupled(best).errors[:, best.pair].mean(axis=1)
-    # If the model with the coupling has a large error in any block, neither model explains the torques, and the
-    # comparison is no evidence.
+    # The coupling is rejected if the model with it has a large error in any block: such a model does not explain the
+    # torques, and a smaller error than without the coupling is no evidence.
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
@@ -180,7 +188,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return a coupling with the ratio of minimum cost.
+    """Return the coupling `start` with the ratio of minimum cost, between half and twice its ratio.
 
     A fraction of small integers near the minimum is preferred if its cost is at most 2 % higher.
     """
@@ -196,17 +204,17 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if a candidate lowers the errors per block (B,) significantly, and their mean by the factor `gain`.
+    """Return True if a candidate for a coupling significantly lowers the errors of B blocks of time.
 
     Args:
         logged: (B,) errors without the candidate.
         mended: (B,) errors with the candidate.
-        gain: largest ratio of both means.
+        gain: largest accepted ratio of the mean error with the candidate to the mean error without it.
         candidates: number of candidates of which this candidate is the best.
     """
     if mended.mean() >= gain * logged.mean():
         return False
-    # relative differences are between -1 and 1, so that no single block dominates their mean
+    # `gains` are relative differences between -1 and 1, so that no single block dominates their mean
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore

@@ -31,7 +31,7 @@ RANK = attrgetter("rank")
 def kinds_of_faults(
     arm: Chain, torque_unit: TorqueUnit | None = None, position_scale: np.ndarray | None = None
 ) -> tuple[Fault, ...]:
-    """Return all kinds of faults of logs of an arm with n joints that the search corrects.
+    """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
 
     torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
     logged positions to SI units; None: the unit of positions is right.
@@ -57,12 +57,13 @@ def kinds_of_faults(
 
 
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
-    """Return the fit of the unchanged log and, if any hypotheses fit significantly better, the fits of the best.
+    """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    Fits that are about as good as the best one are returned, too; the best one is first. faults: kinds of faults that
-    are tested.
+    The hypotheses have about the same cost, and the best one is first. If there is none, the result has only the fit of
+    the unchanged log. Kinds of faults with other evidence, such as a comparison of the torques with the URDF's gravity,
+    need no significant decrease of the cost. faults: kinds of faults; each kind and combinations are tested.
     """
-    # the many hypotheses are compared on few samples, and the best ones below on more
+    # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
@@ -90,13 +91,14 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         fits = [*tried, unchanged]
     likely = _likely(unchanged, fits)
     if not likely:
-        # faults for which there is other evidence than the cost
+        # If no cost decrease is significant, faults with other evidence than the cost are considered, e.g. another
+        # torque unit.
         known = [fit for fault in faults if not fault.needed for fit in fault.fits(coarse, unchanged)]
         best = min(known, key=RANK, default=unchanged)
         return (unchanged, best) if best.cost < unchanged.cost else (unchanged,)
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
-    # only three, since a message lists three hypotheses at most
+    # only three hypotheses are confirmed, since a message lists at most three
     confirmed = _weighed(finer, [finer.fit(fit.hypothesis) for fit in likely[:3]], unchanged)
     return unchanged, *_likely(unchanged, confirmed)
 
@@ -104,13 +106,20 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 def _weighed(
     problem: GeometryProblem, fits: Sequence[HypothesisFit], base: HypothesisFit
 ) -> list[HypothesisFit]:
-    """Return the fits, with other costs if a friction model with hysteresis supports their hypotheses more or less.
+    """Return the fits with costs that take a friction model with hysteresis into account.
 
-    Presliding hysteresis, which the model lacks, is a few per cent of the torque under all hypotheses, and hides the
-    smaller residual of the right one. A model with hysteresis has smaller residuals, so that its cost decreases are
-    larger, but also for wrong hypotheses: on recorded arms up to 32 instead of 17. Half of its cost decrease therefore
-    counts if it is larger than the decrease without hysteresis, for hypotheses that both models prefer. Hysteresis also
-    resembles a delay: of hypotheses with another delay, the smaller decrease counts.
+    The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
+    under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
+
+    A friction model with hysteresis shows the whole decrease, but also larger decreases of wrong hypotheses: on
+    recorded arms up to 32, instead of 17 without hysteresis. Its decreases are therefore halved. The larger one of the
+    decrease without hysteresis and the halved decrease is used. For a hypothesis with another delay, the smaller one of
+    both decreases (not halved) is used, since hysteresis resembles a delay.
+
+    Args:
+        problem: problem without hysteresis.
+        fits: fits of `problem`; only the best ones, with a cost below the cost of `base`, get other costs.
+        base: fit of `problem` with which the costs are compared.
     """
     stateful, best = problem.with_hysteresis(), sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)

@@ -44,7 +44,7 @@ class Hypothesis:
 
     @classmethod
     def unchanged(cls, arm: Chain) -> Hypothesis:
-        """Return the hypothesis of the unchanged log, in SI units and without offsets."""
+        """Return the hypothesis that a log in SI units has no faults: no exchanged columns, offsets or delays."""
         n = len(arm.coordinates)
         x, y, z = map(float, arm.gravity)
         order, zeros = np.tile(np.arange(n), (2, 1)), np.zeros((2, n))
@@ -52,17 +52,20 @@ class Hypothesis:
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
-        """Key under which the regressor is cached: it depends only on the motion and on gravity."""
+        """Key under which the regressor of the hypothesis is cached, since it depends only on motion and gravity."""
         arrays = (self.source[0], self.scale[0], self.offset, self.delay[0], self.drift[0])
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
     def changed(self, fault: Fault, **changes: object) -> Hypothesis:
-        """Return the hypothesis with changed fields, which correct one more fault of the log."""
+        """Return the hypothesis with changed fields that correct one more kind of fault, `fault`."""
         faults = self.faults if fault in self.faults else (*self.faults, fault)
         return replace(self, faults=faults, **changes)  # type: ignore[arg-type]
 
     def signals(self, samples: MotionSamples) -> MotionSamples:
-        """Return the samples of the joints, in SI units, for logged samples under this hypothesis."""
+        """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
+
+        samples: logged samples. The result has signals only at the samples, and not around them.
+        """
         delays = _per_signal(self.delay)
         if self.drift.any():
             delays = delays + samples.times[:, None, None] * _per_signal(self.drift)
@@ -72,19 +75,22 @@ class Hypothesis:
         return samples._replace(values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the logged samples for `samples` of the joints, for a hypothesis of scales and offsets only."""
+        """Return the inverse of `signals`: logged samples for `samples` of the joints.
+
+        The hypothesis must have no delays, and no exchanged columns.
+        """
         signals = samples.values.copy()
         signals[:, :, 0] -= self.offset[:, None]
         return samples._replace(values=signals / _per_signal(self.scale)[..., None])
 
 
 def _per_signal(values: np.ndarray) -> np.ndarray:
-    """Return values (2, n) of motion and torque as values (n, 4) of q, qd, qdd and tau."""
+    """Return values for the signals q, qd, qdd and tau, (n, 4), from values for motion and torque, (2, n)."""
     return values[[0, 0, 0, 1]].T
 
 
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E) in which joint k has the motion of joint source[0, k], torque of source[1, k]."""
+    """Return signals (S, n, 4, E) with the motion of joint source[0, k] and the torque of source[1, k] at joint k."""
     return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
 
 
@@ -110,5 +116,5 @@ class HypothesisFit:
 
     @property
     def rank(self) -> float:
-        """Cost plus penalties for rare faults, so that common faults of about the same cost are preferred."""
+        """Cost plus penalties for rare faults; the hypothesis of lowest rank is preferred."""
         return self.cost + sum(fault.rarity for fault in self.hypothesis.faults)

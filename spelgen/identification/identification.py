@@ -111,12 +111,15 @@ class Identification:
 
     @cached_property
     def intervals(self) -> tuple[Interval, ...]:
-        """Base parameters with their 95 % intervals."""
+        """The base parameters, each with its standard deviation and its 95 % interval."""
         estimates = zip(self.base.names, self.values.tolist(), self.deviations.tolist(), strict=True)
         return tuple(Interval(name, value, std, base_unit(name)) for name, value, std in estimates)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the result in JSON form; the form is a public contract with the version `SCHEMA`."""
+        """Return the identified parameters and the residual in JSON form for other programs.
+
+        `SCHEMA` is the version of the form, which is a public contract.
+        """
         joints = list(self.arm.joint_names)
         friction = self.method.friction
         records = []
@@ -145,7 +148,7 @@ class Identification:
         }
 
     def text(self) -> str:
-        """Return the result as text for a terminal of 80 columns."""
+        """Return the identified parameters, the residual and their quality as text for a terminal of 80 columns."""
         residuals, parameters = self.listings()
         definitions = ["where"]
         for name, formula in zip(self.base.names, self.base.formulas(), strict=True):
@@ -160,7 +163,7 @@ class Identification:
         ])  # fmt: skip
 
     def listings(self) -> tuple[Listing, Listing]:
-        """Return the table of the torque residual per joint, and the table of the base parameters."""
+        """Return two tables of an identification for display: torque residual per joint, and base parameters."""
         joints: list[tuple[str, ...]] = []
         for x, rms, nmse in zip(self.arm.coordinates, self.residual, self.nmse, strict=True):
             joints.append((x.name, f"{rms:.4g}", UNITS[x.joint_type].torque, f"{nmse:.3g}"))
@@ -178,7 +181,7 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """Return a sentence with the numbers of parameters and samples, and the weights of the joints."""
+        """Return a sentence about the identification: numbers of parameters and samples, and weights of the joints."""
         drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (
@@ -187,14 +190,15 @@ class Identification:
         )
 
     def quality(self) -> str:
-        """Return two sentences: the condition number, and the number of parameters in each class of precision."""
+        """Return sentences about the condition number, and the number of parameters in each class of precision."""
         conditioned = f"Condition number {self.condition:.3g} (columns of length one): "
         if self.unseen:
             conditioned = (
                 f"The logs do not excite {counted(self.unseen, 'direction')} of the base parameters: those values are "
                 "arbitrary; excite the arm more, or train the preset closed-form, which has a prior at the URDF."
             )
-        elif self.condition < 30.0:  # torque errors are not amplified noticeably
+        # [1] condition number below which torque errors are not amplified noticeably
+        elif self.condition < 30.0:
             conditioned += "well posed."
         elif self.condition < 300.0:
             conditioned += "acceptable."

@@ -56,7 +56,10 @@ def identify_by(
     methods: Sequence[LeastSquares],
     preprocessing: Preprocessing,
 ) -> list[Identification]:
-    """Return one result per method for the same logs, which are filtered only once; see `identify`."""
+    """Return one identification per method (weights and friction model) from the same logs; see `identify`.
+
+    The logs are filtered only once.
+    """
     joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
     require_torques(logs)
     notes = check(logs, joints, joint_types)
@@ -106,9 +109,10 @@ MIN_BLOCK = 200
 
 
 class _Equations:
-    """Linear equations of the torques in samples, computed for one block of samples at a time.
+    """Linear equations of the joint torques: torque = regressor @ parameters at all samples.
 
-    The regressor of the bodies is common to all friction models, and is kept if it fits into memory.
+    The regressor is computed for one block of samples at a time. Its columns for rigid bodies are common to all
+    friction models, and are kept if they fit into memory.
     """
 
     def __init__(self, arm: Chain, samples: Sequence[DynamicsSamples], drives: Drives) -> None:
@@ -141,7 +145,8 @@ class _Equations:
         parameters: number K of parameters.
         """
         count, first = sum(len(block.q) for block in self._blocks), 0
-        group = np.arange(count) * BLOCKS // count  # contiguous blocks of samples
+        # group: number of the contiguous block to which each sample belongs, (count,)
+        group = np.arange(count) * BLOCKS // count
         products = np.zeros((len(self.drives.speeds), BLOCKS, parameters + 1, parameters + 1))
         for columns, tau in self._rows(friction):
             rows = np.concatenate([columns, tau[..., None]], axis=2).swapaxes(0, 1)
@@ -153,17 +158,21 @@ class _Equations:
         return products
 
     def solved(self, method: LeastSquares) -> Identification:
-        """Return the result for a method. Raises LogError if there are no samples."""
+        """Return the identification with the friction model and the weights of `method`, by weighted least squares.
+
+        Raises LogError if there are no samples.
+        """
         if not self._blocks:
             raise LogError("no samples to identify from", expected=NEEDED)
         base = base_parameters(self.arm, method.friction, self.drives.speeds)
         products = self._products(method.friction, len(base.parameters))
         torques = np.concatenate([block.tau for block in self._blocks])
         deviation = torques.std(axis=0)
-        # bounded from below, since a joint with a constant torque would have an infinite weight
+        # The range of a torque is bounded from below, since a joint with a constant torque would have an infinite
+        # weight.
         torque_range = np.maximum(deviation, 1e-3 * deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
-        # with the weights "noise", joints are reweighted by their residuals in each iteration
+        # with the weights "noise", each iteration weights the joints by their residuals in the previous fit
         for _ in range(1 + TUNING.rounds * (method.weights == "noise")):
             weighted = np.tensordot(np.square(weights), products, 1)
             # only the base columns are fitted; the other parameters remain zero
@@ -174,7 +183,7 @@ class _Equations:
         squares = np.square(np.concatenate(residuals)).mean(axis=0)
         combination = base.combination[:, base.columns]
         std = solution.deviations(products.sum(axis=1), used**2 * noise, combination)
-        # no jackknife if some parameters are undetermined: fits without a block would be singular
+        # the jackknife is omitted if some parameters are undetermined: fits without a block would be singular
         if solution.rank == len(base) and len(torques) >= BLOCKS * MIN_BLOCK:
             std = np.maximum(std, student_scale(BLOCKS) * _jackknife(weighted, solution, combination))
         return Identification(
@@ -195,15 +204,15 @@ class _Equations:
 
 
 def _jackknife(products: np.ndarray, solution: Solution, combination: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (r,) of combinations of the fitted parameters, see `jackknife_covariance`.
+    """Return the standard deviations (r,) of base parameters from a jackknife over blocks of samples.
 
-    products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of samples. combination:
-    (r, k) coefficients of the k fitted parameters in each of the r combinations.
+    See `jackknife_covariance`. products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of
+    samples. combination: (r, k) coefficients of the k fitted parameters in each of the r base parameters.
     """
     columns = solution.columns
     curvature, target = products[:, columns[:, None], columns], products[:, columns, -1]
     descent = target - curvature @ solution.parameters[columns]
-    # columns are scaled to length one, since they have different units
+    # `length`: norms of the regressor's columns, by which they are divided, since they have different units
     length = np.sqrt(curvature.sum(axis=0).diagonal())
     curvature = curvature / np.outer(length, length)
     ridge = TUNING.negligible * np.eye(len(columns))

@@ -37,23 +37,23 @@ class Interval:
 
     @property
     def half(self) -> float:
-        """Half the width of the 95 % interval."""
+        """Half the width of the 95 % interval of the quantity, in its unit."""
         return QUANTILE * self.std
 
     @property
     def low(self) -> float:
-        """Lower end of the 95 % interval."""
+        """Lower end of the 95 % interval of the quantity, in its unit."""
         low = self.value - self.half
         return max(low, 0.0) if self.positive else low
 
     @property
     def high(self) -> float:
-        """Upper end of the 95 % interval."""
+        """Upper end of the 95 % interval of the quantity, in its unit."""
         return self.value + self.half
 
     @property
     def determined(self) -> str:
-        """Class of precision, ``firm``, ``fair``, ``weak`` or ``may be zero``.
+        """Class of precision of the estimate: ``firm``, ``fair``, ``weak`` or ``may be zero``.
 
         The bounds of the first three classes are standard deviations of 5 %, 20 % and 100 % of the value.
         """
@@ -64,20 +64,20 @@ class Interval:
 
     @property
     def text(self) -> str:
-        """Value and half the width of the 95 % interval, as in ``1.234 ± 0.056``."""
+        """The estimate and half the width of its 95 % interval, as in ``1.234 ± 0.056``."""
         return f"{self.value:.4g} ± {self.half:.2g}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the estimate in its JSON form."""
+        """Return the estimate and its interval in JSON form."""
         numbers = {"value": self.value, "deviation": self.std, "low": self.low, "high": self.high}
         finite = {
             name: x if math.isfinite(x) else None for name, x in numbers.items()
-        }  # JSON has no infinity
+        }  # infinite numbers become None, since JSON has no infinity
         return {"name": self.name, "unit": self.unit, **finite, "determined": self.determined}
 
 
 def base_unit(name: str) -> str:
-    """Return the unit of a base parameter from the first letters of its name; "" for friction parameters.
+    """Return the unit of a base parameter, from the first letters of its name; "" for friction parameters.
 
     Masses begin with m, first moments with h, inertias with I, rotor inertias with "armature".
     """
@@ -91,20 +91,21 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the factor for standard deviations from few blocks that corrects 95 % intervals.
+    """Return the ratio of the 95 % quantiles of Student's t distribution and of the normal distribution.
 
-    After multiplication by this factor, 1.96 standard deviations are half of Student's 95 % interval.
+    Standard deviations that are estimated from few blocks are multiplied by this ratio, so that 1.96 standard
+    deviations are half the width of a 95 % interval.
     """
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
 
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the block-jackknife covariance of a MAP estimate of k parameters, and the jackknife's steps.
+    """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
     The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
-    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps and the Hessian S of all
-    blocks and the prior. Errors of samples may be correlated within blocks, and their variance may differ between
-    blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps, the Hessian S of all
+    blocks and the prior, and the precision P of the prior. Errors of samples may be correlated within blocks, and their
+    variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
@@ -125,8 +126,10 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
     lower bound must be positive definite.
     """
-    scale = lower_bound.diagonal().sqrt()  # scaled to a unit diagonal, since parameters have different units
-    # for samples without noise the lower bound is singular except for rounding errors: its eigenvalues are clamped
+    # the lower bound is scaled to a unit diagonal, since parameters have different units
+    scale = lower_bound.diagonal().sqrt()
+    # The eigenvalues of the lower bound are clamped: for samples without noise it is singular except for rounding
+    # errors.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

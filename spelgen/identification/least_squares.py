@@ -79,7 +79,7 @@ class Solution:
 
 
 def solve(product: np.ndarray, columns: np.ndarray) -> Solution:
-    """Return the parameters that minimize the weighted squared residual; the minimum-norm solution if it is singular.
+    """Return the parameters that minimize the weighted squared torque residual; of several minima, the shortest vector.
 
     Args:
         product: (K + 1, K + 1) Gram matrix of the weighted regressor and torque.
@@ -118,7 +118,7 @@ def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
     It is 1 plus twice the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
     """
-    max_lag = min(500, max(map(len, residuals)) - 1)  # [samples] 5 s at 100 Hz
+    max_lag = min(500, max(map(len, residuals)) - 1)  # [samples] largest lag, 5 s at 100 Hz
     power = sum(np.square(x).sum(axis=0) for x in residuals)
     time: np.ndarray = np.ones_like(power)
     correlated = power > 0

@@ -40,11 +40,11 @@ class Correction:
 
     @property
     def factors(self) -> np.ndarray:
-        """Factors (2, n) on the motion and on the torques, with which the present scales are multiplied."""
+        """Scales in `hypothesis` divided by the scales in the current mapping, (2, n): motion, then torque."""
         return np.asarray(self.hypothesis.scale / self.unchanged.scale)
 
     def lines(self) -> str:
-        """Return a text with the settings that implement the hypothesis, and where to write them; "" if none do."""
+        """Return a text with the settings that correct the log, and where to write them; "" if there are none."""
         entries: dict[str, dict[str, object]] = {}
         of_log: dict[str, object] = {}
         of_robot: dict[str, object] = {}
@@ -93,33 +93,39 @@ class Fault(ABC):
 
     @abstractmethod
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the fits of hypotheses that correct one fault of this kind in addition to the faults of `base`."""
+        """Return least-squares fits of hypotheses that correct one more fault of this kind in the log than `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the fits of corrections that take seconds; they are tried if no other correction is enough."""
+        """Return least-squares fits of hypotheses that take seconds to find, such as orders of all joints.
+
+        `compare_hypotheses` calls this function only if none of the quick `fits` explains the torques.
+        """
         return ()
 
     def text(self, correction: Correction) -> str:
-        """Return a description of the fault of the log."""
+        """Return a description of the fault of a log, for the error message."""
         return self.description
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints that have this fault: of those with settings; all joints if there are none."""
+        """Return the names of the joints with the fault, for a message.
+
+        These joints have settings that correct the fault; if no joint has, all joints are returned.
+        """
         names = correction.arm.joint_names
         return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings of a joint in the group `logs` that correct the fault; {} if it is right."""
+        """Return the settings of a joint, in the group `logs`, that correct a fault of the log; {} without a fault."""
         return {}
 
     def log_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings in the group `logs` that correct the fault, besides the settings of joints."""
+        """Return the settings in the group `logs`, such as `torque_delay`, that correct a fault of all joints."""
         return {}
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the settings of the robot, outside the group `logs`, that correct the fault."""
+        """Return the settings of the robot, such as `gravity`, that correct a fault of the log."""
         return {}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if an error of the URDF or of the mounting may be the reason; else ""."""
+        """Return the code of a warning if the fault may be an error of the URDF or mounting; "" for an error."""
         return ""

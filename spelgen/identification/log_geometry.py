@@ -37,7 +37,7 @@ class GeometryProblem:
         seconds: float,
         unchanged: Hypothesis | None = None,
     ) -> None:
-        """Prepare the problem of an arm with n joints.
+        """Define the least-squares problem of the torques in logs of an arm with n joints.
 
         Args:
             arm: arm with its vector of gravity and the inertial parameters of its URDF.
@@ -61,25 +61,30 @@ class GeometryProblem:
         self._counted: np.ndarray | None = None
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
-        self._chains: dict[Vector3, BodyChain] = {}  # under each direction of gravity
+        self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
 
     def thinned(self, count: int) -> GeometryProblem:
-        """Return the problem on at most `count` samples, evenly spaced."""
+        """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
         fewer = copy(self)
         fewer.samples, fewer._equations = self.samples.thinned(count), {}
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
-        """Return the problem that is fitted only to some torques.
+        """Return the least-squares problem in which only some of the torques are fitted.
 
-        counted: mask (S, n) of these torques in the unchanged log.
+        The other torques and their regressor rows become zero.
+
+        counted: mask (S, n), True for the torques that are fitted, of each joint in the unchanged log.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
         return fewer
 
     def with_hysteresis(self) -> GeometryProblem:
-        """Return the problem with a friction model whose dry friction has a history, the bristles' deflections."""
+        """Return the same least-squares problem with a friction model with hysteresis.
+
+        Its dry friction depends on the deflections of bristles, which are additional columns of the regressor.
+        """
         extended = copy(self)
         extended._equations, extended._has_hysteresis = {}, True
         added = self.samples.bent.shape[2] * len(self.speeds)
@@ -88,14 +93,18 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the problem with torques that are multiplied by signs, (S, n)."""
+        """Return the least-squares problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
         return other
 
     def without_gravity(self, joint: int) -> GeometryProblem:
-        """Return the problem of the unchanged log with a model in which one joint's torque contains no gravity."""
+        """Return the least-squares problem with a model in which the torque of one joint contains no gravity.
+
+        If it fits the unchanged log better than the problem with gravity, the logged torque of the joint contains no
+        gravity.
+        """
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
         rows[:, joint] = self.equations(weightless)[0][:, joint]
@@ -104,13 +113,16 @@ class GeometryProblem:
         return other
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return the gravity torques (S, n) [Nm, N] of a fit, and with the inertial parameters of the URDF."""
+        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
+
+        The hypothesis of `fit` determines the positions and the vector of gravity.
+        """
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
         return columns @ fit.parameters, columns @ self.prior_mean
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the standard deviation (S, n) [Nm, N] of the model's torques due to the parameters' covariance."""
+        """Return the standard deviation (S, n) [Nm, N] of a fit's torques due to the covariance of its parameters."""
         rows, _ = self.equations(fit.hypothesis)
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
@@ -119,7 +131,7 @@ class GeometryProblem:
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the model's torques with the parameters (K,) minus the logged ones, (S, n) [Nm, N]."""
+        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N]."""
         torque = self.equations(hypothesis)[0] @ parameters
         return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
@@ -136,8 +148,9 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # the deflections of drive j act on joint i with the factor C_ji, like its other friction
-                # under a hypothesis, a joint may have the motion of another column, or motion of the opposite sense
+                # `bent`: deflections of the bristles under the hypothesis. They are stored for the current mapping, so
+                # the joints are permuted and the signs reversed like the motion. The friction of drive j, which
+                # includes the force of its bristles, acts on joint i with the factor C_ji of C = `speeds`.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
@@ -151,8 +164,8 @@ class GeometryProblem:
         """Return the fit that minimises the cost under a hypothesis, by iteratively reweighted least squares.
 
         The noise variance of each joint is marginalised: the joint's negative log likelihood is N / 2 log(sum of
-        squared residuals). The prior of the inertial parameters is a Student t distribution, so that its precision
-        is reweighted in each iteration.
+        squared residuals), with the number N of independent errors. The prior of the inertial parameters is a Student t
+        distribution, so that its precision is reweighted in each iteration.
         """
         rows, normal = self.equations(hypothesis)
         signals = hypothesis.signals(self.samples)
@@ -163,7 +176,7 @@ class GeometryProblem:
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
-        for _ in range(6):  # further iterations change the cost by less than 0.1
+        for _ in range(6):  # number of reweightings: further ones change the cost by less than 0.1
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
             matrix = np.tensordot(weights, normal, 1)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
@@ -182,9 +195,10 @@ class GeometryProblem:
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
-        """Return the Gauss-Newton step (D,) of additional quantities, fitted together with the parameters of a fit.
+        """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
 
-        columns: (S, n, D) derivative of the residual with respect to these quantities.
+        The parameters of `fit` are estimated together with the quantities. columns: (S, n, D) derivative of the torque
+        residual with respect to the quantities.
         """
         rows, _ = self.equations(fit.hypothesis)
         tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
@@ -206,7 +220,7 @@ class GeometryProblem:
         smallest: float,
         allowed: Callable[[np.ndarray], np.ndarray] = np.asarray,
     ) -> tuple[np.ndarray, HypothesisFit]:
-        """Return continuous quantities of a hypothesis, (D,), with a low cost, and their fit.
+        """Return continuous quantities (D,) of a hypothesis, such as a delay, that minimise the cost, and their fit.
 
         At most four Gauss-Newton steps are made. The descent ends when a step does not lower the cost, or is
         negligible.
@@ -240,12 +254,13 @@ class GeometryProblem:
         """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
 
         Limits of a URDF may be wrong, and zeros may be calibrated badly: the penalty is proportional to the distance
-        beyond the limits up to half of the range between them. Whole turns of revolute joints are no matter.
+        beyond the limits up to half of the range between them. Revolute joints may be logged a whole turn beyond their
+        limits.
         """
         penalty = 0.0
         for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
             lower, upper = coordinate.limits or (0.0, 0.0)
-            if not 0 < upper - lower < 1e3:  # equal or huge limits are no limits
+            if not 0 < upper - lower < 1e3:  # equal or huge limits mean that the joint is unlimited
                 continue
             turns = 2 * np.pi * np.arange(-1, 2) * (coordinate.joint_type == "revolute")
             distance = np.maximum(high + turns - upper, lower - low - turns).min()
@@ -255,10 +270,10 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative rotor inertias, and for friction that drives the motion on average.
 
-        A violation adds half of its squared standard score to the cost, up to a bound. The bound is needed since a
-        drive may compensate friction, and since errors of the friction model may resemble inertia: fits of recorded
-        arms have friction that drives the motion (joint 6 of one arm of benchmarks/recordings.py) or a negative rotor
-        inertia (another arm), but not both.
+        Each of both violations adds half of its squared standard score to the cost, up to a bound. The bound is needed,
+        since the right hypothesis may have one violation: a drive may compensate friction, and errors of the friction
+        model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion
+        (joint 6), another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.
@@ -269,7 +284,8 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # power that friction takes from the motion, qd (viscous qd + Coulomb sign qd), summed over the samples
+        # The second n functionals are the powers that friction takes from the motion of each joint, qd (viscous qd +
+        # Coulomb sign(qd)), summed over the samples. The sums are entries of the Gram matrices.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -307,14 +323,16 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # a wide prior: standard deviations of 20 times the typical mass, with an extent of at least half a metre
+        # without <inertial> the prior is wide: standard deviations of 20 times the typical mass, at an extent of at
+        # least 0.5 m
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
     center, moments = own[1:4] / mass, own[[4, 7, 9]]
     gyration = np.sqrt(max(float(moments.sum() / 2 / mass - center @ center), 0.0))
     extent = max(float(np.linalg.norm(center)), gyration, length / 2, 0.03)
-    radius = max(gyration, 0.3 * extent)  # bounded from below, since some URDFs contain point masses
+    # the radius of gyration is bounded from below, since some URDFs contain point masses
+    radius = max(gyration, 0.3 * extent)
     root = np.zeros((10, 10))
     root[:, 0] = own
     for axis, unit in enumerate(np.eye(3)):
@@ -323,7 +341,7 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # standard deviations of 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
+    # the standard deviations are 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
     return 0.5 * root
 
 
@@ -333,19 +351,26 @@ def _variance(tau: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive definite matrix; it is scaled to a unit diagonal before inversion."""
+    """Return the inverse of a symmetric positive definite matrix (K, K), inverted with a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
 
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return `inverse(matrix) @ vector`, in a third of the time."""
+    """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,).
+
+    The linear system is solved without the inverse, which takes a third of the time.
+    """
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)
 
 
 def _with_unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a matrix (K, K) divided by the scale of its rows and columns, and the scale (K,)."""
+    """Return a positive semidefinite matrix (K, K) scaled to a unit diagonal, and its scale (K,).
+
+    Rows and columns are divided by the scale, the square root of the diagonal. A tiny ridge makes the matrix
+    invertible.
+    """
     scale = np.sqrt(np.diag(matrix))
     scale = np.where(scale > 0, scale, 1.0)
     return matrix / np.outer(scale, scale) + 1e-12 * np.eye(len(matrix)), scale

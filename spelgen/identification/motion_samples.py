@@ -34,15 +34,16 @@ ENDS = 3
 
 
 class MotionSamples(NamedTuple):
-    """S samples of motion and joint torques of n joints.
+    """S samples of motion and joint torques of n joints, with the signals around each sample.
 
     Attributes:
-        values: (S, n, 4, E) q, qd, qdd [rad, s; m, s] and tau [Nm; N] at each of the E times `OFFSETS` after the
-            sample, beyond the ends of a recording its first or last value; E = 1 for samples without their neighbours.
-        bent: (S, n, K) bristle deflections of the unchanged log, divided by the break-away displacements; K = 0 for
-            samples without a history of motion.
+        values: (S, n, 4, E) q [rad, m], qd, qdd (per s, per s^2) and tau [Nm, N] at the E times `OFFSETS` relative to
+            each sample. Before the start and after the end of a recording, the first and last values continue. E = 1 if
+            signals are stored only at the samples, and not around them.
+        bent: (S, n, K) deflections of K bristles per joint for the motion in the current mapping, divided by the
+            break-away displacements; K = 0 for samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
-        times: (S,) times of the samples since the start of their recording [s]; 0 for samples without their neighbours.
+        times: (S,) times of the samples since the start of their recording [s]; 0 for E = 1.
     """
 
     values: np.ndarray
@@ -52,36 +53,39 @@ class MotionSamples(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
-        """Return the samples of signals, (S, n) each, without their neighbours."""
+        """Return samples of signals, (S, n) each, that are stored only at the samples, and not around them."""
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)))
 
     @property
     def motion(self) -> np.ndarray:
-        """Positions, velocities and accelerations, (3, S, n)."""
+        """Positions, velocities and accelerations at the samples, (3, S, n) [rad, m] and per s, per s^2."""
         return np.moveaxis(self.central[..., :3], 2, 0)
 
     @property
     def tau(self) -> np.ndarray:
-        """Joint torques, (S, n)."""
+        """Joint torques at the samples, (S, n) [Nm, N]."""
         return self.central[..., 3]
 
     @property
     def central(self) -> np.ndarray:
-        """Signals (S, n, 4) at the times of the samples."""
+        """Signals q, qd, qdd and tau at the times of the samples, (S, n, 4)."""
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays`, (n, 4) or (S, n, 4) [s], after the samples.
+        """Return the signals (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        Signals at a longer delay than `longest_delay` are those around the sample that is nearest in time.
+        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: the signals around each sample
+        are interpolated. Or (S, n, 4), of any magnitude: the signals around another sample are interpolated, the one
+        that is nearest to the delayed time.
         """
         if not delays.any():
             return self.central
         spline = interpolation()
         if delays.ndim == 2:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
-        # times of later recordings are larger, so that the nearest sample is of the same recording
+        # `present`: times of the samples on a common axis. 1e6 s are added from one recording to the next, so that the
+        # nearest sample always belongs to the same recording.
         recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
         present = self.times + 1e6 * recording
         times = present[:, None, None] + delays
@@ -92,7 +96,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Longest delay [s] at which the signals are known; 0 for samples without their neighbours."""
+        """Largest time before or after a sample up to which its signals are stored [s]; 0 without such signals."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def every(self, stride: int) -> MotionSamples:
@@ -105,30 +109,33 @@ class MotionSamples(NamedTuple):
 
 
 def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
-    """Return the concatenation of several sets of samples."""
+    """Return the samples of several recordings as one set, in the given order."""
     return MotionSamples(*map(np.concatenate, zip(*samples, strict=True)))
 
 
 @cache
 def interpolation() -> CubicSpline:
-    """Return the weights (E,) of the signals around a sample for their values at a time [s] after the sample."""
+    """Return a function of time [s] after a sample, which returns weights (E,) for the values at the times `OFFSETS`.
+
+    The weighted sum of the E values is their cubic spline at this time.
+    """
     return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
 
 class DriveLog:
-    """Collector of the samples of successive trajectories.
+    """Collector of a bounded number of samples from successive trajectories, for the detection of delays and couplings.
 
     Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
     trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """Create a collector without samples.
+        """Create a collector of samples of the arm's motion and torques, without samples.
 
         Args:
             joint_types: "revolute" or "prismatic" for each of the n joints.
-            drives: input matrix and speeds of the drives.
-            preprocessing: filter and gap of the samples; its torque delay is ignored.
+            drives: input matrix, and matrix from joint speeds to motor speeds.
+            preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
         """
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
         smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)
@@ -139,14 +146,14 @@ class DriveLog:
 
     def add(self, trajectory: Trajectory) -> None:
         """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
-        # tested before filtering, which would take too long for a log of ten thousand short motions
+        # the duration is tested before filtering, which would take too long for a log of ten thousand short motions
         if trajectory.duration < SHORTEST:
             return
         self._number += 1
         if self._number % self._step:
             return
         for piece in long_pieces(trajectory, self._preprocessing.gap):
-            # with pauses, so that the samples are evenly spaced, and a time shift is a shift by whole samples
+            # Pauses are included, so that the samples are evenly spaced, and a time shift is a shift by whole samples.
             samples = dynamics_samples(
                 [piece], pauses=True, preprocessing=self._preprocessing, reach=self._reach
             )
@@ -164,7 +171,7 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
-        """Return every `_every`-th sample at which the arm moves, with the signals around it.
+        """Return the samples at which the arm moves, every `_every`-th of them, with the signals around each.
 
         start: time of the first sample since the start of the recording [s].
         """
@@ -173,7 +180,7 @@ class DriveLog:
         moving = np.flatnonzero(is_moving(inner.qd))
         while (
             len(moving[:: self._every]) > 2 * HINTS.samples
-        ):  # windows of all samples of hours would need gigabytes
+        ):  # the signals around all samples of a log of hours would need gigabytes
             self._thin()
         signals = np.stack([samples.q, samples.qd, samples.qdd, samples.tau @ self._inputs.T], axis=2)
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
@@ -187,5 +194,5 @@ class DriveLog:
         return sum(len(x.values) for x in self._samples)
 
     def samples(self) -> MotionSamples | None:
-        """Return the collected samples, at most `DriveHintTuning.samples`; None if there are none."""
+        """Return the samples of all trajectories, at most `DriveHintTuning.samples`; None if there are none."""
         return joined_samples(self._samples).thinned(HINTS.samples) if self._count else None

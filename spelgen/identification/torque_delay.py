@@ -39,7 +39,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling that prevents the estimation of a delay; [] if none is found."""
+        """Message about the delay, or about a coupling, with which no delay is estimated; [] without both."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -79,9 +79,9 @@ def find_torque_delay(
     Args:
         logs: trajectories with torques.
         joint_types: "revolute" or "prismatic" for each joint.
-        drives: input matrix and speeds of the drives.
+        drives: input matrix, and matrix from joint speeds to motor speeds.
         chain: chain of the arm's bodies.
-        preprocessing: filter and gap of the samples.
+        preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
     """
     collected = DriveLog(joint_types, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
@@ -91,10 +91,13 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques or, if a coupling of motors explains the logs better, the coupling instead."""
+    """Return the delay of the torques in a `DriveProblem`; the result contains a coupling of motors instead, if found.
+
+    Both are detected by the decrease of the torque residual of least squares.
+    """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
-        # a delay may look like a coupling, which is not found after removal of the delay
+        # The delay is removed before couplings are searched: an uncorrected delay may be mistaken for a coupling.
         delays = np.full((len(problem.size), 4), late.delay)
         problem = problem.of_torques(samples.at(delays)[..., 3])
     coupling = find_coupling(problem)
@@ -104,29 +107,29 @@ def delay_of(problem: DriveProblem) -> TorqueDelay:
 def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     """Return the delay if it is significant with two friction models; no delay otherwise.
 
-    Dry friction has a state (hysteresis) in one model, and depends only on the velocity in the other. A model with a
-    state that fits badly is ignored. The returned value is from the model with the smaller residual.
+    Dry friction has a state (hysteresis) in one model, and depends only on the velocity in the other. The model with a
+    state is ignored if its residual is much larger. The returned delay is of the model with the smaller residual.
     """
     samples = problem.samples
     tau = samples.values[:, :, 3]
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
-    # Dry friction with and without a state, with the same filter as the torques. A delay that only one of both models
-    # shows is an error of this model.
+    # Both friction models have dry friction with the same filter as the torques, one with and one without a state. A
+    # delay that only one of both models shows is an error of this model.
     _, qd, qdd = samples.motion
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The model without a state is always used: its errors do not lag behind the motion, and do not resemble a delay.
-    # Errors of a friction state lag behind the motion and do.
+    # The model without a friction state is always used: its errors do not lag behind the motion, and do not resemble a
+    # delay. Errors of a friction state lag behind the motion, and do resemble a delay.
     memory, direct = estimates
     likely = [direct]
     # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
     if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)
-    # a 99 % interval, so that a delay is rarely found in logs without one
+    # the delay must be significant at 1 %, so that a delay is rarely found in logs without one
     quantile = -stdtrit(HINTS.blocks - 1, 0.01 / 2)
     deviations = np.array([x.delay / x.standard_error for x in likely])
     if not ((deviations > quantile).all() or (deviations < -quantile).all()):
@@ -151,19 +154,19 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # The delay is unknown above the limit, where friction may look like a delay. If the jackknife estimates of all
-    # blocks are equal, there are too few samples.
+    # The standard error is infinite for a delay above the limit, where friction may look like a delay, and for equal
+    # jackknife estimates of all blocks, since there are then too few samples.
     unknown = abs(delay) > HINTS.longest_delay or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
 
 
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the delay [s] with the smallest residual, and the coefficients (K + D,) of the residual.
+    """Return the delay [s] with the smallest torque residual, and the coefficients (K + D,) of this residual.
 
-    products: (K + D, K + D) Gram matrix of the regressor and of the D shifted torques. The residual is the sum of these
-    columns times the coefficients. A torque between two of the `OFFSETS` is interpolated by a cubic spline, since
-    filtered torques are smooth over one step.
+    products: (K + D, K + D) Gram matrix of the K columns of the regressor and of the torques at the D times `OFFSETS`.
+    The residual is the sum of these K + D columns times the coefficients. A torque between two of the times is
+    interpolated by a cubic spline, since filtered torques are smooth over one step.
     """
     moved = len(OFFSETS)
     parameters = normal_solution(products, moved)

@@ -37,11 +37,12 @@ class DriveHintTuning:
     longest_delay: float = 0.02
     # [samples] Largest time shift of the signals of one joint, 160 ms.
     longest_offset: int = 16
-    # [1] Number of samples that are used, which is ample for the about 70 parameters of six joints.
+    # [1] Largest number of samples of the estimation of delays and couplings, ample for about 70 parameters of six
+    # joints.
     samples: int = 1500
     # [1] Smallest number of samples for the detection of couplings; tests of the geometry need a quarter of it.
     fewest_samples: int = 400
-    # [1] Largest number of trajectories that are used; of more trajectories, an evenly spaced subset is used.
+    # [1] Largest number of trajectories of the estimation of delays and couplings; more are subsampled evenly.
     trajectories: int = 8
 
 
@@ -55,7 +56,7 @@ class LogGeometryTuning:
     # [1] Constant added to a joint's relative residual variance: errors of friction models are 2 % of the torque.
     error_floor: float = 4e-4
     # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
-    # is 16.
+    # is 17.
     needed: float = 20.0
     # Smallest cost decrease without hysteresis of a hypothesis that is accepted for its decrease with hysteresis.
     slight: float = 3.0
@@ -67,7 +68,7 @@ class LogGeometryTuning:
     ambiguous: float = 8.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
-    # [1] Mean relative residual variance of the joints above which a log is probably in another order.
+    # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
     # [1] Relative residual variance above which a hypothesis is no advice. Mended logs of recorded arms have at most
     # 0.07 in the mean of the joints, and at most 0.27 at a joint whose torque is mostly friction.

@@ -1,1 +1,1 @@
-"""Online estimator of payload, friction drift and contact."""
+"""Online estimator for a fitted arm: payload, drift of friction, and contacts, from measured q, qd and torque."""

@@ -1,4 +1,4 @@
-"""External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), and thresholds for contacts."""
+"""External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), and detection of contacts."""
 
 from typing import NamedTuple
 
@@ -11,9 +11,13 @@ from spelgen.live.tuning import TUNING
 
 
 class ContactState(NamedTuple):
-    """External torques and their thresholds, (n,) [Nm, N].
+    """External torques of a sample, and the detected contact.
 
-    touched: mask (n,) of torques above their thresholds. force: force at the tip in root axes, (3,) [N].
+    Attributes:
+        external_torque: estimated torques of contacts at the joints, (n,) [Nm, N].
+        threshold: magnitudes above which external torques are contacts, (n,) [Nm, N].
+        touched: True for joints whose external torque exceeds the threshold, (n,).
+        force: estimated contact force at the tip in root axes, (3,) [N]; zero without a contact.
     """
 
     external_torque: np.ndarray
@@ -23,12 +27,18 @@ class ContactState(NamedTuple):
 
 
 class ContactObserver:
-    """Momentum observer: a first-order low-pass filter of the terms of the momentum balance, updated with each sample.
+    """Momentum observer of external torques: first-order low-pass filters of the terms of the momentum balance.
+
+    The filters are updated with each sample.
+
+    Args:
+        levels: noise levels of the arm, from which the thresholds are computed.
+        alarms_per_minute: rate of false contact alarms [1/min].
 
     Attributes:
         low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
-            of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of the
-            payload.
+            p of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of
+            the payload.
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered squared change of dp/dt, (n,) [Nm^2, N^2].
     """
@@ -38,13 +48,13 @@ class ContactObserver:
         self.restart()
 
     def restart(self) -> None:
-        """Discard the filter states; the next sample initialises them."""
+        """Discard the filter states, for example after a gap; the next sample initialises the filters."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.touched = np.zeros(len(self.levels.speed), dtype=bool)
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
-        """Return the external torques after a sample.
+        """Update the observer with a sample; return the external torques and the detected contact.
 
         Args:
             t: Time of the sample [s].
@@ -63,11 +73,13 @@ class ContactObserver:
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the low-pass filtered torque residual, (n,) [Nm, N], and a part of its variance, (n,).
+        """Update the filters with a sample; return the torque residual, (n,) [Nm, N], and its variance, (n,).
 
-        The residual is the measured torque minus the torques of the model, of the payload and of the drift. The
-        variance has three terms: for changing accelerations, for an unknown friction state and for the uncertain
-        payload. The noise of the observer must be added. For the arguments see `step`.
+        The residual is the low-pass filtered measured torque minus the torques of the model, of the payload and of the
+        drift: minus the external torque. The variance has three terms: for changing accelerations, for an unknown
+        friction state and for the uncertain payload. The caller adds the noise variance of the observer.
+
+        t, at, payload, drift: see `step`.
         """
         rate = TUNING.bandwidth
         scale, disturbance = drift.T
@@ -81,8 +93,8 @@ class ContactObserver:
         step = 0.0 if self.t is None else t - self.t
         gain = 1 - np.exp(-rate * step)
         if self.t is None:
-            # The filters start in the states for which the torque residual is zero. In their steady state for constant
-            # inputs, the residual of an accelerating arm would not be zero.
+            # The initial filter states give a torque residual of zero. With the steady state for constant inputs as
+            # initial states, the residual of an accelerating arm would not be zero.
             self.low = inputs.copy()
             self.low[0], self.low[1], self.low[5:] = rate * at.momentum, 0.0, rate * at.load_momentum.T
             self.baseline, self.jerk = disturbance, np.zeros_like(disturbance)
@@ -92,8 +104,8 @@ class ContactObserver:
             # indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
-            # The baseline of a joint in contact is not updated, because its estimated disturbance contains the contact
-            # torque.
+            # The baseline (slow disturbance) of a joint in contact is not updated, because the estimated disturbance
+            # then contains the contact torque.
             adapted = np.where(self.touched, 0.0, 1 - np.exp(-step / TUNING.baseline))
             self.baseline = self.baseline + adapted * (disturbance - self.baseline)
         self.t, self.inputs = t, inputs
@@ -105,8 +117,9 @@ class ContactObserver:
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
         )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        # Torques that lag behind the motion cause an error if dp/dt changes, and the filter of the residual retains
-        # this error.
+        # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
+        # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
+        # the variance of the residual therefore contains `jerk` and its low-pass filtered square.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)
@@ -122,6 +135,6 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -
     """
     weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
-    # With this regularization, a force component that affects no joint torque is estimated as zero.
+    # With the regularization of `matrix`, a force component that affects no joint torque is estimated as zero.
     matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
     return np.linalg.solve(matrix, weighted @ torque)

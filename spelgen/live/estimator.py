@@ -1,4 +1,7 @@
-"""The estimator: payload, friction drift and external torques, sample by sample, without accelerations."""
+"""The online estimator of payload, friction drift and external torques, updated with each sample.
+
+It needs positions, velocities and torques, but no accelerations.
+"""
 
 import copy
 from collections.abc import Iterator
@@ -26,14 +29,14 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
-    """Estimates after a sample.
+    """Estimates of the online estimator after a sample.
 
     Attributes:
         t: Time of the sample [s].
         refusal: "used", or the reason why the sample was refused or only partly used.
         contact: External torques, their thresholds, and the force at the tip.
         payload: Last reported payload.
-        load_changed: Whether a change of the payload was detected at this sample.
+        load_changed: True if a change of the payload was detected at this sample.
         friction_scale: Current friction divided by the friction of the model, (n,) [1].
         disturbance: Slow torque that neither model nor payload explains, (n,) [Nm, N].
     """
@@ -63,9 +66,13 @@ class Estimator:
     ) -> None:
         """Initialize the estimator for the model of a fit.
 
-        levels: noise levels; by default the noise levels in the run folder, or noise levels that are estimated from the
-        logs of the fit. alarms_per_minute: rate of false contact alarms [1/min]. Raises RunError for a model without
-        rigid bodies or with position servos, and if there are no noise levels.
+        Args:
+            fit: fit of a rigid-body model to measured torques.
+            levels: noise levels; by default the noise levels in the run folder, or noise levels that are estimated from
+                the logs of the fit.
+            alarms_per_minute: rate of false contact alarms [1/min].
+
+        Raises RunError for a model without rigid bodies or with position servos, and if there are no noise levels.
         """
         self.model = torque_model(fit)
         with torch.no_grad():
@@ -76,7 +83,7 @@ class Estimator:
         self.reset()
 
     def reset(self) -> None:
-        """Reset all estimates. Payload, friction drift and friction state are then unknown."""
+        """Reset all estimates: payload, friction drift and friction state are unknown afterwards."""
         n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
@@ -90,11 +97,18 @@ class Estimator:
 
     @property
     def refused(self) -> dict[str, int]:
-        """{reason: number of samples that were refused or only partly used for this reason}."""
+        """{reason of a refusal: number of samples that were refused or only partly used for this reason}."""
         return {reason: count for reason, count in self.intake.counts.items() if count and reason != "used"}
 
     def step(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> EstimatorState:
-        """Process a sample: time [s], positions, velocities and measured torques, (n,); return the estimates."""
+        """Process a sample and return the estimates.
+
+        Args:
+            t: Time [s].
+            q: Positions, (n,) [rad, m].
+            qd: Velocities, (n,) [rad/s, m/s].
+            tau: Measured torques, (n,) [Nm, N].
+        """
         (state,) = self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
         return state
 
@@ -105,7 +119,14 @@ class Estimator:
     def steps(
         self, t: np.ndarray, q: np.ndarray, qd: np.ndarray, tau: np.ndarray
     ) -> Iterator[EstimatorState]:
-        """Process samples at times t (T,), with q, qd and tau (T, n); yield the estimates after each sample."""
+        """Process T samples; yield the estimates after each sample.
+
+        Args:
+            t: Times, (T,) [s].
+            q: Positions, (T, n) [rad, m].
+            qd: Velocities, (T, n) [rad/s, m/s].
+            tau: Measured torques, (T, n) [Nm, N].
+        """
         shape = (len(t), self.model.n)
         if not q.shape == qd.shape == tau.shape == shape:
             raise ValueError(
@@ -118,9 +139,10 @@ class Estimator:
             yield EstimatorState(now, refusal, self.contact, self.payload, changed, 1 + a, d)
 
     def _advance(self, t: float, at: Balance, refusal: Refusal) -> bool:
-        """Update all filters with a sample; return True if a changed load was detected.
+        """Update all filters with a sample; return True if a change of the payload was detected.
 
-        t: time [s]. at: terms of the momentum balance. refusal: result of the sample's check.
+        t: time [s]. at: terms of the momentum balance at the sample. refusal: "used", or the reason why the sample is
+        only partly used.
         """
         if refusal != "used":
             self.blocks.restart()
@@ -141,9 +163,9 @@ class Estimator:
         return changed
 
     def report(self) -> Payload:
-        """Estimate the payload, use it from the next sample on, and return it.
+        """Estimate the payload from the payload filter and return it; the estimator uses it from the next sample on.
 
-        ``step`` calls this method after each second of motion and after a detected change of the load.
+        ``step`` calls this method after each second of motion and after a detected change of the payload.
         """
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
@@ -151,8 +173,8 @@ class Estimator:
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # The drift filter has assumed a wrong payload until now, and has attributed the torques of the error to
-            # friction. It is restarted from the friction scale of the payload filter.
+            # The drift filter has assumed a wrong payload so far, and has attributed its torques to friction. The drift
+            # filter is restarted from the friction scale of the payload filter.
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]
@@ -160,7 +182,7 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques for a motion, with the estimated payload and friction drift, (n,) [Nm, N].
+        """Return the torques, as measured, for a motion with the estimated payload and friction drift, (n,) [Nm, N].
 
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
@@ -174,8 +196,8 @@ class Estimator:
             cache = self.model.at(*at, prepared=self.prepared)
             torque = self.model.inverse_dynamics(cache, *at[1:], *past)
             friction = self.model.friction_torque(cache, at[1], *past)
-            # The payload is fixed to the last body. Its regressor is therefore the last ten columns of the regressor,
-            # which belong to this body.
+            # The payload is fixed to the last body: its regressor is the last ten columns of the arm's regressor, which
+            # belong to the last body.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
             decay = np.zeros(1)
@@ -187,9 +209,9 @@ class Estimator:
 
 
 def torque_model(fit: Fit) -> RigidBodyDynamics:
-    """Return the model of a fit in double precision.
+    """Return a copy of the model of a fit for the estimator, in double precision.
 
-    Raises RunError for a model that the estimator does not support.
+    Raises RunError for a model that the estimator does not support: without rigid bodies, or with position servos.
     """
     if not isinstance(fit, Fit):
         raise RunError(

@@ -1,14 +1,16 @@
-"""Kalman filters of the momentum balance, averaged over blocks of time: y = Phi theta + f a + b + d + w per joint.
+"""Kalman filters of payload and friction drift, with the momentum balance as measurement equation.
 
-- y: measured torque residual of the model.
+The balance is averaged over blocks of time. Per joint it is y = Phi theta + f a + b + d + w:
+
+- y: torque residual, the measured torque minus the torque of the model.
 - Phi, theta: regressor and constant inertial parameters of the payload, (10,) each.
 - f, a: friction torque of the model, and friction scale minus one; a is a random walk.
 - b: constant torque offset.
 - d: disturbance, an Ornstein-Uhlenbeck process.
 - w: white noise.
 
-The equations of the joints are processed one after the other, so that a control loop can distribute them over its
-samples.
+The equations of the joints are processed one after the other, so that a control loop can distribute the computation
+over several samples.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from spelgen.live.tuning import TUNING
 
 
 class Block(NamedTuple):
-    """Means of the terms of the momentum balance over a block of samples.
+    """Means of the terms of the momentum balance over a block of consecutive samples: one measurement of the filters.
 
     Attributes:
         duration: Length of the block [s].
@@ -35,7 +37,7 @@ class Block(NamedTuple):
         friction: Friction torque of the model, (n,) [Nm, N].
         uncertainty: Half of the difference between the largest and the smallest friction torque that an unknown
             friction state permits, (n,) [Nm, N].
-        moving: Whether each joint moved, (n,).
+        moving: True for joints that moved, (n,).
     """
 
     duration: float
@@ -46,9 +48,9 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return this block and the block after it, `later`, as one block."""
+        """Return the means over this block and the next block, `later`, as one block of both durations."""
         duration = self.duration + later.duration
-        # The terms are means over time, so the means over both blocks are weighted by the durations of the blocks.
+        # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
         y, load, friction, uncertainty = (
             a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
@@ -57,23 +59,26 @@ class Block(NamedTuple):
 
 
 class Blocks:
-    """Accumulator of samples. Every `TUNING.block` seconds it returns the means over these samples, a `Block`."""
+    """Accumulator of samples, which returns their means as a `Block` every `TUNING.block` seconds.
+
+    rest_speed: speed below which a joint is at rest, (n,) [rad/s, m/s].
+    """
 
     def __init__(self, rest_speed: np.ndarray) -> None:
         self.rest_speed = rest_speed
         self.restart()
 
     def restart(self) -> None:
-        """Discard the samples of the current block, for example after a gap."""
+        """Discard the samples of the incomplete block, for example after a gap."""
         self.samples: list[tuple[float, Balance]] = []
         self.duration = 0.0
 
     def add(self, t: float, at: Balance) -> Block | None:
-        """Add a sample at time t [s] with the terms `at`; return the block if it is complete."""
+        """Add a sample at time t [s] with its terms of the momentum balance; return the block if it is complete."""
         step = t - self.samples[-1][0] if self.samples else 0.0
         self.samples.append((t, at))
-        # The duration is a sum of time steps, because the emitted C code computes it in this way. The difference of the
-        # last and the first time has other rounding errors.
+        # The duration of a block is a sum of time steps, because the exported C code computes it in this way. The
+        # difference of the last and the first time would have other rounding errors.
         self.duration += step
         # The block ends at the sample at which its duration is nearest to `TUNING.block`.
         if len(self.samples) == 1 or self.duration < TUNING.block - step / 2:
@@ -91,11 +96,17 @@ class Blocks:
 
 
 class LoadFilter:
-    """Kalman filter of the payload theta and of a, b and d of all joints; see the top of this module for the symbols.
+    """Kalman filter of the payload's parameters theta, and of friction scale a, offset b and disturbance d of n joints.
+
+    The measurement equation and its symbols are in the docstring of the module.
+
+    Args:
+        noise: standard deviations of the white noise w and of d, and time constant of d.
+        effort: torque limits, which scale the prior of b, (n,) [Nm, N].
 
     Attributes:
         x: State (theta, a, b, d), (10 + 3 n,).
-        P: Covariance of x.
+        P: Covariance of x, (10 + 3 n, 10 + 3 n).
         log_likelihood: Log likelihood of all measurements since it was set to zero.
         surprise: Sum of the normalised squared residuals of moving joints in the last block.
         disturbance: Stationary variance of d, (n,).
@@ -110,13 +121,13 @@ class LoadFilter:
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
-        """Reset theta to its prior distribution, for a new payload."""
+        """Reset the payload's parameters theta to their prior distribution, for a new payload."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
-        """Replace the state and its covariance by their prediction after a time `duration` [s]."""
+        """Replace the state x and its covariance P by their prediction after a time `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
         decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration
@@ -126,7 +137,12 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Update the state with the measurement y of one joint. A joint at rest updates only its own disturbance d."""
+        """Update the state with the measurement y of one joint.
+
+        A joint at rest updates only its own disturbance d.
+
+        block: means over a block of samples. joint: index of the joint.
+        """
         columns = [*range(10), *range(10 + joint, 10 + 3 * self.n, self.n)]
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
@@ -141,8 +157,8 @@ class LoadFilter:
             self.x += gain * residual
             self.P -= np.outer(gain, covariance)
         else:
-            # The gains of all states except d are set to zero. This gain is not optimal, so the covariance is updated
-            # by Joseph's form, which is valid for any gain.
+            # The Kalman gains of all states except d are set to zero. Such a gain is not optimal, so the covariance is
+            # updated by Joseph's form, which is valid for any gain.
             d, product = columns[-1], gain[columns[-1]] * covariance
             self.x[d] += gain[d] * residual
             self.P[d] -= product
@@ -152,24 +168,26 @@ class LoadFilter:
 
 
 class JointFilters:
-    """Independent filters of the change a of friction and the disturbance d of each joint, for a known payload.
+    """Independent Kalman filters of friction change a and disturbance d of each joint, for a known payload.
 
     The friction torque is 1 + a times the friction torque of the model. Each filter has K states: (a, d), or (a, b, d)
-    if there is a torque offset b. Filters with different noise can be computed at once, along the leading axes (...) of
-    all arrays.
+    with a torque offset b. Filters with different noise can be computed at once, along the leading axes (...) of all
+    arrays.
 
-    x: states, (..., n, K). P: covariances, (..., n, K, K).
+    Attributes:
+        x: states, (..., n, K).
+        P: covariances, (..., n, K, K).
     """
 
     def __init__(
         self, deviations: np.ndarray, white: np.ndarray, time_constant: np.ndarray, *, drifts: bool = False
     ) -> None:
-        """Initialize all states to zero: friction as in the model, no offset and no disturbance.
+        """Initialize all states to zero: friction as in the model, no torque offset and no disturbance.
 
         Args:
-            deviations: prior standard deviations of the states, (..., n, K). The value for d is also the stationary
-                standard deviation of d.
-            white: standard deviations of the white noise of the torque residual y, (..., n) [Nm, N].
+            deviations: prior standard deviations of the K states (friction change a, torque offset b if K = 3,
+                disturbance d), (..., n, K). The value for d is also the stationary standard deviation of d.
+            white: standard deviations of the white noise of the torque residual, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
             drifts: True: a is a random walk, and joints at rest update d. False: a is constant, and joints at rest
                 update no state.
@@ -180,12 +198,12 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the filters of the estimator, with the states a, a random walk, and d."""
+        """Return the drift filters of the estimator: their states are the friction change a, a random walk, and d."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the states at a block, update them with a torque, and return the residual and its variance.
+        """Predict the states at a block of samples, update them with a torque, and return residual and variance.
 
         Args:
             block: Means of the terms of the momentum balance.
@@ -210,22 +228,26 @@ class JointFilters:
         used[:, -1] |= self.drifts
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
-        # The gain is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's form of
-        # the covariance update is equal to this expression.
+        # The Kalman gain K is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's
+        # form of the update of the covariance P is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c the
+        # covariance of state and measurement.
         product = gain[..., None] * covariance[..., None, :]
         self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
         return residual, expected
 
 
 class PayloadEstimate:
-    """The payload filter, with detection of a changed load.
+    """The payload filter, with detection of a changed payload.
 
-    After a block with large residuals there are two copies of the filter: one for the hypothesis that the load has
-    changed, one for the hypothesis of a contact. They exist until the change of the load is accepted or both hypotheses
-    are dropped. A block has one filter update per joint and filter. These updates are distributed over the samples of
-    the next block, to limit the computing time per sample.
+    After a block with large residuals there are two copies of the filter: one for the hypothesis that the payload has
+    changed, one for the hypothesis of a contact. The copies exist until the change of the payload is accepted or both
+    hypotheses are dropped. A block has one filter update per joint and filter. The updates are distributed over the
+    samples of the next block, to limit the computing time per sample.
 
-    moved: time in motion since the start or the last change of the load [s].
+    Attributes:
+        filters: the filter without a hypothesis, then the two copies, if any.
+        moved: time in motion since the start or the last change of the payload [s].
+        changed: True if a change of the payload was accepted, until the caller sets it to False.
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
@@ -236,7 +258,7 @@ class PayloadEstimate:
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
-        """Finish the updates of the previous block, then start the updates of `block`, which `step` continues."""
+        """Finish the filter updates of the previous block, and prepare the updates of `block` for calls of `step`."""
         for _ in self.rows:
             pass
         if block.moving.any():
@@ -247,10 +269,10 @@ class PayloadEstimate:
         self.rows = self._rows(block)
 
     def step(self) -> None:
-        """Process the next updates of the current block.
+        """Process some filter updates of the current block; the method is called at each sample.
 
-        It is called at each sample. The number of updates per call is chosen so that all updates are finished before
-        the next block is complete.
+        The number of updates per call is chosen so that all updates of a block are finished before the next block is
+        complete.
         """
         self.samples += 1
         for _ in range(self.per_sample):
@@ -267,9 +289,9 @@ class PayloadEstimate:
             yield
 
     def _compare(self, moving: int) -> None:
-        """Accept or drop existing hypotheses, or start new hypotheses if the residuals of the block are large.
+        """Accept or drop the hypotheses of a changed payload and of a contact, or start them if residuals are large.
 
-        moving: number of moving joints.
+        moving: number of joints that moved in the block.
         """
         main = self.filters[0]
         if len(self.filters) > 1:
@@ -282,7 +304,7 @@ class PayloadEstimate:
             if self.hypotheses_moved >= least:
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
-        # There are no hypotheses in the first second of motion, in which residuals are large because the payload is
+        # Hypotheses are not started in the first second of motion, in which residuals are large because the payload is
         # unknown.
         if len(self.filters) == 1 and is_surprise and self.moved >= TUNING.changed_after:
             main.log_likelihood = self.hypotheses_moved = 0.0

@@ -1,4 +1,4 @@
-"""Plausibility checks of measured samples, and bounds of the unknown friction state."""
+"""Plausibility checks of measured samples for the estimator, and bounds of the unknown friction state."""
 
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -14,18 +14,21 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParamete
 Refusal = Literal["used", "not finite", "repeated", "reversed", "jump", "saturated", "gap"]
 REFUSALS: tuple[Refusal, ...] = get_args(Refusal)
 IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
-"""Reasons for which nothing of a sample is used."""
+"""Reasons of refusals for which nothing of a sample is used; with other reasons, a sample is partly used."""
 
 
 class DelayLine:
-    """Delay of signals by a constant time, with linear interpolation between samples."""
+    """Delay of measured signals by a constant time, with linear interpolation between samples.
+
+    It aligns motion and torques, of which one is measured later than the other. delay: time [s].
+    """
 
     def __init__(self, delay: float) -> None:
         self.delay = delay
         self.samples: list[tuple[float, np.ndarray]] = []
 
     def step(self, t: float, values: np.ndarray) -> np.ndarray:
-        """Add values, (3, n), at time t [s]; return the values ``delay`` seconds before, or the oldest values."""
+        """Add values, (3, n), at time t [s]; return the values at t - ``delay``, or the oldest stored values."""
         samples, past = self.samples, t - self.delay
         if not samples or t - samples[-1][0] >= self.delay / TUNING.delay_samples:
             samples.append((t, values))
@@ -39,16 +42,20 @@ class DelayLine:
 
 
 class Intake:
-    """Checks of samples one after the other, and bounds of the friction state.
+    """Checks of consecutive samples, and bounds of the friction state (deflections of bristles).
 
-    The initial bounds of the friction state are minus and plus the break-away displacements. After a sufficient motion
-    of a joint both bounds are equal, and its friction state is known.
+    The initial bounds of a deflection are minus and plus the break-away displacement. After a sufficient motion of a
+    joint both bounds are equal, and its friction state is known.
+
+    Args:
+        levels: limits by which samples are refused, and the delay of torques.
+        bristles: break-away displacements.
 
     Attributes:
         counts: {result of the check: number of samples}.
         bounds: Lower and upper bound of the friction state of each of K bristles, (2, n, K) [rad, m].
-        aligned: q, qd and tau of the last used sample, (3, n), at the same time: the motion is delayed if torques are
-            measured late, the torques if they are measured early.
+        aligned: q, qd and tau of the last used sample, (3, n), at the same time: q and qd are delayed if measured
+            torques lag behind the motion, tau is delayed if they precede it.
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
@@ -60,18 +67,25 @@ class Intake:
         self._begin()
 
     def _begin(self) -> None:
-        """Reset the friction state and the delay: the motion so far is unknown."""
+        """Reset the bounds of the friction state and the delay line: the past motion is unknown."""
         self.bounds = np.stack([-self.limit, self.limit])
         self.line = DelayLine(abs(self.levels.delay))
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
         """Check a sample and update the bounds of the friction state.
 
-        Return "used", or the reason why the sample is refused or only partly used. t: time [s]. q, qd, tau: (n,) each.
+        Args:
+            t: time [s].
+            q: positions, (n,) [rad, m].
+            qd: velocities, (n,) [rad/s, m/s].
+            tau: measured torques, (n,) [Nm, N].
+
+        Returns:
+            "used", or the reason why the sample is refused or only partly used.
         """
         refusal = self._check(t, q, qd, tau)
-        # After `TUNING.restart` consecutive samples with such a refusal, a permanent change of the clock or of the
-        # positions is assumed, and the checks restart with the current sample.
+        # After `TUNING.restart` consecutive samples that are refused as "reversed" or "jump", a permanent change of the
+        # clock or of the positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
         restarts = self.ignored >= TUNING.restart
         refusal = "gap" if restarts else refusal
@@ -104,8 +118,8 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # The largest possible motion since the last sample. Time stamps may be delayed, so the limit includes a motion
-        # of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
+        # `furthest` is the largest plausible motion since the last sample. Time stamps may be delayed, so it includes a
+        # motion of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"
@@ -120,16 +134,16 @@ def balance_along(
     samples: Sequence[np.ndarray],
     prepared: RigidParameters | None = None,
 ) -> tuple[list[Refusal], list[Balance | None]]:
-    """Check samples; return the result of each check, and the terms of the momentum balance at each sample.
+    """Check T samples; return the result of each check, and the terms of the momentum balance at each sample.
 
-    The terms of ignored samples are None.
+    The terms of samples of which nothing is used (refused for a reason in `IGNORED`) are None.
 
     Args:
         model: model in double precision.
-        levels: noise levels, which include the point whose Jacobian is among the terms.
+        levels: noise levels, with the position of the tip, whose Jacobian is among the terms.
         intake: checks of the samples; its state is updated.
         t: times, (T,) [s].
-        samples: q, qd and tau, (T, n).
+        samples: q [rad, m], qd [rad/s, m/s] and tau [Nm, N], (T, n) each.
         prepared: parameter cache of the model; None: the function computes it.
     """
     refusals: list[Refusal] = []

@@ -1,6 +1,6 @@
-"""Estimation of the noise levels of a fit by cross-validation on the training logs.
+"""Estimation of the estimator's noise levels for a fit, by cross-validation on the training logs.
 
-The noise is estimated from the torque residual of a model that was fitted to other logs: the residual of the logs to
+The noise is estimated from the torque residual on logs to which the model was not fitted: the residual on the logs to
 which a model was fitted would be too small.
 """
 
@@ -37,7 +37,10 @@ Folds = Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]]
 
 
 def noise_levels(fit: Fit) -> NoiseLevels:
-    """Return the stored or estimated noise levels of a fit. Raises RunError if they cannot be read or estimated."""
+    """Return the noise levels of a fit: stored in its run folder, or estimated from its logs and then stored.
+
+    Raises RunError if they cannot be read, or if there are neither stored levels nor logs.
+    """
     levels = stored_levels(fit)
     if levels is None:
         if not fit.logs:
@@ -51,14 +54,14 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
-    """Return the noise levels of a fit, estimated by cross-validation.
+    """Return the noise levels of a fit, estimated by cross-validation on its logs.
 
-    For each fold of the logs a model is fitted to the other folds, and the noise is estimated from its residual on this
-    fold.
+    For each fold of the logs a model is fitted to the other folds, and the noise is estimated from the torque residual
+    of the model on the held-out fold.
     """
     logs, count = list(fit.logs), TUNING.folds
     if len(logs) == 1:
-        # A single log is divided into parts, so that a part can be held out.
+        # A single log is divided into intervals, so that an interval can be held out.
         ends = np.linspace(0, len(logs[0]), count + 1).astype(int)
         logs = [logs[0][start:stop] for start, stop in itertools.pairwise(ends)]
     folds = [logs[k::count] for k in range(min(count, len(logs)))]
@@ -75,17 +78,16 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
         tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
-    # Serialization rounds the numbers. The rounded numbers are returned, so that they are equal to the numbers that are
-    # later read from the run folder.
+    # Serialization rounds the noise levels. The rounded levels are returned, so that they are equal to the levels that
+    # are later read from the run folder.
     return NoiseLevels.model_validate(levels.model_dump(mode="json"))
 
 
 def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
-    """Return a new model with the specification of the model of a fit, fitted to other logs.
+    """Return a new model with the specification of a fit's model, fitted to ``logs``, for tests on held-out logs.
 
-    The new model is used to estimate the error on held-out logs. For this, at most ``TUNING.max_samples`` samples of
-    the other logs suffice. Residual terms are selected only if the model of the fit has some. Raises LogError if the
-    logs have too little motion.
+    At most ``TUNING.max_samples`` samples of the logs are used, which suffice for estimates of noise. Residual terms
+    are selected only if the model of the fit has residual terms. Raises LogError if the logs have too little motion.
     """
     model = assemble(required_spec(fit.model)).double()
     if residual_terms(without_idle_residuals(fit.model)) is None:
@@ -104,10 +106,13 @@ def fitted_to(fit: Fit, logs: Sequence[Trajectory]) -> RigidBodyDynamics:
 
 
 class HeldOutSample(NamedTuple):
-    """A sample of a log, with the terms of a model that was not fitted to the log.
+    """A sample of a held-out log, with the terms of the momentum balance of a model that was not fitted to the log.
 
-    t: time [s]. at: terms of the momentum balance. is_resumed: whether the sample is the first one after a gap. block:
-    the block that ends at this sample, or None.
+    Attributes:
+        t: time [s].
+        at: terms of the momentum balance.
+        is_resumed: True if the sample is the first one after a gap.
+        block: means over the block of samples that ends at this sample; None if no block ends.
     """
 
     t: float
@@ -117,7 +122,7 @@ class HeldOutSample(NamedTuple):
 
 
 def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> list[HeldOutSample]:
-    """Return the accepted samples of a log, with the terms of the momentum balance."""
+    """Return the accepted samples of a held-out log, with the terms of the momentum balance of ``model``."""
     intake, blocks = Intake(levels, bristle_reach(model)), Blocks(levels.rest_speed)
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
@@ -131,17 +136,17 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
 
 
 def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: float) -> NoiseLevels:
-    """Return the noise levels of an arm from held-out logs.
+    """Return the noise levels of an arm, estimated from held-out logs.
 
     Args:
-        folds: models with their held-out logs.
+        folds: pairs of a model and its held-out logs, to which it was not fitted.
         effort: torque limits, (n,) [Nm, N]; infinite if unknown.
         point: position of the tip in the frame of the last body, (3,) [m].
         delay: delay of the torques relative to the positions [s].
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # `levels` has no noise values yet. It has the limits by which samples are accepted or refused, and the noise is
+    # `levels` has no noise values at first, but the limits by which samples are accepted or refused: the noise is
     # estimated from the accepted samples.
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0),
@@ -162,14 +167,18 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return the factor on the covariance of an estimated payload, and the degrees of freedom of this factor.
+    """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The factor is the mean normalised squared error of estimated payloads. The logs are without payload, so each
-    estimated payload is an error. Each window of consecutive blocks gives one estimate (a trial), with two errors: the
-    error of the mass, and the error of mass and first moments. A prior value is included in the mean, with the weight
-    of `prior_trials` trials. Means are computed for the two errors and for each length of windows, and the factor is
-    the largest mean: in longer windows the normalised error may be larger, because the errors of the model are
-    correlated over time.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
+    logs are without payload, so each estimate x is an error, and the factor is the mean of x^T P^-1 x / k over trials.
+    A trial is an estimate from several consecutive blocks; x is the mass (k = 1), or mass and first moments (k = 4). A
+    prior value is included in each mean, with the weight of `prior_trials` trials. The factor is the largest mean of
+    both k and all lengths of trials: errors of the model are correlated over time, so that the mean may be larger for
+    longer trials.
+
+    Args:
+        blocks: consecutive blocks of the payload filter, from held-out logs.
+        levels: noise levels, with the noise of the payload filter.
     """
     factors = []
     for window in TUNING.trial_blocks:
@@ -189,11 +198,14 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
-    """Return the maximum-likelihood noise of each joint.
+    """Return the maximum-likelihood noise of the momentum balance for each joint.
 
-    The model is y = f a + b + d + w per joint (see `live.filters`). The likelihood is maximized over a grid of time
-    constants of d, and of ratios between the standard deviations of d and w. The standard deviation of w is estimated
-    for each grid point. segments: consecutive blocks of each log.
+    The model is y = f a + b + d + w per joint, with torque residual y, friction torque f, friction change a, offset b,
+    disturbance d (an Ornstein-Uhlenbeck process) and white noise w (see `live.filters`). The likelihood is maximized
+    over a grid of time constants of d, and of ratios between the standard deviations of d and w. The standard deviation
+    of w is estimated for each grid point.
+
+    segments: consecutive blocks of each log.
     """
     grid = np.array(list(itertools.product(TUNING.time_constants, TUNING.disturbance_ratios)))
     typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
@@ -209,20 +221,24 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
 def _likelihood(
     segments: Sequence[Sequence[Block]], grid: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the negative log likelihood, and the mean normalised squared residual, (G, n) each, at G grid points.
+    """Return the negative log likelihood of the torque residuals, (G, n), for G noise models per joint.
+
+    The second result is the mean squared prediction error divided by its variance, (G, n), from which the scale of the
+    noise is corrected.
 
     Args:
         segments: consecutive blocks of each log.
-        grid: time constant of d [s], and ratio of the standard deviations of d and w [1], (G, 2).
+        grid: time constant of the disturbance d [s], and ratio of the standard deviations of d and of the white noise w
+            [1], (G, 2).
         scale: standard deviations of the white noise w, (G, n) [Nm, N].
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    # Prior standard deviations of a, b and d, (G, n, 3). It is assumed that the offset b is not larger than a few
-    # standard deviations of the white noise.
+    # `prior`: prior standard deviations of friction change a, offset b and disturbance d, (G, n, 3). The offset b is
+    # assumed to be at most a few standard deviations of the white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # With `drifts` false, joints at rest update no state, so the noise of joints in motion is estimated.
+        # The filters have drifts=False: joints at rest update no state, so the noise of joints in motion is estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -234,9 +250,11 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return ``levels`` with the noise of the momentum observer, and with the distribution of the largest peaks.
+    """Return ``levels`` with the noise of the momentum observer, and the distribution of its largest residuals (peaks).
 
-    The new fields are ``observer`` to ``peak_count`` of `NoiseLevels`. tested: held-out samples of each log.
+    The new fields are ``observer`` to ``peak_count`` of `NoiseLevels`, from which contact thresholds are computed.
+
+    tested: held-out samples of each log.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
@@ -245,7 +263,7 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
         beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
         ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-        # Large values at neighbouring samples are one event, so a peak is the largest value in a time window.
+        # Large residuals at neighbouring samples are one event, so a peak is the largest value in a time window.
         times = np.array([sample.t for sample in samples])
         starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
         peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
@@ -253,14 +271,17 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return the exponential tail of the peaks of all logs, as fields of `NoiseLevels`.
+    """Return the exponential distribution of the largest peaks of all logs, as fields of `NoiseLevels`.
 
-    The peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
-    thresholds are computed from all other logs. With the factor on these thresholds, all held-out logs together have no
-    more alarms than the default rate of false alarms allows. The factor is the same for all joints, because the joint
-    that needs the largest factor differs between logs.
+    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. The
+    peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
+    contact thresholds are computed from all other logs. With thresholds multiplied by the factor, all held-out logs
+    together have at most the number of alarms that the default rate of false alarms allows. The factor is the same for
+    all joints, because the joint that needs the largest factor differs between logs.
 
-    peaks: peaks of each log in W time windows, (W, n) [1].
+    Args:
+        peaks: peaks of each log in W time windows, (W, n) [1].
+        levels: noise levels, with the noise of the observer.
     """
     excess = []
     for k, peaks_of_log in enumerate(peaks):
@@ -273,7 +294,7 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 def _observer_residuals(
     levels: NoiseLevels, samples: Sequence[HeldOutSample]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residual of the momentum observer, the variance of the residual, and qd, (T, n) each, at T samples."""
+    """Return the torque residual of the momentum observer, its variance, and qd, (T, n) each, at T held-out samples."""
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
     columns = []
@@ -290,16 +311,16 @@ def _observer_residuals(
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
     """Return the parameters of an exponential distribution of the largest peaks, as fields of `NoiseLevels`.
 
-    peaks: peaks of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
+    peaks: largest normalised residuals of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)
-    # The number of peaks above `start` is the same for all joints except joints without residuals, which have none.
+    # The number of peaks above `start` is the same for all joints, except for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales are similar, and each has an error of 1 / sqrt(count) of its value. They are shrunk towards their mean
-    # with the weight of this variance in the variance over the joints (James and Stein, 1961). The mean over n joints
-    # is estimated from at most n times as many peaks.
+    # The scales of the joints are similar, and the error of each is 1 / sqrt(count) of its value. The scales are shrunk
+    # towards their mean; the weight of the mean is the variance of the error divided by the variance over the joints
+    # (James and Stein, 1961). It is at most 1 - 1 / n, since the mean over n joints is estimated from n `count` peaks.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)
@@ -310,19 +331,25 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
     """Return the noise of the momentum observer in motion and at rest, as fields of `NoiseLevels`.
 
-    The likelihood is maximized over a grid. signal: torque residual of the observer, (T, n) [Nm, N]. qd: velocities,
-    (T, n) [rad/s, m/s].
+    The noise variance of a joint at the velocity qd is s^2 (1 + (r exp(-|qd| / v))^2). The likelihood is maximized over
+    a grid of the ratio r and the velocity scale v of the additional noise near standstill; the noise s in motion is
+    estimated for each grid point.
+
+    Args:
+        signal: torque residual of the observer, (T, n) [Nm, N].
+        qd: velocities, (T, n) [rad/s, m/s].
+        levels: largest speeds and torque limits of the joints.
     """
     grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
     noise, costs = np.zeros((2, len(grid), len(levels.speed)))
     for k, (speed, ratio) in enumerate(grid):
         shape = 1 + np.square(ratio * np.exp(-np.abs(qd) / (speed * levels.speed)))
-        # The variance is estimated by the median of the squares, on which peaks have no influence: they are modelled
-        # separately. 0.455 is the median of the square of a standard normal variable.
+        # The noise variance is estimated by the median of the squares, on which peaks have no influence: peaks are
+        # modelled separately. 0.455 is the median of the square of a standard normal variable.
         level = np.sqrt(np.median(signal**2 / shape, axis=0) / 0.455)
         noise[k] = np.maximum(level, TUNING.min_observer_noise * levels.effort)
         normalised = np.abs(signal) / (noise[k] * np.sqrt(shape))
-        # Huber's cost is quadratic for residuals up to TUNING.outlier, and linear beyond.
+        # Huber's cost is quadratic for normalised residuals up to TUNING.outlier, and linear above.
         inner = np.minimum(normalised, TUNING.outlier)
         costs[k] = np.mean(np.log(noise[k] ** 2 * shape) + inner * (2 * normalised - inner), axis=0)
     best = costs.argmin(axis=0)

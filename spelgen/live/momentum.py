@@ -4,7 +4,8 @@ The generalised momentum p = M qd of the arm, and P theta of a payload with the 
 
     d/dt (p + P theta) = G (tau - offset) + dL/dq - friction + N theta + external torque,
 
-with L the Lagrangian of the arm (De Luca and Mattone, ICRA 2005). The balance contains no accelerations.
+with the input matrix G, the Lagrangian L of the arm, and regressors P and N of the payload's momentum and torque (De
+Luca and Mattone, ICRA 2005). The balance contains no accelerations.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
-_BLOCK = 2048  # Number of samples that are computed at once. The number is limited to save memory.
+_BLOCK = 2048  # Number of samples whose terms are computed at once. The number is limited to save memory.
 
 
 class Balance(NamedTuple):
@@ -27,7 +28,7 @@ class Balance(NamedTuple):
 
     Attributes:
         momentum: Momentum p of the arm, (T, n).
-        torque: G (tau - offset) + friction compensation + dL/dq, (T, n).
+        torque: G (tau - offset) + friction compensation of the drives + dL/dq, (T, n).
         friction: Mean of the friction torques at the two bounds of the friction state, (T, n).
         uncertainty: Half the difference of the friction torques at the two bounds, (T, n).
         load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).
@@ -47,17 +48,19 @@ class Balance(NamedTuple):
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return P and N, (T, n, 10) each, and the Jacobian of a point of the last body, (T, 3, n), in root axes.
-
-    P is the generalised momentum and N the torque in the momentum balance, per inertial parameter of a payload.
+    """Return the terms of a payload in the momentum balance, and the Jacobian of a point of the last body.
 
     Args:
         chain: kinematics of the bodies.
-        q, qd: positions and velocities, (T, n).
+        q, qd: positions [rad, m] and velocities [rad/s, m/s], (T, n).
         point: position of the point in the frame of the last body, (3,) [m].
+
+    Returns:
+        P, generalised momentum per inertial parameter of the payload, (T, n, 10); N, torque per inertial parameter,
+        (T, n, 10); Jacobian of the point in root axes, (T, 3, n).
     """
-    # `forward` transforms points of the bodies. The columns of the identity are passed as points, so that the result
-    # contains the whole homogeneous transform of each body.
+    # `chain.forward` transforms points of the bodies. The columns of the identity are passed as points, so that the
+    # result contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
     # `frame` is the homogeneous transform of the last body, (T, 1, 4, 4).
@@ -72,8 +75,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     weight = torch.zeros_like(velocity)
     weight[..., 3] = -chain.base.flatten()
     directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
-    # Momentum and torque of the payload have the form tr(A J B^T), with its pseudo-inertia J (4, 4), A in `directions`
-    # and B in `vectors`. They are linear in J, with the coefficients A^T B (4, 4).
+    # Momentum and torque of the payload have the form tr(A J B^T), with the payload's pseudo-inertia J (4, 4), A in
+    # `directions` and B in `vectors`. Both are linear in J, with the coefficients A^T B (4, 4).
     products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
     units = pseudo_inertia(torch.eye(10).to(q))
     momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))
@@ -87,12 +90,12 @@ def balance(
     bounds: Sequence[np.ndarray],
     prepared: RigidParameters | None = None,
 ) -> Balance:
-    """Return the terms of the momentum balance at samples.
+    """Return the terms of the momentum balance of an arm at T measured samples.
 
     Args:
         model: model in double precision.
         point: point of the last body, in the frame of this body, whose Jacobian is returned, (3,) [m].
-        samples: q, qd and tau, (T, n).
+        samples: q [rad, m], qd [rad/s, m/s] and tau [Nm, N], (T, n) each.
         bounds: lower and upper bound of the friction state of K bristles per drive, (T, n, K) [rad, m].
         prepared: parameter cache of the model; None: the function computes it.
     """

@@ -1,4 +1,7 @@
-"""Noise levels of an arm, which are estimated from the training logs and stored in the run folder as estimator.json."""
+"""Noise levels of an arm for the online estimator: thresholds from them, and storage in the run folder.
+
+They are estimated from the training logs (``live.levels``) and stored as estimator.json.
+"""
 
 import math
 from typing import Annotated
@@ -29,10 +32,12 @@ Vector = Annotated[
 
 
 class BlockNoise(BaseModel):
-    """Noise of the momentum balance over blocks of one length.
+    """Noise of the torque residual of the momentum balance, averaged over blocks of samples of one length.
 
-    white, disturbance: standard deviations of white noise and of a stationary Ornstein-Uhlenbeck process, (n,) [Nm, N].
-    time_constant: time constant of the Ornstein-Uhlenbeck process, (n,) [s].
+    Attributes:
+        white: standard deviations of white noise, (n,) [Nm, N].
+        disturbance: stationary standard deviations of a disturbance, an Ornstein-Uhlenbeck process, (n,) [Nm, N].
+        time_constant: time constants of the disturbance, (n,) [s].
     """
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True, extra="forbid")
@@ -51,7 +56,7 @@ class NoiseLevels(BaseModel):
     Attributes:
         drift: Noise of the blocks of the drift filter.
         load: Noise of the blocks of the payload filter.
-        observer: Standard deviation of the momentum observer for a moving joint, (n,) [Nm, N].
+        observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
         resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
             [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
@@ -89,16 +94,16 @@ class NoiseLevels(BaseModel):
 
     @property
     def rest_speed(self) -> np.ndarray:
-        """Speed below which a joint is at rest, (n,) [rad/s, m/s]."""
+        """Speed below which a joint is regarded as being at rest, (n,) [rad/s, m/s]."""
         return TUNING.rest * self.speed
 
     @property
     def load_quantile(self) -> float:
         """Half width of 95 % intervals of a payload, in standard deviations.
 
-        It is a quantile of Student's t distribution, because the variance is an estimate, multiplied by a factor that
-        widens the intervals for two reasons. First, errors are larger on other days than in the training logs. Second,
-        a payload increases friction and its errors, and `load_variance` is estimated from logs without payload.
+        It is a quantile of Student's t distribution, because the variance is an estimate, multiplied by a factor above
+        1 for two reasons. First, errors are larger on other days than in the training logs. Second, a payload increases
+        friction and its errors, but `load_variance` is estimated from logs without payload.
         """
         width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
         return float(stdtrit(self.load_freedom, 0.975)) * width
@@ -109,28 +114,31 @@ class NoiseLevels(BaseModel):
         return 1 / self.minutes
 
     def contact_thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the smallest external torques that are contacts, in motion and at rest, (n, 2) [Nm, N]."""
+        """Return the smallest external torques that are detected as contacts, in motion and at rest, (n, 2) [Nm, N].
+
+        alarms_per_minute: rate of false alarms of all joints together [1/min].
+        """
         moving = self.thresholds(alarms_per_minute) * self.observer
         return np.stack([moving, moving + self.resting], axis=1)
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
-        """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd (..., n).
+        """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd, (..., n).
 
-        This bound is added once to a threshold. The standard deviation of the noise, which has rare peaks, is
-        multiplied by a factor (see `thresholds`).
+        A contact threshold is the sum of this bound and a multiple of the standard deviation of the noise (see
+        `thresholds`).
         """
         return np.asarray(self.resting * np.exp(-np.abs(qd) / self.resting_speed))
 
     @property
     def tail_peaks(self) -> float:
-        """Number of peaks per minute that exceed `peak_start`, all joints together [1/min]."""
+        """Number of external-torque peaks per minute that exceed `peak_start`, of all joints together [1/min]."""
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
-        """Return the thresholds of the external torque divided by its standard deviation, (n,) [1].
+        """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
         Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
-        With the prior density 1 / scale of the uncertain scale, a further peak exceeds `peak_start` by more than x with
+        With the prior density 1 / scale of the uncertain scale, a new peak exceeds `peak_start` by more than x with
         the probability (1 + x / (m `peak_scale`))^-m.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
@@ -141,13 +149,13 @@ class NoiseLevels(BaseModel):
 
 
 def keep_levels(fit: Fit, levels: NoiseLevels) -> None:
-    """Write noise levels into the run folder of a fit, if it has one."""
+    """Write noise levels into the run folder of a fit, if the fit has a folder."""
     if fit.folder is not None:
         write_json(RunFolder(fit.folder).estimator, levels.model_dump(mode="json"))
 
 
 def stored_levels(fit: Fit) -> NoiseLevels | None:
-    """Return the noise levels in the run folder of a fit; None if there are none."""
+    """Return the noise levels in the run folder of a fit; None if the fit has no folder or no stored levels."""
     file = None if fit.folder is None else RunFolder(fit.folder).estimator
     if file is None or not file.exists():
         return None

@@ -1,10 +1,10 @@
 """Estimate of a physically consistent payload, or of "no payload", from the state of the payload filter.
 
-The likelihood of the ten inertial parameters theta is the Gaussian of the filter after removal of the filter's prior.
-The prior of a payload is a Wishart distribution of the pseudo-inertia with 6 degrees of freedom. The negative log
-posterior is then convex, and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
-Priors with mean payloads of several masses are compared with "no payload" by Laplace's approximation of the evidence
-(MacKay, Neural Computation 4:415, 1992).
+The payload filter gives a Gaussian of the ten inertial parameters theta. Without the filter's prior, it is the
+likelihood of theta. The prior of a payload is a Wishart distribution of the pseudo-inertia with 6 degrees of freedom.
+The negative log posterior is then convex, and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L
+3:60, 2018). Priors whose means have different masses are compared with "no payload" by Laplace's approximation of the
+evidence (MacKay, Neural Computation 4:415, 1992).
 """
 
 import math
@@ -21,14 +21,14 @@ from spelgen.live.tuning import TUNING
 
 Status = Literal["not yet", "no payload", "payload"]
 _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
-"""dJ/dtheta, (10, 4, 4)."""
+"""Derivative dJ/dtheta of the pseudo-inertia J with respect to the inertial parameters theta, (10, 4, 4)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Payload that is fixed to the last body, in the frame of this body.
+    """Estimate of a payload that is fixed to the last body, in the frame of this body.
 
-    The values from `mass` on are zero unless the status is "payload".
+    All attributes after `limit` are zero unless the status is "payload".
 
     Attributes:
         status: "payload", "no payload", or "not yet" if the motion does not determine whether there is a payload.
@@ -61,12 +61,13 @@ NO_REPORT = Payload()
 
 
 def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quantile: float) -> Payload:
-    """Return a physically consistent payload, or "no payload", from the estimate of the payload filter.
+    """Return the payload that the state of the payload filter indicates: a physically consistent one, or "no payload".
 
-    The status is also "not yet" if rounding errors make a matrix indefinite.
+    The status of the result is "not yet" if the evidence does not suffice, or if rounding errors make a matrix
+    indefinite.
 
     Args:
-        mean: inertial parameters that the filter estimates, with the filter's prior, (10,).
+        mean: inertial parameters estimated by the payload filter, (10,); the filter's prior is removed here.
         covariance: covariance of `mean`, (10, 10).
         factor: factor by which the covariance of the likelihood is multiplied (`NoiseLevels.load_variance`).
         quantile: half width of the 95 % intervals in standard deviations.
@@ -84,13 +85,14 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     log_odds = float(math.log(len(found)) - logsumexp(evidence))
     weights = softmax(evidence)
     theta = weights @ thetas
-    # The covariance of a mixture is the mean of the covariances plus the covariance of the means.
+    # The posterior is a mixture over the prior masses. The covariance of a mixture is the mean of the covariances plus
+    # the covariance of the means.
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
         return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
-    # The intervals follow from the derivatives of mass, centre of mass and inertia with respect to theta. Complex-step
-    # derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
+    # Intervals are computed from the derivatives of mass, centre of mass and inertia with respect to theta (delta
+    # method). Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
     values, tiny = _mass_center_inertia(theta), 1e-30
     steps = [_mass_center_inertia(theta + tiny * 1j * unit).imag for unit in np.eye(10)]
     jacobian = np.array(steps).T / tiny
@@ -104,7 +106,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a positive definite matrix whose entries may differ by orders of magnitude."""
+    """Return the inverse of a positive definite matrix, (k, k), whose entries may differ by orders of magnitude."""
     root = solve_triangular(np.linalg.cholesky(matrix), np.eye(len(matrix)), lower=True)
     return np.asarray(root.T @ root)
 
@@ -112,7 +114,7 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
 def _at_scale(
     precision: np.ndarray, linear: np.ndarray, scale: float, start: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the MAP estimate of the payload, its covariance, and the log evidence, for one prior mean.
+    """Return the MAP estimate of a payload's parameters, its covariance, and the log evidence, for one prior mean.
 
     Newton's method minimizes w (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), with
     the pseudo-inertia J of theta, the scale matrix W of the Wishart prior, and the weight w of the likelihood.
@@ -128,7 +130,7 @@ def _at_scale(
         scale: mass of the prior mean [kg].
         start: parameters from which Newton's method starts with w = 1, (10,).
     """
-    # The prior mean is a homogeneous ball, whose centre is on the z axis at the position +`TUNING.distance`.
+    # The prior mean is a homogeneous ball, whose centre is on the z axis of the last body at +`TUNING.distance`.
     height, about_z = TUNING.distance, 2 / 5 * TUNING.radius**2
     about_x = about_z + height**2
     mean = scale * np.array([1, 0, 0, height, about_x, 0, 0, about_x, 0, about_z])
@@ -146,8 +148,9 @@ def _at_scale(
             step = inverse @ gradient
             decrement = gradient @ step
             theta = theta - step / (1 + math.sqrt(2 * decrement) if decrement > 0.01 else 1)
-            # For a weight below 1 a decrement of 0.1 suffices, because the result is only the start for the next
-            # weight. For the weight 1 it must be 1e-12, which quadratic convergence reaches in a few steps.
+            # Newton's method ends if the decrement is small. For a likelihood weight below 1, 0.1 suffices, because the
+            # result is only the initial value for the next weight. For the weight 1 it must be below 1e-12, which
+            # quadratic convergence reaches in a few steps.
             if decrement < (0.1 if power else 1e-12):
                 break
     inertia = np.einsum("i,iab->ab", theta, _UNITS)
@@ -157,9 +160,10 @@ def _at_scale(
 
 
 def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:
-    """Return mass, centre of mass and inertia about the centre of mass as one array (10,), for parameters (10,).
+    """Return mass, centre of mass and inertia about the centre of mass of a payload as one array, (10,).
 
-    The entries of the inertia are (xx, xy, xz, yy, yz, zz).
+    theta: mass, first moment and inertia about the origin, (10,), real or complex. The elements of both inertias are
+    (xx, xy, xz, yy, yz, zz).
     """
     center = theta[1:4] / theta[0]
     about_origin = theta[0] * (center @ center * np.eye(3) - np.outer(center, center))

@@ -19,10 +19,14 @@ from spelgen.logs.trajectory import Trajectory, require_torques
 
 @dataclass(frozen=True)
 class ContactEvent:
-    """A contact along a log.
+    """A contact in a log: consecutive samples at which external torques exceed their thresholds.
 
-    begin, end: times from the start of the log [s]. joints: names of the joints in contact. torques: largest external
-    torque of each of these joints [Nm, N]. force: largest force at the tip [N].
+    Attributes:
+        begin: time of the first sample, from the start of the log [s].
+        end: time of the last sample [s].
+        joints: names of the joints whose external torque exceeds the threshold.
+        torques: largest external torque of each of these joints [Nm, N].
+        force: largest estimated force at the tip [N].
     """
 
     begin: float
@@ -34,7 +38,7 @@ class ContactEvent:
 
 @dataclass(frozen=True, eq=False)
 class LogEstimate:
-    """The estimates along a log.
+    """The estimates of payload, contacts and friction drift along a log.
 
     Attributes:
         log: The log.
@@ -43,7 +47,7 @@ class LogEstimate:
         states: Estimates after each sample.
         payload: Estimated payload at the end of the log.
         since: Time at which a payload was first reported [s]; None without a payload.
-        changes: Times of detected changes of the load [s].
+        changes: Times of detected changes of the payload [s].
         contacts: Contacts along the log.
         drift: {joint: relative difference of friction at the end of the log from friction of the model [%]}.
         refused: {reason: number of samples that were refused or only partly used}.
@@ -61,7 +65,7 @@ class LogEstimate:
     refused: dict[str, int]
 
     def to_dict(self) -> dict[str, object]:
-        """Return the estimates as content of a JSON file."""
+        """Return the estimates as content of a JSON file: times [s], payload, contacts, friction drift [%]."""
         return {
             "log": self.log.name,
             "seconds": self.log.duration,
@@ -74,7 +78,7 @@ class LogEstimate:
         }
 
     def text(self) -> str:
-        """Return the estimates as text for users."""
+        """Return the estimates as text for users, with a line per contact."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
         if self.since is not None:
             lines.append(f"  a payload was reported first at {self.since:.1f} s")
@@ -97,7 +101,7 @@ class LogEstimate:
 
 
 def payload_content(payload: Payload) -> dict[str, object]:
-    """Return a payload as content of a JSON file."""
+    """Return an estimated payload as content of a JSON file, with 95 % intervals if the status is "payload"."""
     content: dict[str, object] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
     if np.isfinite(payload.limit):
         content["mass_limit"] = payload.limit
@@ -110,7 +114,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return a text about a payload: mass and centre of mass with 95 % intervals, or an upper limit of the mass."""
+    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or "no payload" with limit."""
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(
@@ -125,7 +129,7 @@ def payload_sentence(payload: Payload) -> str:
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:
-    """Return the estimates along each log; the estimator is reset at the start of a log.
+    """Return the estimates of payload, contacts and friction drift along each log; each log starts a new estimate.
 
     Args:
         fit: fit of an arm's model to torques.
@@ -160,12 +164,12 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
 
 
 def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
-    """Return the estimated payload of an arm that carries the same payload in all given logs."""
+    """Return the payload of an arm, estimated from several logs with the same payload."""
     estimator, begin = Estimator(fit), 0.0
     for log in logs:
         t = log.t - log.t[0] + begin
-        # The logs are processed as one recording with pauses. A pause exceeds the longest gap, so that the friction
-        # state is reset.
+        # The logs are processed as one recording with pauses. Each pause exceeds `TUNING.gap`, so that the estimator
+        # resets the friction state.
         begin = float(t[-1]) + 2 * TUNING.gap
         for _ in estimator.steps(t, log.q, log.qd, log.tau):
             pass
@@ -173,7 +177,10 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
-    """Return the contacts along a log. states: estimates after consecutive samples. joints: names of the joints."""
+    """Return the contacts in a log; contacts separated by less than `TUNING.merged` seconds are one contact.
+
+    states: estimates after each sample of the log. joints: names of the joints.
+    """
     touching = [state for state in states if state.contact.touched.any()]
     ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
     events = []
@@ -182,8 +189,8 @@ def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> l
         torques = np.array([state.contact.external_torque for state in group])
         touched = np.array([state.contact.touched for state in group])
         named = np.flatnonzero(touched.any(axis=0)).tolist()
-        # `peaks` are the samples of the largest torque of each joint, among the samples at which the torque exceeds the
-        # threshold of the joint.
+        # `peaks` are the samples of the largest external torque of each joint in contact, among the samples at which
+        # the torque exceeds the threshold of the joint.
         peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)[named]
         events.append(
             ContactEvent(

@@ -1,4 +1,4 @@
-"""Constants of the online estimator. Noise levels are no constants: `live.levels` estimates them from training logs."""
+"""Constants of the online estimator, except for noise levels, which `live.levels` estimates from training logs."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from scipy.special import multigammaln
 
 @dataclass(frozen=True)
 class LiveTuning:
-    """Constants of the estimator, chosen by `benchmarks/live.py`."""
+    """Constants of the online estimator of payload, friction drift and contacts, chosen by `benchmarks/live.py`."""
 
     # Constants of blocks and of the friction state (`live.estimator`).
 
@@ -22,19 +22,21 @@ class LiveTuning:
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
-    # [1] Samples over the delay of the torques: samples that follow each other faster are omitted from the memory.
+    # [1] Number of samples that a `DelayLine` stores per delay: a sample is stored only if at least the time delay /
+    # `delay_samples` has passed since the last stored sample.
     delay_samples: int = 16
     # [1] A joint is at rest below this fraction of its largest speed in the training logs.
     rest: float = 0.01
 
     # Constants of the filters (`live.filters`).
 
-    # Prior standard deviations of the payload in the payload filter: mass [kg], first moments [kg m] and inertia
-    # [kg m^2]. This prior is removed from the final estimate, so a wider prior would only add rounding errors.
+    # Prior standard deviations of the payload's inertial parameters in the payload filter: mass [kg], first moments
+    # [kg m] and inertia [kg m^2]. The filter's prior is removed from the final estimate, so a wider prior would only
+    # add rounding errors.
     load_mass: float = 10.0
     load_moment: float = 2.0
     load_inertia: float = 0.4
-    # [1] Prior standard deviation of the friction scale.
+    # [1] Prior standard deviation of the friction scale, current friction divided by friction of the model.
     friction: float = 0.02
     # [1/s] Increase of the variance of the friction scale per second, as a random walk.
     friction_walk: float = 3e-5
@@ -44,9 +46,9 @@ class LiveTuning:
     # [1] Residuals beyond this number of standard deviations are treated as outliers, with a larger noise variance
     # (Huber, Robust Statistics, 1981).
     outlier: float = 3.0
-    # [1] Variance of friction with an unknown friction state, divided by the square of `Balance.uncertainty`. It would
-    # be 1/3 for friction that is uniformly distributed between its bounds. The value is larger, because the errors of
-    # the samples of a block are correlated.
+    # [1] Variance of the friction torque of a joint whose friction state is unknown, divided by the square of
+    # `Balance.uncertainty`, half the range of this torque. The value would be 1/3 for a uniform distribution over the
+    # range. It is larger, because samples are averaged in blocks, and the errors in a block are correlated.
     uncertainty: float = 3.0
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
@@ -56,12 +58,13 @@ class LiveTuning:
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
-    # A changed load is accepted after `changed_after` [s] of motion or later, if the log likelihood of this hypothesis
-    # exceeds the log likelihoods of no change and of a contact by more than `changed` [1].
+    # A changed load is accepted after `changed_after` [s] of motion or later, if the log likelihood of the hypothesis
+    # "changed load" exceeds the log likelihoods of "no change" and of "contact" by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses are dropped after `dropped_after` [s] of motion. They are dropped after `changed_after` if the
-    # difference of the log likelihoods is below `unlikely` [1].
+    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion. They are dropped
+    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact"
+    # and "no change" is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -69,9 +72,9 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
-    # [1] Standard deviation of the torque error while dp/dt changes, relative to the difference of two estimates of
-    # dp/dt, with the bandwidth of the observer and with twice this bandwidth. Torques that lag behind the motion by
-    # 1 / (2 * 2 * bandwidth) = 12 ms have this error.
+    # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
+    # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt, with the
+    # bandwidth of the observer and with twice this bandwidth. This is the error for a lag of 1 / (4 bandwidth) = 12 ms.
     jerk: float = 0.5
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.
@@ -93,22 +96,22 @@ class LiveTuning:
 
     # [s] Time in motion between two reports of the payload.
     report: float = 1.0
-    # [m] The prior mean of a payload is a homogeneous ball of this radius, with its centre on the z axis of the last
-    # body at this distance from the origin.
+    # [m] The prior mean of a payload is a homogeneous ball of the radius `radius`, with its centre on the z axis of the
+    # last body at the distance `distance` from the origin.
     radius: float = 0.2
     distance: float = 0.05
     # [kg] Masses of the prior means of a payload. Each has the same prior probability.
     scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
-    # [1] Limits of the log odds of "no payload" against a payload. A payload is reported if they are at most
-    # `payload_odds`, and "no payload" if they are greater than `no_payload_odds`. Between these limits, the status is
-    # "not yet".
+    # [1] Limits of the log odds of "no payload" against a payload. A payload is reported if the log odds are at most
+    # `payload_odds`, "no payload" if they are greater than `no_payload_odds`. Between the limits, the status is "not
+    # yet".
     payload_odds: float = -5.0
     no_payload_odds: float = 3.0
 
-    # [1] Degrees of freedom of the Wishart prior of the pseudo-inertia.
+    # [1] Degrees of freedom of the Wishart prior of the payload's pseudo-inertia.
     degrees: int = 6
-    # [1] Newton's method increases the weight of the likelihood from 4^-weights to 1 by factors of 4, with at most
-    # `iterations` steps for each weight.
+    # [1] Newton's method for the payload increases the weight of the likelihood from 4^-weights to 1 by factors of 4,
+    # with at most `iterations` steps for each weight.
     weights: int = 12
     iterations: int = 40
     # [s] Torques that are predicted at most this time ahead include the estimated disturbance.
@@ -116,23 +119,23 @@ class LiveTuning:
 
     # Constants of the estimation of noise levels (`live.levels`).
 
-    # [1] The logs are divided into `folds` parts, which are held out one at a time. A fit to the other parts needs at
+    # [1] The logs are divided into `folds` folds, which are held out one at a time. A fit to the other folds needs at
     # least `min_samples` samples of motion, and uses at most `max_samples`.
     folds: int = 3
     min_samples: int = 300
     max_samples: int = 2**11
-    # The grid of the noise: time constants of the disturbance [s], and standard deviations of the disturbance divided
-    # by the standard deviation of white noise [1].
+    # The grid for the estimation of `BlockNoise`: time constants of the disturbance [s], and standard deviations of the
+    # disturbance divided by the standard deviation of white noise [1].
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
-    # [1] Lengths of the trials of the payload filter, as numbers of blocks: 5 and 10 s.
+    # [1] Lengths of trial estimates of the payload, as numbers of blocks of the payload filter: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
-    # [1] Prior value of `NoiseLevels.load_variance`, with the weight of `prior_trials` trials. It is needed because the
-    # logs of an arm often have too few trials for an estimate.
+    # [1] Prior value of `NoiseLevels.load_variance`, with the weight of `prior_trials` trials: the logs of an arm often
+    # have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] The grid of the noise near standstill: velocity scales divided by the largest speed, and the additional noise
-    # at rest divided by the noise in motion.
+    # [1] The grid of the noise of the momentum observer near standstill: velocity scales divided by the largest speed,
+    # and the additional noise at rest divided by the noise in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 
@@ -143,15 +146,15 @@ class LiveTuning:
 
     @property
     def load_prior(self) -> np.ndarray:
-        """Prior standard deviations of the inertial parameters of a payload, (10,)."""
+        """Prior standard deviations of a payload's inertial parameters in the payload filter, (10,)."""
         return np.repeat([self.load_mass, self.load_moment, self.load_inertia], [1, 3, 6])
 
     @property
     def evidence(self) -> float:
-        """Sum of the terms of the log evidence that depend neither on logs nor on the prior mean.
+        """Constant terms of the log evidence of a payload, which depend neither on logs nor on the prior mean.
 
-        The terms are the constants of Laplace's approximation and of the Wishart density of the pseudo-inertia J, with
-        |dJ/dtheta| = 1/2 for the inertial parameters theta.
+        They are the constants of Laplace's approximation and of the Wishart density of the pseudo-inertia J, with the
+        determinant |dJ/dtheta| = 1/2 for the inertial parameters theta.
         """
         wishart = 2 * self.degrees * math.log(2) + float(multigammaln(self.degrees / 2, 4))
         return 5 * math.log(2 * math.pi) - math.log(2) - wishart

@@ -26,7 +26,7 @@ ABOUT_ARM = {COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS
 def check_logs(
     logs: Trajectory | Iterable[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> LogReport:
-    """Return the report on the logs of an arm. Faults of the logs are not raised, but are `errors` of the report.
+    """Return the report on the logs of an arm; faults of the logs are not raised, but listed in its `errors`.
 
     Args:
         logs: one or several trajectories; an iterator is consumed once, one trajectory at a time.
@@ -52,7 +52,7 @@ def check_logs(
     log_checks = LogChecks(joints, types)
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
-    # one trajectory at a time: an iterator of logs may be larger than memory
+    # logs are read one trajectory at a time: an iterator of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
         checked.add(trajectory)
@@ -81,9 +81,12 @@ def check_logs(
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Return the findings about logs that concern the arm; raise LogError if the logs cannot be trained on."""
-    # the checks of `spelgen logs`, so that training and this command reject the same logs
+    """Check logs with the arm; return the findings. Raises LogError if the logs cannot be used for training.
+
+    A fit calls this function before it uses the logs.
+    """
+    # the command `spelgen logs` makes the same checks, so that training and the command reject the same logs
     report = check_logs(logs, arm, mapping)
     collect(report.errors)
-    # other findings are omitted: a fit itself runs the checks that need no arm, and estimates the delay of torques
+    # Findings of checks that need no arm, and of the delay of torques, are omitted: the fit itself reports them.
     return [note for note in report.findings if note.code in ABOUT_ARM]

@@ -29,16 +29,15 @@ MOVING = SAMPLES.moving
 # delays of low-cost servos are below 0.2 s.
 DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
-FILTER_SAMPLES = 12  # [1] fewest samples of a gap-free piece, which the smoothing polynomial needs
+FILTER_SAMPLES = 12  # [1] Smallest number of samples of a segment without gaps, for the smoothing polynomial.
 FOLLOWS = SIGNALS.agreement
-OTHER_ZERO = (
-    0.17  # [rad, m] constant distance of commands from positions; servos deviate less under their load
-)
+# [rad, m] Constant distance of commands from positions that shows another zero; servos deviate less under their load.
+OTHER_ZERO = 0.17
 # Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
 # step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
-# at each joint: 200 divided by the counts of the joint's calibrated range.
-# NORMALISED_RANGE: largest magnitude of a normalised position. NORMALISED_STEPS: smallest and largest quantisation step
-# of normalised positions, for calibrated ranges of 800 to 5000 counts.
+# at each joint: 200 divided by the counts of the joint's calibrated range. NORMALISED_RANGE is the largest magnitude of
+# a normalised position. NORMALISED_STEPS are the smallest and the largest quantisation step of normalised positions,
+# for calibrated ranges of 800 to 5000 counts.
 NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
 # SAME_STEP: relative difference below which the steps of all joints count as equal. ENCODER_STEP: relative difference
 # below which a step counts as a step of an encoder.
@@ -46,10 +45,15 @@ SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 
 
 def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
-    """Find positions of servos that are logged in another unit than the mapping states, "deg" or "rad".
+    """Return a finding if the positions of servos have another unit than `unit`, "deg" or "rad"; else None.
 
-    The steps of the encoders show the unit. Positions without steps that move by less than 0.1 rad at all joints, and
-    by more than 0.5 as radians, were not in degrees. Normalised positions have another step at each joint.
+    The quantisation steps of the encoders show the unit: see the comment at `NORMALISED_RANGE`. Positions without steps
+    were not in degrees if all joints move by less than 0.1 rad when the positions are read in degrees, and a joint
+    moves by more than 0.5 rad when they are read in radians. Normalised positions have another step at each joint.
+
+    Args:
+        joints: statistics of all joints, converted to radians from `unit`.
+        unit: unit of the positions in the mapping.
     """
     steps = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
     ranges = np.array([joint.high["q"] - joint.low["q"] for joint in joints])
@@ -79,7 +83,10 @@ def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
 
 
 def _are_encoders(steps: np.ndarray) -> bool:
-    """Return True if most quantisation steps (J,) [degrees] are steps of encoders with 2**10 to 2**14 counts."""
+    """Return True if most quantisation steps (J,) [degrees] of J joints are about 360 / 2**k, k from 10 to 14.
+
+    Encoders of position servos have these steps.
+    """
     counts = 360 / steps
     powers = np.clip(np.round(np.log2(counts)), 10, 14)
     return bool(len(steps) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
@@ -96,15 +103,17 @@ NORMALISED: Check[Sequence[JointReport]] = Check(
 
 
 class Following(NamedTuple):
-    """Tracking of the commands of n joints.
+    """Tracking of the commands u of n position servos by the positions q.
 
     Attributes:
         moves: (n,) True for joints whose command changes.
-        delay: (n, n) [s] delay at which the magnitude of the correlation is largest.
+        delay: (n, n) [s] delay of the position of joint j (column) after the command of joint i (row) at which the
+            magnitude of their correlation is largest.
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
-        offset: (n,) [rad, m] mean of u - q; 0 if u - q varies more than that, as for joints that carry a load.
+        offset: (n,) [rad, m] mean of u - q; 0 if the mean is less than two standard deviations of u - q, as for joints
+            that carry a load.
         joints: tracking errors and lag of each joint.
     """
 
@@ -117,10 +126,10 @@ class Following(NamedTuple):
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
-    """Return the tracking of the commands of n joints over all recordings; None if no recording is long enough.
+    """Return the tracking of the commands of n position servos over all recordings: delay, correlation, errors.
 
-    saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
-    infinity if the limit is unknown.
+    None is returned if no recording is long enough. saturation: (n,) [rad, m] distance of a position from its command
+    at which the servo's torque is at its limit; infinity if the limit is unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -133,18 +142,19 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     correlations, tracking_rms = [], []
     for delay in DELAYS.tolist():
         u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
-        # means are subtracted, since the static error of a servo shifts them
+        # the means of u and q are subtracted, since the static error of a servo shifts them
         covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     best = np.abs(correlations).argmax(axis=0)
     correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
-    moves = u_std > 0.01  # [rad, m] a command with a smaller standard deviation is constant with noise
+    # [rad, m] standard deviation below which a command is treated as constant with noise
+    moves = u_std > 0.01
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
     joints = []
     for k, error in enumerate(_steady_state_errors(pieces)):
         delay_index = best[k, k] if moves[k] else NO_DELAY
-        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # + 0.0 turns -0 into 0
+        lag = float(DELAYS[delay_index]) + 0.0 if moves[k] else None  # adding 0.0 to the lag turns -0 into 0
         fraction = float(saturated[k]) if np.isfinite(saturation[k]) else None
         joints.append(JointFollowing(lag, float(tracking_rms[delay_index][k]), error, fraction))
     gain = correlation.diagonal() * q_std / np.maximum(u_std, 1e-6)
@@ -156,9 +166,10 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
-    """Return the steady-state error of each joint [rad, m]; None for a joint that never rests.
+    """Return the steady-state error of each joint [rad, m]; None for a joint that is never at rest.
 
-    It is the 90th percentile of |u - q| at samples at which the command is constant and the joint rests.
+    It is the 90th percentile of |u - q|, command minus position, at samples with a constant command and a joint at
+    rest.
     """
     distances, rests = [], []
     for piece in pieces:
@@ -172,34 +183,37 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
         distances.append(np.abs(u - _midpoints(piece.q)))
     errors: list[float | None] = []
     for distance, resting in zip(np.concatenate(distances).T, np.concatenate(rests).T, strict=True):
-        # the 90th percentile, since the largest error may be due to contact with an obstacle
+        # the error is the 90th percentile, since the largest error may be due to contact with an obstacle
         errors.append(float(np.quantile(distance[resting], 0.9)) if resting.any() else None)
     return errors
 
 
 def _midpoints(x: np.ndarray) -> np.ndarray:
-    """Return the means (T - 1, ...) of neighbouring samples of x (T, ...), to match commands averaged over steps."""
+    """Return the means (T - 1, ...) of neighbouring samples of x (T, ...): positions in the middle between two samples.
+
+    They are compared with the commands, which act from one sample to the next.
+    """
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
 class ServoLogs:
-    """Checks of logs of commanded positions against the arm, over all trajectories."""
+    """Checks of logs of commanded positions, on all trajectories together: `add` each trajectory, then `check`."""
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
         self._logs: list[Trajectory] = []
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError if it has no commands."""
+        """Add a trajectory to the logs that `check` tests. Raises LogError if it has no commands."""
         require_commands(trajectory)
         self._logs.append(trajectory)
 
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the joint reports with the tracking of the commands added, and the tables for display.
+        """Return the joint reports with the tracking of the commands added, and the tables of the report.
 
-        The findings are added to `summary`.
+        The findings are added to `summary`. reports: statistics of each joint.
         """
         names = self._arm.chain.joint_names
         saturation = np.full(len(names), np.inf)
@@ -242,13 +256,18 @@ class ServoLogs:
             if log.sample_rate < 20.0:
                 message = f"{log.sample_rate:.3g} Hz: delays and friction need 20 Hz or more"
                 summary.notes.append(Diagnostic("warning", "sparse", f"trajectory {log.name}", None, message))
-                break  # reported for one trajectory only: logs of one robot have the same sample rate
+                # the low rate is reported for one trajectory only: logs of one robot have the same sample rate
+                break
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
     def _check_unit(
         self, reports: Sequence[JointReport], units: Collection[str | None], summary: Findings
     ) -> None:
-        """Add an error about positions in another unit than the mapping states for all joints."""
+        """Add an error to `summary` if the positions have another unit than the mapping states.
+
+        Nothing is tested unless all joints have the same unit in the mapping. units: the different units of the joints'
+        positions in the mapping.
+        """
         (unit, *others) = units
         if others or unit not in (None, "rad", "deg"):
             return
@@ -256,14 +275,15 @@ class ServoLogs:
         if finding is None:
             return
         check = UNIT if finding.keys else NORMALISED
-        # the reader's general doubt about degrees of LeRobot is omitted if this error is found
+        # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
+        # states more.
         summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
         if check.code not in self._logs[0].accepted:
             summary.add(check, finding.message, "all joints", keys=finding.keys)
 
 
 def _exchanged_commands(following: Following) -> list[int]:
-    """Return the joints whose commands other joints track."""
+    """Return the indices of the joints whose command is tracked by another joint, and not by the joint itself."""
     is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
     return np.flatnonzero(is_tracked & (following.correlation.diagonal() < 0.5)).tolist()
 
@@ -271,7 +291,11 @@ def _exchanged_commands(following: Following) -> list[int]:
 def _exchange_error(
     exchanged: Sequence[int], joints: Sequence[str], following: Following, mapping: LogMapping
 ) -> LogError:
-    """Return the error about joints whose commands other joints track, with the columns that these joints track."""
+    """Return the error about joints whose commands are tracked by other joints.
+
+    The error names the setting with the right column of each joint. exchanged: indices of the joints from
+    `_exchanged_commands`. joints: names of all joints.
+    """
     entries = {}
     for k in exchanged:
         for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
@@ -283,13 +307,15 @@ def _exchange_error(
 
 
 def _command_error(k: int, report: JointReport, following: Following, of_sum: float) -> LogError | None:
-    """Return the error that the column cannot contain the commands of joint k; None if it can.
+    """Return the error that the logged commands of joint k cannot be its commands; None if they can.
 
-    of_sum: correlation of the sum of the commands with the position.
+    The commands may be in another unit or sense than the positions, or be increments of the position. of_sum:
+    correlation of the position with the cumulative sum of the commands, which is high for increments.
     """
-    # correlation and gain at the delay with the largest correlation, so that a slow servo is not reported as a fault
+    # Correlation and gain are those at the delay of largest correlation, so that a slow servo is not reported as a
+    # fault.
     correlation, gain = following.correlation[k, k], following.gain[k]
-    # a ratio of amplitudes of about 57.3 or 1/57.3 shows that the command or the position is in degrees
+    # a gain (ratio of amplitudes) of about 57.3 or 1/57.3 shows that the command or the position is in degrees
     if correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
         got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
         units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
@@ -312,7 +338,7 @@ def _command_warning(
     """Yield the warning that the logged command of joint k may not be the command that its servo tracks."""
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
-        # the logger wrote measured positions in place of commands
+        # commands equal to positions: the logger wrote measured positions in place of commands
         code = "commands-are-positions"
         message = "u is q, to the last bit: are the commands those that were sent?"
     elif not following.moves[k]:

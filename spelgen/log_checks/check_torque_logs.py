@@ -49,7 +49,10 @@ CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 
 
 class TorqueLogs:
-    """Checks of logs of torques against the model of the arm, on a subset of the samples of all trajectories."""
+    """Checks of logs of torques against the model of the arm: `add` each trajectory, then `check`.
+
+    A subset of the samples of all trajectories is used.
+    """
 
     def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
@@ -60,14 +63,14 @@ class TorqueLogs:
         self._seconds, self._is_bag = 0.0, False
 
     def add(self, trajectory: Trajectory) -> None:
-        """Add a trajectory. Raises LogError if it has no torques."""
+        """Add a trajectory to the logs that `check` tests. Raises LogError if it has no torques."""
         require_torques([trajectory])
         inputs = self._drives.inputs.T
         pieces = []
         for x in split_at_gaps(trajectory, shortest=3):
             pieces.append(MotionSamples.of(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
         if pieces:
-            # 400 samples of a trajectory suffice, since gravity and friction change slowly
+            # at most 400 samples of a trajectory are kept, which suffice, since gravity and friction change slowly
             self._samples.append(joined_samples(pieces).thinned(400))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
@@ -79,11 +82,11 @@ class TorqueLogs:
     def check(
         self, reports: Sequence[JointReport], summary: Findings
     ) -> tuple[list[JointReport], tuple[Listing, ...]]:
-        """Return the joint reports with the fit of gravity added, and the tables for display.
+        """Return the joint reports with the fit of gravity added, and the tables of the report.
 
-        The findings are added to `summary`.
+        The findings are added to `summary`. reports: statistics of each joint.
         """
-        # a check is omitted if the mapping accepts it, or if every trajectory does
+        # a check is omitted if the mapping accepts its findings, or if the mappings of all trajectories do
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
@@ -93,7 +96,8 @@ class TorqueLogs:
             completed.append(replace(report, gravity=gravity))
             offset = self._mapping.offset("q", coordinate.name)
             evidence.append(JointEvidence(coordinate, completed[-1], offset))
-        # the model is fitted only to sound logs: wrong velocities give wrong friction, and other faults wrong hints
+        # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
+        # hints.
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
@@ -102,8 +106,9 @@ class TorqueLogs:
             message = f"no samples for identify and for fits of torques: they need {NEEDED}"
             summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
         if is_sound:
-            # with unknown motor gains a wrong hypothesis about the log may have the lowest cost
-            # unfiltered samples of logs whose sample rate is too low for accelerations
+            # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
+            # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
+            # samples.
             problem = None if unscaled else self._problem(motion if moving is None else moving)
             is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
             if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
@@ -113,7 +118,8 @@ class TorqueLogs:
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
         for joint in evidence:
             passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            # if the log has an error, torques beyond the limits of the drive are a consequence of the same fault
+            # torques beyond the limits of the drive are not reported if the log has an error, since they are a
+            # consequence of it
             if has_errors:
                 passed.add("torque-beyond-drive")
             for check, found in run_checks(CHECKS, joint, passed):
@@ -127,9 +133,9 @@ class TorqueLogs:
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
     def _unscaled_currents(self) -> list[Diagnostic]:
-        """Return a warning about logged motor currents whose gain is still 1, as in a draft of a mapping; [] if none.
+        """Return a warning about logged motor currents whose gain is still 1, as in the draft of a mapping.
 
-        A gain that a fit estimates ('gain: trained') needs no warning.
+        [] is returned if there are none. A gain that a fit estimates ('gain: trained') needs no warning.
         """
         names = []
         for name in self._arm.chain.joint_names:
@@ -150,7 +156,10 @@ class TorqueLogs:
         return self._mapping.unit("tau", joint) is not None
 
     def _problem(self, samples: MotionSamples) -> GeometryProblem | None:
-        """Return the least-squares problem of samples; None for too few samples or only constant torques."""
+        """Return the least-squares problem of the samples, for the comparison of hypotheses about the log.
+
+        None is returned for too few samples, or if all torques are constant.
+        """
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         return GeometryProblem(
@@ -158,7 +167,7 @@ class TorqueLogs:
         )
 
     def _stated_hypothesis(self) -> Hypothesis:
-        """Return the hypothesis without faults, with the signs, scales and offsets that the mapping states.
+        """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
 
         The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
         """
@@ -176,10 +185,17 @@ class TorqueLogs:
         accepted: set[str],
         summary: Findings,
     ) -> bool:
-        """Return True if the torques are neither cut off nor explained much better by a hypothesis about the log.
+        """Return True if the torques agree with the mapping: they are not cut off, and no hypothesis fits much better.
 
-        Hypotheses are, for example, other signs, orders or zeros of the joints. Otherwise the finding is added, and
-        False is returned. Warnings about mechanical stops and about inertials of the URDF are added, too.
+        Hypotheses are, for example, other signs, orders or zeros of the joints. For torques that do not agree, the
+        finding is added to `summary`, and False is returned. Warnings about mechanical stops and about inertials of the
+        URDF are added to `summary`, too.
+
+        Args:
+            problem: least-squares problem of the samples.
+            evidence: each joint of the URDF with its statistics.
+            accepted: codes of the checks that the mapping accepts.
+            summary: findings, to which findings are added.
         """
         unsigned = find_unsigned(problem) if UNSIGNED not in accepted else []
         if unsigned:
@@ -218,9 +234,10 @@ class TorqueLogs:
         return False
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test, with candidates for factors on torques from the magnitude of gravity.
+        """Return the kinds of faults to test, with candidates for wrong units of torques and positions.
 
-        A unit of torques that the mapping states is not changed, unless it is mNm.
+        The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
+        that the mapping states is not changed, unless it is mNm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -230,14 +247,15 @@ class TorqueLogs:
         _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
         loads = of_urdf.std(axis=0)
         factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
-        # velocities must have the unit of the positions per second, so that both are changed by the same factor
+        # Units of positions are tested only if velocities have the same unit per second, so that one factor changes
+        # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
         scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
         return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
-        """Add a warning about a coupling of motors that the logs show, or else a note on a delay of the torques."""
+        """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
@@ -246,10 +264,10 @@ class TorqueLogs:
 
 
 def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) -> Iterator[Diagnostic]:
-    """Yield a warning for each joint whose torque contains no gravity.
+    """Yield a warning for each joint whose torque contains no gravity, although gravity of the URDF loads the joint.
 
-    Its torque is uncorrelated with the gravity torque of the URDF and, since wrong masses also lower this correlation,
-    fits better without gravity than with gravity and masses near the URDF's.
+    Its torque is uncorrelated with the gravity torque of the URDF. Since wrong masses also lower this correlation, the
+    torque must in addition fit better without gravity than with gravity and masses near the URDF's.
     """
     suspicious = []
     for k, joint in enumerate(joints):
@@ -261,7 +279,7 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     problem = problem.thinned(GEOMETRY.confirming_samples)
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
-        # without any suitable model, a residual of more than 10 % of the torque's variance is enough
+        # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
         if fit.errors[k] > 0.1 or problem.without_gravity(k).fit(problem.unchanged).cost < fit.cost:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
@@ -271,10 +289,11 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose mass or first moment (mass times centre of mass) is far from the URDF's.
+    """Yield a warning for each link whose mass or first moment, by least squares, is far from its value in the URDF.
 
-    Of the first moment, the component along the URDF's is compared. The difference must change the torque of a joint by
-    a visible part, since wrong parameters of bodies that hardly affect the torques are no matter.
+    The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
+    difference must change the torque of a joint by half of the torque's standard deviation, since parameters of bodies
+    that hardly affect the torques are uncertain.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
@@ -293,8 +312,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             axis = stated / size
             ratio = float(axis @ found) / size
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
-            # CAD models are wrong by a factor of less than 2.5. Four standard deviations are required, since one of
-            # many bodies may exceed two by chance.
+            # Masses of CAD models are wrong by a factor of less than 2.5. The difference from the URDF must also
+            # exceed four standard deviations of the fitted value: one of many bodies may exceed two by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (
@@ -308,7 +327,7 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
     """Return the warning about a coupling of motors, with the settings that declare it.
 
-    remaining: squared torque residual of both joints with the coupling, divided by the one without it.
+    remaining: squared torque residual of both joints with the coupling, divided by the residual without the coupling.
     """
     names = arm.chain.joint_names
     pair = [coupling.moved_by, coupling.joint]

@@ -1,6 +1,6 @@
 """The finding that a log fits the arm better with other settings, for example with other signs of joints.
 
-The finding names the settings that correct the log; if no settings can correct it, the finding has other advice.
+The finding names the settings that correct the log. If no setting can correct it, the finding has other advice.
 """
 
 from collections.abc import Sequence
@@ -96,7 +96,10 @@ def _place(correction: Correction, fault: Fault) -> str:
 
 
 def _evidence(before: float, after: float) -> str:
-    """Return a sentence that compares squared torque residuals, relative to the variance of the torques."""
+    """Return a sentence that compares the squared torque residuals before and after the corrections of a log.
+
+    before, after: mean squared residual, divided by the variance of the torques.
+    """
     if after < 0.9 * before:
         return f"the squared torque error of least squares falls from {before:.2%} to {after:.2%} of the variance"
     return "the torque error of least squares remains the same, with plausible positions, masses, inertias and friction"

@@ -29,9 +29,9 @@ class FlatTops(NamedTuple):
     """Flat bottoms and tops of the positions and torques of n joints: extreme values at which a signal is constant.
 
     Attributes:
-        q: (2, n) lowest and highest positions [rad, m]; NaN for positions that are not flat.
-        tau: (2, n) lowest and highest torques [Nm, N]; NaN for torques that are not flat.
-        shares: (2, n) fraction of the samples at these torques.
+        q: (2, n) lowest and highest positions [rad, m]; NaN for an extreme that is not flat.
+        tau: (2, n) lowest and highest torques [Nm, N]; NaN for an extreme that is not flat.
+        shares: (2, n) fraction of the samples whose torque is at the flat bottom or top.
     """
 
     q: np.ndarray
@@ -40,12 +40,15 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat tops of one trajectory with positions q and torques tau, (T, n) each."""
+        """Return the constant extreme values of positions q and torques tau of one trajectory, (T, n) each."""
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the most extreme flat tops of several trajectories, and the means of their shares."""
+        """Return the extreme values at which signals stay (flat bottoms and tops), joined over several trajectories.
+
+        The fractions of the samples at them (`shares`) are means over the trajectories.
+        """
         q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
         sides = SIDES[:, None]
         return cls(
@@ -54,11 +57,11 @@ class FlatTops(NamedTuple):
 
 
 def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (2, n) of the flat bottoms and tops of signals (T, n), and their fractions of samples (2, n).
+    """Return the flat bottoms and tops of n signals (T, n).
 
-    The value of an extreme that is not flat is NaN. At a flat top, a narrow band at the extreme value contains many
-    more samples than the adjacent band, which is three times as wide; at the peak of a sinusoid both contain equally
-    many.
+    Two arrays (2, n) are returned: the lowest and highest values, NaN for an extreme that is not flat, and the
+    fractions of the samples at them. At a flat top, a narrow band at the extreme value contains many more samples than
+    the adjacent band, which is three times as wide; at the peak of a sinusoid both contain equally many.
     """
     upright = SIDES[:, None, None] * values
     tops = upright.max(axis=1)
@@ -73,8 +76,9 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
 
-    The signs of the model's torques are assigned to the magnitudes, and the model is fitted again, in a few
-    alternations. A joint whose load always has the same direction keeps its torques, and is no finding.
+    The torques get the signs of the model's torques, and the model is fitted again, in a few alternations. A joint is
+    named if this lowers its residual much, and if both signs occur: the load of a joint with only one sign may indeed
+    have always the same direction.
     """
     problem = problem.thinned(GEOMETRY.confirming_samples)
     signals = problem.unchanged.signals(problem.samples)
@@ -83,7 +87,7 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     if not suspects.any():
         return []
     fits = []
-    # initial signs: of the torques of the URDF or, for joints with little load, of the velocity (friction)
+    # Initial signs are the signs of the URDF's torques or, for joints with little load, of the velocity (friction).
     for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
@@ -108,8 +112,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     """Return an error for each joint with clipped torques; if there is none, a warning for each joint at a stop.
 
-    problem: least-squares problem of the logs. flat: flat tops of the logs as recorded, since a low-pass filter rounds
-    flat tops off.
+    At a stop, a position is constant at an extreme while the torque contradicts the model. problem: least-squares
+    problem of the logs. flat: flat tops of the logs as recorded, since a low-pass filter rounds flat tops off.
     """
     problem, findings = problem.thinned(GEOMETRY.confirming_samples), Findings()
     samples = problem.unchanged.signals(problem.samples)
@@ -121,18 +125,18 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.residual(problem.unchanged, fit.parameters)
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
-    # The residual of few samples underestimates the noise: the 30 degrees of freedom of a joint's parameters are
-    # subtracted.
+    # A fit to few samples has a smaller residual than the noise. The sum of squares is divided by the number of samples
+    # minus 30, about the number of parameters that are fitted to a joint's torque.
     freedom = np.maximum(free.sum(axis=0) - 30, 1e-9)
     noise = np.sqrt(np.square(residual * free).sum(axis=0) / freedom)
-    certain = 3.0  # standard deviations
+    certain = 3.0  # number of standard deviations that a significant difference exceeds
     for k, coordinate in enumerate(problem.arm.coordinates):
         unit, levels = UNITS[coordinate.joint_type].torque, flat.tau[:, k]
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # The excess must be larger than the friction: friction estimated from few samples may be wrong, and its error
-        # is no evidence of a limit.
+        # The torque excess at a flat top must be larger than the friction: friction estimated from few samples may be
+        # wrong, and its error is no evidence of a limit.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
@@ -169,5 +173,5 @@ def _at_levels(levels: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _median(values: Sequence[float] | np.ndarray) -> float:
-    """Return the median of values; minus infinity if there are none."""
+    """Return the median of values (S,); minus infinity if there are none."""
     return float(np.median(values)) if len(values) else -np.inf

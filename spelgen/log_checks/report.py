@@ -22,8 +22,8 @@ MEASURES = {"q": "position", "qd": "velocity", "tau": "torque", "u": "position"}
 class GravityFit:
     """Contribution of gravity to the torque of one joint.
 
-    Friction and the inertia torque of the joint's own acceleration are first removed from the torque and from the
-    gravity torque by least squares.
+    Friction, and the inertia torque of the joint's own acceleration, are first removed by least squares from the torque
+    and from the gravity torque of the URDF.
 
     Attributes:
         explained: fraction (0 to 1) of the torque's variance that gravity explains, for the best inertial parameters;
@@ -31,7 +31,7 @@ class GravityFit:
         factor: least-squares ratio of the torque to the gravity torque of the URDF.
         correlation: correlation of the torque with the gravity torque of the URDF.
         relative_deviation: standard deviation of the URDF's gravity torque, divided by the standard deviation of the
-            torque, both before the removal.
+            torque, both before friction and inertia are removed.
     """
 
     explained: float | None = None
@@ -59,9 +59,9 @@ class JointFollowing:
 
 @dataclass(frozen=True)
 class JointReport:
-    """Statistics of one joint over all trajectories, in SI units; unknown ones are None.
+    """Statistics of one joint over all trajectories, in SI units; unknown statistics are None.
 
-    The dicts have the keys "q", "qd" and "tau" or, for logs of commands, "q", "qd" and "u".
+    The dicts have one value per signal, with the keys "q", "qd" and "tau" or, for logs of commands, "q", "qd" and "u".
 
     Attributes:
         name: name of the joint.
@@ -72,8 +72,8 @@ class JointReport:
         steps: quantisation step of each signal; None for signals that are not quantised in most trajectories.
         velocity_factor: ratio of dq/dt to qd, by least squares.
         velocity_correlation: correlation of dq/dt and qd.
-        gravity: contribution of gravity to the torque.
-        following: tracking of the command of a joint under a position servo.
+        gravity: correlation and ratio of the torque and the URDF's gravity torque.
+        following: lag and errors with which the position tracks the command; None for logs of torques.
     """
 
     name: str
@@ -89,7 +89,7 @@ class JointReport:
     following: JointFollowing | None = None
 
     def largest(self, quantity: str) -> float:
-        """Return the largest magnitude of the signal "q", "qd", "tau" or "u"."""
+        """Return the largest magnitude of a signal of the joint, "q", "qd", "tau" or "u", in all logs."""
         return max(abs(self.low[quantity]), abs(self.high[quantity]))
 
 
@@ -104,7 +104,7 @@ class LogReport:
         tables: tables of the joints, for display.
         findings: remarks and warnings.
         errors: reasons why the logs cannot be trained on.
-        examples: up to two trajectories that the page plots.
+        examples: up to two trajectories, which the HTML page of the report plots.
     """
 
     robot: str
@@ -117,26 +117,26 @@ class LogReport:
 
     @property
     def files(self) -> int:
-        """Number of files from which the trajectories were read."""
+        """Number of files from which the logs were read."""
         return len({clock.file for clock in self.trajectories} - {None})
 
     @property
     def samples(self) -> int:
-        """Number of samples of all trajectories."""
+        """Number of samples of all logs."""
         return sum(clock.samples for clock in self.trajectories)
 
     @property
     def duration(self) -> float:
-        """Duration of all trajectories [s]."""
+        """Duration of all logs [s]."""
         return sum(clock.duration for clock in self.trajectories)
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """The warnings among the findings."""
+        """The findings that are warnings, without the remarks."""
         return tuple(x for x in self.findings if x.severity == "warning")
 
     def to_dict(self) -> dict[str, object]:
-        """Return the report in JSON form; `schema` is the version of the form."""
+        """Return the report in JSON form for other programs; `schema` is the version of the form."""
         return {
             "schema": 3,
             "robot": self.robot,
@@ -150,7 +150,7 @@ class LogReport:
         }
 
     def heading(self) -> str:
-        """Return one line with the numbers of files, trajectories and samples, and the duration."""
+        """Return one line about the logs: the numbers of files, trajectories and samples, and the duration."""
         files = ""
         if self.files:
             files = f" in {counted(self.files, 'file')}"
@@ -160,15 +160,15 @@ class LogReport:
         )
 
     def listings(self, limit: int | None = None) -> list[Listing]:
-        """Return all tables; the table of sample times contains at most `limit` trajectories."""
+        """Return all tables of the report; the table of sample times contains at most `limit` trajectories."""
         return [_clock_table(self.trajectories, limit), *self.tables]
 
     def _short_listings(self) -> list[Listing]:
-        # at most 20 trajectories: a data set of a thousand episodes would fill the terminal
+        # the table has at most 20 trajectories: a data set of a thousand episodes would fill the terminal
         return self.listings(20)
 
     def text(self) -> str:
-        """Return the report for a terminal, in 80 columns, without the errors."""
+        """Return the report on logs for a terminal, in 80 columns, without the errors."""
         paragraphs = [self.heading(), *map(Listing.text, self._short_listings())]
         wrapped = partial(textwrap.fill, width=WIDTH, initial_indent="  ", subsequent_indent="    ")
         findings = list(map(wrapped, map(str, self.findings)))
@@ -195,21 +195,22 @@ class LogReport:
 def joint_report(
     index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Return the report of the joint with this index, without gravity and tracking.
+    """Return the statistics of the joint number `index` over all trajectories, without gravity and tracking.
 
-    measured: statistics of all trajectories. products: (2n, 2n) Gram matrix of the increments of the
-    integrals of qd and of q, summed over all trajectories, see `velocity_products`.
+    measured: statistics of each trajectory. products: (2n, 2n) sum of the results of `velocity_products` for all
+    trajectories, from which qd is compared with dq/dt.
     """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
         low[name], high[name] = float(lows.min()), float(highs.max())
-        # medians over trajectories, so that one trajectory with contacts does not determine the noise
+        # noise and steps are medians over trajectories, so that one trajectory with contacts does not determine the
+        # noise
         noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
     factors, correlations = velocity_agreement(products)
     factor, correlation = factors[index], correlations[index, index]
     visited = None
-    # the range is undefined for a URDF with equal or swapped limits
+    # the visited fraction of the range is undefined for a URDF with equal or swapped limits
     if coordinate.limits is not None and coordinate.limits[0] < coordinate.limits[1]:
         visited = (high["q"] - low["q"]) / (coordinate.limits[1] - coordinate.limits[0])
     return JointReport(
@@ -226,7 +227,10 @@ def joint_report(
 
 
 def _median(values: np.ndarray, share: float) -> float | None:
-    """Return the median of the finite values; None if the fraction of finite values is at most `share`."""
+    """Return the median of the finite values of a statistic, one per trajectory.
+
+    None is returned if the fraction of finite values is at most `share`.
+    """
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) > share * len(values) else None
 
@@ -246,7 +250,7 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
 
 
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
-    """Return two tables of the joints: ranges of these quantities, and their noise and quantisation steps.
+    """Return two tables of the joints: the ranges of the signals `quantities`, and their noise and quantisation steps.
 
     The first quantity must be "q".
     """
@@ -274,5 +278,5 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
 
 
 def percent(fraction: float | None, digits: int = 0) -> str:
-    """Return the text of a fraction in percent with this number of decimals; a dash for None."""
+    """Return a fraction as text in percent, with `digits` decimals; a dash for None."""
     return "-" if fraction is None else f"{fraction:.{digits}%}"

@@ -33,10 +33,12 @@ class RobotCheckTuning:
     # [1] The torque contains gravity if its correlation with the URDF's gravity torque is above this number, and does
     # not if the magnitude of the correlation is below 1 minus this number. In between nothing is concluded.
     seen: float = 0.7
-    # [1] Gravity is visible if its standard deviation is at least this fraction of the torque's, in logs of a UR10e.
+    # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
+    # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [1] Gravity of the URDF shows the unit of a joint's torque if it varies by this fraction of the variation at the
-    # joint with the largest gravity. A payload may multiply the gravity of a joint with less, such as a wrist.
+    # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
+    # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
+    # multiply the gravity torque.
     loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
@@ -47,13 +49,16 @@ TUNING = RobotCheckTuning()
 
 
 def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
-    """Return the fit of the gravity torque of the URDF to the torque of each joint in samples of motion."""
-    # with fewer than 100 samples gravity and friction are confounded
+    """Return the fit of the gravity torque of the URDF to the logged torque, for each joint of the arm.
+
+    The fit shows whether the torques contain gravity, and in which unit they are. motion: samples with torques.
+    """
+    # at least 100 samples are required: with fewer samples gravity and friction are confounded
     q, qd, qdd = motion.motion
     if len(q) < 100:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
-    rows = regressor(arm, q, still, still)  # (S, n, 10 B) for S samples and B bodies
+    rows = regressor(arm, q, still, still)  # rows: (S, n, 10 B) for S samples and B bodies
     load = rows @ urdf_parameters(arm)
     # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
     friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), qdd], axis=2)
@@ -65,18 +70,18 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
 
 
 def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
-    """Return the fit of gravity to the torque of one joint.
+    """Return the fit of gravity to the torque of one joint in S samples.
 
-    signals: (S, 2 + K) for S samples, the torque, the gravity torque of the URDF, and the K regressor columns of
-    gravity. friction: (S, F) columns of friction and inertia, which are removed from the signals by projection.
+    signals: (S, 2 + K): the torque, the gravity torque of the URDF, and the K regressor columns of gravity. friction:
+    (S, F) columns of friction and inertia, which are removed from the signals by projection.
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # signals that consist of rounding errors after the projection, e.g. a constant torque
+    # `is_rounding`: signals that consist of rounding errors after the projection, e.g. a constant torque
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
-    # gravity cannot be fitted to a constant torque, as of a motor that is off, and does not load a vertical axis
+    # No fit is possible if the torque is constant, as of a motor that is off, or if gravity never loads the joint.
     if is_rounding[0] or not is_seen.any():
         return GravityFit()
     torque, load = remainders[:, 0], remainders[:, 1]
@@ -91,7 +96,7 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the residual of values after projection onto the span of the columns.
+    """Return the residual of signals `values` after projection onto the span of `columns` (least squares).
 
     columns: (S, C) for S samples. values: (S,) or (S, K).
     """
@@ -100,7 +105,7 @@ def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 class JointEvidence(NamedTuple):
-    """Joint of the URDF and its report over all trajectories, which the checks against the robot compare.
+    """A joint of the URDF and its statistics over all trajectories: the input of each check in `CHECKS`.
 
     offset: offset of the logged position in the mapping [rad, m].
     """
@@ -110,7 +115,7 @@ class JointEvidence(NamedTuple):
     offset: float = 0.0
 
     def limits(self) -> tuple[float, float]:
-        """Return the lower and the upper position limit [rad, m]; infinite for a joint without this limit."""
+        """Return the lower and upper position limit [rad, m]; infinity for a limit that does not exist."""
         lower, upper = self.coordinate.lower, self.coordinate.upper
         if self.coordinate.continuous:
             lower = upper = None
@@ -118,7 +123,10 @@ class JointEvidence(NamedTuple):
 
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
-    """Return a message about measured or commanded positions beyond the position limits; None if there are none."""
+    """Return a message about measured or commanded positions beyond the position limits; None if there are none.
+
+    If all positions are within the limits after a shift by one revolution, the message names the setting for it.
+    """
     findings = []
     (lower, upper), unit = joint.limits(), UNITS[joint.coordinate.joint_type].position
     lower, upper = lower - TUNING.limit_rounding, upper + TUNING.limit_rounding
@@ -133,7 +141,8 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
         if high > upper:
             findings.append(f"{name} up to {high:.4g} {unit}, the limit is {joint.limits()[1]:z.4g}")
     is_limited = joint.coordinate.joint_type == "revolute" and upper - lower < 2 * pi
-    # drivers that log 0 to 360 degrees are a turn above the negative half of a joint's range
+    # Shifts by one revolution are tried: drivers that log 0 to 360 degrees are a turn above the negative half of the
+    # range.
     for shift in (-2 * pi, 2 * pi) if findings and is_limited else ():
         if all(lower <= low + shift and high + shift <= upper for low, high in ranges.values()):
             offset = plain_number(joint.offset + shift, 8)
@@ -143,11 +152,11 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
 
 
 def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
-    """Find values of a signal, "qd" or "tau", whose magnitude exceeds the joint's limit, "velocity" or "effort"."""
+    """Return a message if a signal, "qd" or "tau", exceeds the joint's limit, "velocity" or "effort"; else None."""
     limits = {"velocity": joint.coordinate.velocity, "effort": joint.coordinate.effort}
     bound, unit = limits[limit], asdict(UNITS[joint.coordinate.joint_type])[MEASURES[quantity]]
     largest = joint.report.largest(quantity)
-    # a tolerance of 1 % for noise at the limit
+    # a limit may be exceeded by 1 %, due to noise
     if not bound or largest <= bound * 1.01:
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
@@ -156,18 +165,23 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 def torque_factors(
     joints: Sequence[JointEvidence], undeclared: Sequence[bool], loaded: Sequence[bool] | np.ndarray
 ) -> list[np.ndarray]:
-    """Return candidates for factors (n,) that convert torques in a wrong unit, from the gravity that they contain.
+    """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
-    A factor is negative if the torques have the opposite sense as well. There is one candidate for each joint whose
-    torques differ from the URDF's gravity by more than a factor of five, which wrong inertials do not explain, and one
-    with the same factor for all joints if their median differs as much. undeclared: (n,) True for joints whose torque
-    has no unit in the mapping. loaded: (n,) True for joints that gravity loads enough.
+    Let r be the gravity in a joint's logged torques divided by the gravity torque of the URDF; r is negative if the
+    torques have the opposite sense. If |r| is above five or below a fifth, wrong inertials do not explain it. For each
+    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the median
+    of r over the joints is above five or below a fifth, there is also a candidate with 1 / median for all joints.
+
+    Args:
+        joints: the joints with their fits of gravity.
+        undeclared: (n,) True for joints whose torque has no unit in the mapping.
+        loaded: (n,) True for joints that gravity loads enough.
     """
     seen: list[float] = []
     factors = []
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, abs(joint.report.gravity.correlation or 0.0)
-        # for a joint with little gravity the ratio is known only if the torque is nearly proportional to gravity
+        # The ratio of a joint with little gravity is known only if its torque is nearly proportional to gravity.
         share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
         is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k] and loaded[k]):
@@ -184,19 +198,21 @@ def torque_factors(
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Find torques that exceed the joint's effort limit by a factor that no drive and no unit explains."""
+    """Return a message if torques exceed the joint's effort limit 20 times, so that their unit is wrong; else None."""
     # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
-    # 20 times: torques in mNm are 1000 times as large as in Nm, and no drive exceeds its limit by such a factor
+    # The bound is 20 times the limit: torques in mNm are 1000 times as large as in Nm, and no drive gives 20 times its
+    # limit.
     if not 0 < 20.0 * limit < largest:
         return None
     return f"up to {largest:.4g}, {largest / limit:.3g} times what the drive can give"
 
 
 def find_coarse(joint: JointEvidence) -> str | None:
-    """Find signals whose quantisation step is a large fraction of the range of the signal."""
+    """Return a message if the quantisation step of a signal is a large fraction of its range; else None."""
     for name in QUANTITIES:
-        # compared with the range: a step of 0.01 Nm is negligible for a shoulder but may be the whole torque of a wrist
+        # A step is compared with the range: 0.01 Nm are negligible for a shoulder, but may be the whole torque of a
+        # wrist.
         step, width = joint.report.steps[name], joint.report.high[name] - joint.report.low[name]
         if step is not None and has_few_levels(step, width):
             return (
@@ -207,10 +223,13 @@ def find_coarse(joint: JointEvidence) -> str | None:
 
 
 def find_one_way(joint: JointEvidence) -> str | None:
-    """Find joints that move in one direction only: dry friction is then confounded with the load of the joint."""
+    """Return a message if the joint moves in one direction only; else None.
+
+    Dry friction is then confounded with the load of the joint.
+    """
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    # Velocities of the rarer sign may be noise if they are below a tenth of the others. A velocity that is not dq/dt
-    # does not show the direction of motion.
+    # Velocities of the rarer sign may be noise if they are below a tenth of the velocities of the other sign. A logged
+    # velocity that does not agree with dq/dt does not show the direction of motion.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     unit = UNITS[joint.coordinate.joint_type].velocity
@@ -220,7 +239,7 @@ def find_one_way(joint: JointEvidence) -> str | None:
     )
 
 
-# checks that need no torques, and therefore also apply to arms under position servos
+# `POSITION_CHECKS` need no torques, and therefore also apply to arms under position servos
 POSITION_CHECKS = [Check("beyond-position-limit", "warning", find_beyond_limits)]
 CHECKS: list[Check[JointEvidence]] = [
     Check("torque-beyond-drive", "error", find_beyond_drive, expected="Nm or N at the joint", do=SAY_UNIT),

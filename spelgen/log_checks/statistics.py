@@ -48,8 +48,8 @@ class Statistics(NamedTuple):
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
-    """Return the statistics of one trajectory."""
-    # at low sample rates the third differences, from which the noise is estimated, also contain the motion
+    """Return the statistics of one trajectory: its sample times, and the range, noise and steps of its signals."""
+    # Noise is estimated only for dense samples: at low sample rates the third differences also contain the motion.
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     signals = {}
     for name in trajectory.quantities:
@@ -79,26 +79,28 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     steps. They are normalised, so that white noise has the same standard deviation in them as in the signal. The median
     of their magnitudes is robust against outliers.
     """
-    times = sliding_window_view(t, 4)  # (T - 3, 4)
+    times = sliding_window_view(t, 4)  # times: (T - 3, 4), the times of each four successive samples
     distances = times[:, :, None] - times[:, None, :] + np.eye(4)
     weights = 1.0 / distances.prod(axis=2)
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     differences = np.einsum("tk,tnk->tn", weights, sliding_window_view(values, 4, axis=0))
-    # the median of |x| is 0.6745 standard deviations for a normally distributed x
+    # For normally distributed noise, the median of the magnitudes is 0.6745 standard deviations.
     return np.asarray(np.median(np.abs(differences), axis=0) / 0.6745)
 
 
 def quantisation_step(values: np.ndarray) -> float:
     """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
-    # a level is on the grid if it deviates by less than 5 % of a step; 5 % of the levels may be off the grid
+    # A difference of two levels counts as a multiple of the step if its distance from the nearest multiple is less than
+    # 5 % of a step. At least 95 % of the differences must be multiples. `tolerance` is the 5 % of both bounds.
     tolerance = 0.05
-    # two or three levels do not determine a grid
+    # Two or three levels are multiples of some step by chance.
     if len(differences) < 3:
         return float("nan")
     smallest = np.quantile(differences, tolerance)
     step = float(np.median(differences[differences <= 1.5 * smallest]))
-    # larger differences are ignored: over a hundred levels the error of the step accumulates to a fraction of a step
+    # `near`: differences below 100 steps, divided by the step. In larger differences, the error of the estimated step
+    # is multiplied by more than 100 and may reach a considerable fraction of a step.
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance

@@ -15,7 +15,7 @@ GivenMapping = LogMapping | Mapping[str, object] | Path | str | None
 
 @runtime_checkable
 class JointNames(Protocol):
-    """Object that has the names and types of a log's joints: an arm or a trained model.
+    """Protocol of an object with the names and types of a log's joints: an arm or a trained model.
 
     joint_types: "revolute" or "prismatic" for each joint.
     """
@@ -28,7 +28,7 @@ class JointNames(Protocol):
 
 @runtime_checkable
 class DescribedArm(Protocol):
-    """Loaded arm whose settings contain the column mapping of its logs.
+    """Protocol of a loaded arm (see `load_arm`), whose settings contain the column mapping of its logs.
 
     turning_joints: names of the revolute joints without position limits.
     """
@@ -45,7 +45,7 @@ class DescribedArm(Protocol):
 
 @runtime_checkable
 class DrivenModel(Protocol):
-    """Model that states which input drives its joints: "torque" or "position"."""
+    """Protocol of a model that states which input drives its joints: "torque", or "position" for servos."""
 
     @property
     def input_quantity(self) -> str: ...
@@ -95,7 +95,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
 
     stated: mapping in the arm's settings, which applies to all keys that the dict or the file does not contain.
     """
-    # A LogMapping is complete and replaces the mapping of the settings. A file or a dict overrides single keys.
+    # A LogMapping replaces the mapping in the settings completely. A file or a dict overrides single keys of it.
     if isinstance(mapping, LogMapping):
         return mapping
     if isinstance(mapping, str | Path):
@@ -110,7 +110,7 @@ def _mapping(mapping: GivenMapping, joints: Sequence[str], stated: LogMapping | 
 
 
 def _merged(stated: object, override: object) -> object:
-    """Return the union of two nested dicts; a key in both dicts has the value of `override`."""
+    """Return the union of two nested dicts of settings; a key in both dicts has the value of `override`."""
     if isinstance(stated, Mapping) and isinstance(override, Mapping):
         return {**stated, **{key: _merged(stated.get(key), value) for key, value in override.items()}}
     return override

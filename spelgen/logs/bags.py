@@ -23,10 +23,10 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # [B] memory that the reader may use in addition to 20 times the bag's size
+MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times its size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
-SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of MCAP
+SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of records in an MCAP file
 
 RawState = tuple[str, int, bytes]
 """Topic, time [ns] of the recorder, and encoded joint state."""
@@ -60,14 +60,14 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     messages = _of_one_arm(list(_messages(path, mapping.topic, remarks)), names, path, remarks)
     stamped = [message for message in messages if message.stamp]
     times = np.array([message.stamp for message in stamped])
-    # The clocks of publisher and recorder may differ by hours and are never mixed.
+    # The clocks of publisher (stamps) and recorder may differ by hours: times are all from one of the two clocks.
     if not stamped:
         remarks.append("no message has a stamp: times are those at which the recorder received them")
         stamped, times = messages, np.array([message.recorded for message in messages])
     elif len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
     columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, names)
-    # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply
+    # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply to bags.
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
     return [LogTable.of(pa.table(columns), mapping, remarks=tuple(remarks))]
@@ -76,11 +76,11 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def _of_one_arm(
     messages: Sequence[StampedState], names: Sequence[str], path: Path, remarks: list[str]
 ) -> list[StampedState]:
-    """Return the messages that contain any of the joints `names`.
+    """Return the messages of a bag that contain any of the arm's joints `names`.
 
     A message may contain only some of the joints, and joints may be on several topics. If most of the messages contain
     all joints, the others are omitted. Raises LogError if several topics contain the same joint, or if a joint is in no
-    message.
+    message. remarks: list to which a remark on omitted messages is added.
     """
     arm = set(names)
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
@@ -112,7 +112,7 @@ def _of_one_arm(
 def _joint_states(
     path: Path, messages: Sequence[StampedState], names: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """Return the columns `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names`, each (T,).
+    """Return the columns `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names` from T messages, each (T,).
 
     Fields that are empty in all messages are omitted; values of joints that a message does not contain are NaN.
     """
@@ -125,7 +125,7 @@ def _joint_states(
             if len(array) not in (0, len(state.name)):
                 got, element = f"{len(array)} values for {len(state.name)} joints", f"message {row + 1}"
                 raise LogError(got, file=path, element=f"{element}, {field}", expected="one of each")
-            # ROS allows empty fields in a joint state, such as a missing effort
+            # Empty fields of a joint state are skipped: ROS allows them, for example without efforts.
             if len(array):
                 values[logged, row] = array[indices]
     columns: dict[str, np.ndarray] = {}
@@ -137,7 +137,7 @@ def _joint_states(
 
 
 def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
-    """Return the advice to map joint names to names in the log.
+    """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
     the settings that map the names if every joint name is the end of exactly one logged name ("j1" and "left_j1").
@@ -149,9 +149,10 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
-    """Yield the joint states on `topic`, or on all topics if it is None.
+    """Yield the decoded joint states in a bag: on `topic`, or on all topics if it is None.
 
     Messages are decoded with the published definition of `JointState`; message definitions in the bag are ignored.
+    remarks: list to which a remark on a recorder that was killed is added.
     """
     try:
         from rosbags.rosbag1 import Reader as Ros1Reader
@@ -163,7 +164,8 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     size = path.stat().st_size
     for file in path.rglob("*"):
         if not file.is_dir():
-            # a pipe in the folder would block, since rosbags opens all files of the folder
+            # A pipe in the folder of a bag is an error: rosbags opens all files of the folder, and reading a pipe may
+            # not end.
             require_regular_file(file, LogError, "files in the folder of a ROS 2 bag")
             size += file.stat().st_size
     is_ros1 = path.suffix == ROS1
@@ -190,14 +192,14 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
             )
     except (LogError, GeneratorExit):
         raise
-    except Exception as error:  # rosbags and its decompressors raise exceptions of many types
+    except Exception as error:  # rosbags raises exceptions of many types: all are caught
         do = "a recording that was not closed may be repaired by `ros2 bag reindex` or `rosbag reindex`"
         got = f"an unreadable ROS bag ({in_one_line(error).rstrip('.')})"
         raise LogError(got, file=path, do=None if isinstance(error, MemoryError) else do) from error
 
 
 def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics, read with `rosbags`. Raises LogError for a bag without any."""
+    """Yield the encoded joint states on all topics of a bag, read with `rosbags`. Raises LogError if there are none."""
     with open_bag(path) as reader:
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
         if not connections:
@@ -209,7 +211,7 @@ def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """Return all MCAP files of a bag if one of them lacks its end; return [] if all are complete."""
+    """Return all MCAP files of a bag if one of them lacks its end (the recorder was killed); [] if all are complete."""
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as source:
@@ -221,7 +223,10 @@ def _unfinished(path: Path) -> list[Path]:
 
 
 def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics from MCAP files without an end."""
+    """Yield the encoded joint states on all topics of MCAP files whose recorder was killed, and add a remark about it.
+
+    path: path of the bag, for errors. Raises LogError if there are no joint states.
+    """
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
         got = "a recording that was not closed, without a complete message of joint states"
@@ -231,7 +236,7 @@ def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Itera
 
 
 def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
-    """Yield topic, recorder's time [ns] and encoded content of all complete messages of a type in an MCAP file."""
+    """Yield topic, recorder's time [ns] and encoded content of each complete message of a type in an MCAP file."""
     types: dict[int, str] = {}
     topics: dict[int, str] = {}
     for code, body in _records(path.read_bytes()[len(MAGIC) :]):
@@ -248,13 +253,13 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
 
 
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield operation code and body of all complete records of an MCAP file, including the records within chunks."""
+    """Yield operation code and body of each complete record in the bytes of an MCAP file, also of records in chunks."""
     start = 0
     while start + 9 <= len(data):
         code, length = struct.unpack_from("<BQ", data, start)
         body = data[start + 9 : start + 9 + length]
         start += 9 + length
-        # the last chunk of an interrupted recording is incomplete, but begins with complete records
+        # The last chunk of an interrupted recording is read, too: it is incomplete, but begins with complete records.
         if code == CHUNK:
             yield from _records(_unpacked(body))
         elif len(body) == length:
@@ -262,7 +267,7 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpacked(chunk: bytes) -> bytes:
-    """Return the decompressed records of a chunk of an MCAP file.
+    """Return the decompressed bytes of a chunk of an MCAP file: a sequence of records.
 
     If the chunk is incomplete, the part that can be decompressed is returned.
     """
@@ -283,6 +288,6 @@ def _unpacked(chunk: bytes) -> bytes:
 
 
 def _text(data: bytes, start: int) -> str:
-    """Return the text at the offset `start`; MCAP stores a text as its length (4 bytes) and its characters."""
+    """Return the text at the offset `start` of a record; MCAP stores a text as its length (4 bytes) and characters."""
     (length,) = struct.unpack_from("<I", data, start)
     return data[start + 4 : start + 4 + length].decode()

@@ -70,13 +70,13 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# Check of a trajectory or of a joint: `LogChecks` collects the findings of both in one dict.
+# A check of a trajectory or of a joint; `LogChecks` collects the findings of both in one dict.
 AnyCheck = Check[Any]
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of checks: errors, which prevent training, and notes, which do not."""
+    """Findings of checks of logs: errors, which prevent training, and notes, which do not."""
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
@@ -91,8 +91,9 @@ class Findings:
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
-        keys: settings of the group `logs` that correct the fault. A fault with such a correction is always an error, so
-        that no model is trained on the log without the correction.
+        where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
+        `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
+        the log without the correction.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
@@ -104,7 +105,10 @@ class Findings:
 def run_checks(
     checks: Iterable[Check[Subject]], subject: Subject, accepted: Collection[str] = ()
 ) -> list[tuple[Check[Subject], Advice]]:
-    """Return (check, finding) for each check that finds a fault of `subject`. accepted: codes of checks to omit."""
+    """Return (check, finding) for each check that finds a fault of `subject`, a trajectory or the signals of a joint.
+
+    accepted: codes of checks to omit.
+    """
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
         # A check is omitted if the finding of another check explains the fault: velocities in degrees, for example, are
@@ -120,7 +124,7 @@ def run_checks(
 def find_no_torques(signals: JointSignals) -> str | None:
     """Return a message if the torques of all joints are 0 throughout a trajectory in which the arm moves."""
     trajectory = signals.trajectory
-    # The fault concerns all joints, so it is reported only for joint 0.
+    # Torques that are all 0 are a fault of all joints, which is reported only once, for joint 0.
     if signals.number or not trajectory.tau.size or trajectory.tau.any() or not np.ptp(trajectory.q):
         return None
     return "torques that are all 0 while the arm moves"
@@ -155,7 +159,7 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     Return None for logs of position commands, whose fits do not need accelerations.
     """
     rate = trajectory.sample_rate
-    # below 2 Hz the times are in another unit, which another check reports
+    # Below 2 Hz the times are probably in another unit, which the check of times reports.
     if trajectory.u is not None or rate * SIGNALS.slowest_step < 1 or is_dense(rate):
         return None
     use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
@@ -168,12 +172,13 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# These two are registered only for their code and severity: the reader of a log provides the messages, about changed
-# rows (REPAIRED) and about properties of the file (REMARKED).
+# REPAIRED and REMARKED find nothing and only have a code and a severity: the messages, about changed rows (REPAIRED) or
+# properties of the file (REMARKED), are from the reader of the log.
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # undecoded words of velocities differ from dq/dt, as if positions were frozen
+    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, as if
+    # positions were frozen.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -241,7 +246,7 @@ class LogChecks:
         self._count = 0
 
     def add(self, trajectory: Trajectory) -> None:
-        """Apply all checks to a trajectory, and add the findings."""
+        """Apply all checks that need no robot to a trajectory, and collect the findings."""
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
@@ -288,10 +293,12 @@ class LogChecks:
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
-        """Return the settings of the group `logs` that correct a fault; entries: settings of each faulty joint.
+        """Return the settings of the group `logs` that correct one fault of several joints.
 
         If most joints of the same type (revolute or prismatic) need the same units, the units are also set for the
         other joints of this type, unless the motion of a joint contradicts them.
+
+        entries: settings that correct each faulty joint, by its name.
         """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))
@@ -308,7 +315,7 @@ class LogChecks:
 def check(
     trajectories: Iterable[Trajectory], joints: Sequence[str], joint_types: Sequence[str]
 ) -> list[Diagnostic]:
-    """Return the notes of the checks of logs that need no robot; the logs are not changed.
+    """Apply the checks of logs that need no robot, and return their notes; the logs are not changed.
 
     Raises LogError with all findings of severity "error", e.g. positions in degrees without a declared unit, or a
     velocity that is constant while the position changes.

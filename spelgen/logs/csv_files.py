@@ -18,9 +18,10 @@ from spelgen.logs.tables import LogTable
 from spelgen.logs.values import is_number, stamps
 from spelgen.settings.log_mapping import PLAIN, LogMapping
 
-# first columns that `ros2 topic echo --csv` writes: the header of the message
+# First columns of a file that `ros2 topic echo --csv` writes: the fields of the message header.
 STAMP = ("sec", "nanosec", "frame_id")
-# Beginning of a comment; "%time" is a name that `rostopic echo -p` writes.
+# Beginning of a comment line: "#" or "% ". A "%" without a blank is no comment: `rostopic echo -p` names a column
+# "%time".
 COMMENT = re.compile(r"^(#|% )\s*")
 
 
@@ -66,7 +67,7 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
         return "skip" if len(wrong) == 1 else "error"
 
     source, encoding = file, text.encoding
-    # Arrow does not join several spaces, which align columns, to one delimiter.
+    # Several spaces, which align columns, are replaced by one: Arrow does not treat them as one delimiter.
     if text.delimiter == " " and re.search("^ |  ", text.rows, re.MULTILINE):
         aligned = re.sub("^ +| +$| +(?= )", "", file.read_text(encoding), flags=re.MULTILINE)
         source, encoding = pa.BufferReader(aligned.encode()), "utf-8"
@@ -94,7 +95,7 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
 
 
 def _beginning(file: Path) -> Beginning:
-    """Return the beginning of a CSV file."""
+    """Return encoding, delimiter, column names and first rows of a CSV file, detected from its first 128 KiB."""
     encoding, head = _decoded_head(file)
     lines = head.lstrip("\ufeff").splitlines() or [""]
     delimiter, cells, width = _divided(lines)
@@ -107,8 +108,8 @@ def _beginning(file: Path) -> Beginning:
 
 
 def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
-    """Return the delimiter of the columns, the cells of each line, and the most frequent number of cells of a line."""
-    # Names of columns may contain spaces, and numbers decimal commas, so spaces and commas are tried last.
+    """Detect the delimiter of CSV lines. Return it, the cells of each line, and the most frequent number of cells."""
+    # Spaces and commas are tried last as delimiters: column names may contain spaces, and numbers decimal commas.
     for delimiter in "\t;|, ":
         cells = [_cells(COMMENT.sub("", line), delimiter) for line in lines]
         width = mode(map(len, cells[:-1] or cells))
@@ -120,8 +121,8 @@ def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
 def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int) -> int:
     """Return the index of the header, or of the first row of values in a file without a header.
 
-    The header is the first line with as many cells as most lines have (`width`), which is a comment only if values
-    follow it directly.
+    The header is the first line that has `width` cells, the number of cells of most lines, and is no comment. If this
+    line has values and a comment with `width` cells precedes it, the comment is the header.
     """
     # In rows that end with a delimiter, the last cell has no name.
     is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
@@ -132,10 +133,12 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
 
 
 def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int) -> tuple[list[str], int]:
-    """Return the names of the columns, and the index of the first row of values.
+    """Return the names of the columns of a CSV file, and the index of the first line of values.
 
     Between header and values there may be lines without digits, such as units, and repeats of the header. Names may be
     in two lines: the quantities, repeated or once for several joints, and below them the joints.
+
+    lines, cells: text and cells of each line. header: index of the header.
     """
     names, between = cells[header], header + 1
     is_repeated = len(set(names)) < len(names) - 1
@@ -154,16 +157,17 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 
 
 def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
-    """Return True for a line below the header without values: without digits, the header again, or without numbers.
+    """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    cells: the cells of the line if they may be names, which may contain digits; else None.
+    A line of names or units has no digits. cells: cells of the line if it may have names with digits, such as "joint1":
+    it has no values if none of its cells is a number. None: it has no such names.
     """
     is_name = cells is not None and not any(map(is_number, cells))
     return bool(line) and (line == header or is_name or not re.search(r"\d", line))
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    """Return the cells of a line, which may be in quotation marks; several spaces are one delimiter."""
+    """Return the cells of a CSV line, without their quotation marks; several spaces are one delimiter."""
     cells = line.split() if delimiter == " " else next(csv.reader([line], delimiter=delimiter), [])
     return [cell.strip() for cell in cells] or [""]
 
@@ -191,7 +195,7 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 
 def _decoded_head(file: Path) -> tuple[str, str]:
-    """Return the encoding and the first characters of a file."""
+    """Return the text encoding of a file (UTF-8, UTF-16 or Latin-1), and its first characters."""
     # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. The module
     # csv reads no larger cells.
     size = 2**17
@@ -200,7 +204,7 @@ def _decoded_head(file: Path) -> tuple[str, str]:
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
     try:
-        # the head may end in the middle of a UTF-8 character
+        # The head of the file may end in the middle of a UTF-8 character, which the incremental decoder omits.
         return "utf-8", codecs.getincrementaldecoder("utf-8")().decode(head, final=len(head) < size)
     except UnicodeDecodeError:
         return "latin-1", head.decode("latin-1")

@@ -13,7 +13,7 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SLOWEST, TUNING, shows_accelerations
 
-FREQUENCY = 100.0  # [Hz] common sample rate, twelve times the default cutoff of the low-pass filter
+FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default cutoff of the low-pass filter
 # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
 SHORTEST = 1.0
 NEEDED = f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least"
@@ -81,7 +81,7 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        # The arrays of a single piece are not copied, since they may be hours long.
+        # The arrays of a single gap-free piece are not copied, since they may be hours long.
         joined = columns[0]
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
@@ -102,9 +102,14 @@ def _columns(
 ) -> list[np.ndarray]:
     """Return the arrays of `DynamicsSamples` for one gap-free piece, at the samples at which a joint moves.
 
-    The arrays are q, qd, qdd and tau, (T, n). If `reach` is given, z (T, n, K) is added, and also the direction (T, n)
-    if `reach` contains a smoothing velocity. pauses: if True, samples at rest between the first and the last motion are
-    included. cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+    The arrays are q, qd, qdd and tau, (T, n), then z (T, n, K), if `reach` has bristles, and the direction (T, n), if
+    `reach` also has a smoothing velocity.
+
+    Args:
+        piece: gap-free piece of a log.
+        pauses: if True, samples at rest between the first and the last motion are included.
+        cutoff: cutoff of the low-pass filter [Hz]; None: no filter.
+        reach: break-away displacements of the friction bristles; None: z and direction are not computed.
     """
     rate, times, t = piece.sample_rate, piece.t, regular_times(piece.t, FREQUENCY)
     is_denser = rate > 1.5 * FREQUENCY
@@ -148,5 +153,5 @@ def _columns(
 
 
 def is_moving(qd: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of the samples at which any joint moves."""
+    """Return a mask (T,) of the samples at which any joint moves: a velocity in qd (T, n) exceeds 0.02 rad/s or m/s."""
     return np.asarray((np.abs(qd) > SAMPLES.moving).any(axis=1))

@@ -20,7 +20,8 @@ LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 _PYTHON = 'python -c "import {}"'
-# {suffix: command that makes a log of a file of this kind}; {0} is its path, {1} the path without the suffix.
+# {suffix of a file that is no log: command that converts the file to a log}; in the command, {0} is the path of the
+# file, and {1} the path without the suffix.
 CONVERT = {
     ".zstd": "zstd -d {0}", ".zst": "zstd -d {0}", ".gz": "gunzip {0}", ".xz": "unxz {0}", ".bz2": "bunzip2 {0}",
     **dict.fromkeys((".txt", ".dat", ".asc"), "mv {0} {1}.csv"),
@@ -37,7 +38,10 @@ CONVERT = {
 
 
 def _lazy(name: str) -> Callable[..., list[LogTable]]:
-    """Return a function of a file of this folder that is imported at the first call: most users have one format."""
+    """Return a function of this package by "module:function"; the module is imported only when the function is called.
+
+    Most users have logs in one format, and the reader of each format imports another library.
+    """
     return lambda *arguments: pkgutil.resolve_name(f"spelgen.logs.{name}")(*arguments)
 
 
@@ -60,7 +64,7 @@ def format_of(path: Path) -> LogFormat | None:
 
 
 def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> Iterator[tuple[Layout, pa.Table]]:
-    """Yield the tables of a log with their layouts, read by the reader of its format, one at a time.
+    """Yield the layout and the table of each recording of a log, one at a time, read by the reader of its format.
 
     path: file or folder, one of the results of `log_files`. Raises LogError for a damaged file and for missing columns.
     """
@@ -73,7 +77,7 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> Itera
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:
-    """Return the logs at these paths, each once, and one error for each path without a log.
+    """Return the log files and log folders at these paths, each once, and one error for each path without a log.
 
     role: "train" or "test". If a folder contains files named train.* or test.*, only the files named after the role
     are used. None: all logs of a folder are used.
@@ -92,9 +96,9 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
 
 
 def _conversion(path: Path) -> str | None:
-    """Return the advice to convert a file of a kind in CONVERT; None for other files."""
+    """Return the advice, for an error message, to convert a file by a command in CONVERT; None for other files."""
     command = CONVERT.get(path.suffix.lower())
-    # A path with spaces or quotation marks would be other arguments, or code, in a command that is copied to a shell.
+    # FILE replaces a path with spaces or quotation marks, which a shell would split into arguments or execute as code.
     plain = path if re.fullmatch(r"[\w./@+-]+", str(path)) else Path("FILE").with_suffix(path.suffix)
     return command and f"convert it: {command.format(plain, plain.with_suffix(''))}"
 
@@ -113,7 +117,7 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     if not logs:
         packed = next(filter(None, map(_conversion, sorted(path.iterdir()))), None)
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
-    # all logs are used if no file of the folder is named train.* or test.*
+    # All logs of a folder are used if no file of the folder is named train.* or test.*.
     selected = [log for log in logs if log.stem == role]
     if selected or role is None or {"train", "test"}.isdisjoint(log.stem for log in logs):
         return selected or logs

@@ -21,7 +21,7 @@ from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
 
 class Advice(NamedTuple):
-    """Finding of a check, with the settings that correct the log.
+    """Finding of a check of logs, with the settings of the column mapping that correct the log.
 
     Attributes:
         message: the finding.
@@ -35,18 +35,18 @@ class Advice(NamedTuple):
 
 
 def settings_line(keys: Mapping[str, object]) -> str:
-    """Return settings as one line of YAML, without the outer braces."""
+    """Return settings as one line of YAML without the outer braces, for a message."""
     text: str = yaml.safe_dump(dict(keys), default_flow_style=True, sort_keys=False, width=float("inf"))
     return text.strip()[1:-1]
 
 
 def mapping_line(keys: Mapping[str, object]) -> str:
-    """Return the advice to write these settings into the group `logs`."""
+    """Return the advice, for a message, to write these settings into the group `logs` of the settings file."""
     return f"write '{settings_line(keys)}' under 'logs' in the robot's YAML"
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the content of the group `logs` that contains the given settings of single joints.
+    """Return the content of the settings group `logs` that contains the given settings of single joints.
 
     If all joints have the same units and no other settings, the units are set once for the whole log. entries: settings
     of each joint, by its name. joints: names of all joints.
@@ -58,7 +58,7 @@ def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str
 
 
 def plain_number(value: float, digits: int = 5) -> float:
-    """Return a number rounded to significant digits, as an int if the result is whole."""
+    """Return a number rounded to `digits` significant digits, as an int if the result is whole, for a settings file."""
     rounded = float(f"{value:.{digits}g}")
     return int(rounded) if rounded.is_integer() else rounded
 
@@ -104,7 +104,7 @@ class JointSignals(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """True if all positions are whole numbers."""
+        """True if all positions of the joint are whole numbers, as counts of an encoder are."""
         return bool((self.q == self.q.round()).all())
 
     @property
@@ -132,7 +132,7 @@ class JointSignals(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """Ratio of dq/dt to qd; NaN for a joint at rest."""
+        """Ratio of dq/dt to qd of this joint, 1 for correct units; NaN for a joint at rest."""
         return float(self.factors[self.number])
 
     @property
@@ -142,25 +142,26 @@ class JointSignals(NamedTuple):
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a measured factor `value` equals the conversion factor `unit` within 25 %."""
-    # Noisy velocities make the measured factor inexact. Conversion factors of different units differ by more than 25 %.
+    """Return True if a measured ratio of dq/dt to qd equals the conversion factor `unit` between units within 25 %."""
+    # Ratio of dq/dt to qd and conversion factor may differ by 25 %: noisy velocities make the ratio inexact, and
+    # conversion factors of different units differ by more than 25 %.
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if a signal is frozen while the joint moves: constant q, constant qd, or repeated old values."""
+    """Return a finding if a signal is frozen while the joint moves: constant q or qd, or repeated old values."""
     from scipy.integrate import cumulative_trapezoid
 
-    # [rad, m] A constant qd is frozen if q changes by more than `motion`. A constant q is frozen if the integral of qd
-    # changes by more than `motion`.
+    # `motion` [rad, m]: a constant qd is frozen if q changes by more than `motion`; a constant q is frozen if the
+    # integral of qd changes by more than `motion`.
     t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
     if np.ptp(qd) == 0 and np.ptp(q) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
-    # The integral of qd is tested and not qd itself: it averages the noise of qd about zero.
+    # A constant q is compared with the integral of qd and not with qd, because the integral averages the noise of qd.
     drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
-    # If another unit explains the difference of qd and dq/dt, the drift does not show that values are stale.
+    # Stale values are not searched if another unit explains the difference between qd and dq/dt.
     is_other_unit = signals.correlation > SIGNALS.agreement and not 0.25 < signals.factor < 4
     for name in signals.measured if "qd" in signals.measured and not is_other_unit else ():
         rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd))
@@ -172,7 +173,7 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
 
 
 def find_dropouts(signals: JointSignals) -> str | None:
-    """Return a message about the first measured signal that has lost samples or outliers; None if there is none."""
+    """Return a message about the first signal of the joint with lost samples or outliers; None if there is none."""
     for name in signals.measured:
         values = signals.signal(name)
         rows = np.flatnonzero(outlier_rows(name, values))
@@ -220,9 +221,10 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
     unit = mapping.unit(name, signals.joint)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
-        # Candidates for one revolution in the unit of the log: angles without a stated unit may be in degrees.
+        # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
         turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
-    # Lost samples and outliers are removed first, because their jumps have other causes than register words.
+    # Lost samples and outliers are removed before the search for register words, because their jumps have other causes
+    # than register words.
     values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
     for turn in turns:
         word = read_as_words((values - offset) / scale, turn)
@@ -234,7 +236,8 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
                 return None
-        # The line states the sign bits of the other signals too, so that it can replace the line in the mapping.
+        # The advised settings include the sign bits of the other signals, so that they can replace the line in the
+        # mapping.
         stated = {x: mapping.word("sign_bit", x, signals.joint) for x in signals.trajectory.quantities}
         words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
         keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
@@ -248,8 +251,8 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
         what = (
             "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
         )
-        # The first samples of a sign-magnitude word may be 0 like lost ones: jumps are counted between all samples that
-        # are no outliers of the decoded signal.
+        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
+        # words of a signal may be 0, and would be removed as lost samples.
         raw = (signals.signal(name) - offset) / scale
         decoded = signed(raw, word.value) if word.key == "sign_bit" else unwrapped(raw, word.value)
         count = jump_count(raw[~is_outlier(decoded, smooth=name == "q")], word.value)
@@ -261,29 +264,32 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
 def find_elastic(signals: JointSignals) -> str | None:
     """Return a message if the apparent inertia of the joint shows the resonance of an elastic gear or belt.
 
-    See the docstring of the module for the apparent inertia.
+    The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration; it depends
+    on frequency as H(f) in the docstring of this module.
     """
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
-    # Number of samples of a segment. Spectra of 2 s have a frequency resolution of 0.5 Hz.
+    # `length`: number of samples per spectrum. Spectra of 2 s have a frequency resolution of 0.5 Hz.
     length = round(2.0 * rate)
     is_long = shows_accelerations(rate) and len(piece) >= 4 * length
     if not (is_long and piece.tau.size and np.ptp(piece.tau[:, k])):
         return None
     frequency, inertia = _apparent_inertia(piece.qd[:, k], piece.tau[:, k], rate, length)
-    # fewer than five bands do not determine the two inertias and the resonance
+    # Fewer than five frequency bands do not determine the two inertias (motor, link) and the resonance.
     if len(frequency) < 5:
         return None
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    # a resonance at up to 1.5 times the highest excited frequency still changes the apparent inertia noticeably
+    # Candidates for the resonance: at up to 1.5 times the highest excited frequency, it still changes the apparent
+    # inertia noticeably.
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
         # H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance f_0 would otherwise
         # give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
-        # the resonance of a link with less than a tenth of the motor's inertia is not visible
+        # Solutions in which the link has less than a tenth of the motor's inertia are rejected: such a resonance is not
+        # visible.
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
     # A joint counts as elastic if the RMS error of the rigid model is at least 10 %, and the RMS error of the elastic
@@ -305,7 +311,7 @@ def find_elastic(signals: JointSignals) -> str | None:
 def _apparent_inertia(
     qd: np.ndarray, tau: np.ndarray, rate: float, length: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return frequencies (B,) [Hz] and apparent inertias (B,) [kg m^2, kg] of the coherent frequency bands.
+    """Return frequencies (B,) [Hz] and apparent inertias (B,) [kg m^2, kg] of the B coherent frequency bands.
 
     The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration. A band is
     coherent if its torque is nearly proportional to the acceleration.
@@ -316,7 +322,7 @@ def _apparent_inertia(
         rate: sample rate [Hz].
         length: number of samples of a segment of the averaged spectra; segments overlap by half.
     """
-    # [Hz] below 0.9 Hz gravity and friction dominate; links of arms have resonances between 3 and 30 Hz
+    # [Hz] Range of the spectra: below 0.9 Hz gravity and friction dominate; links of arms resonate at 3 to 30 Hz.
     lowest, highest = 0.9, 30.0
     frequency = np.fft.rfftfreq(length, 1 / rate)
     band = (frequency >= lowest) & (frequency <= min(highest, rate / 3))

@@ -17,12 +17,12 @@ FINEST_WORD = 4e-6
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
-    """Return the number of wraps of a signal (T,): steps whose magnitude exceeds half a period."""
+    """Return the number of wraps of a signal (T,): steps between samples whose magnitude exceeds half a period."""
     return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the signal (T,) with jumps of whole periods removed, starting at the unchanged first value."""
+    """Return a signal (T,) that wraps at a period without its jumps of whole periods; its first value is unchanged."""
     if not jump_count(values, period):
         return values
     turns = np.diff(values, prepend=values[:1]) / period
@@ -36,7 +36,7 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
 
 
 def centred(values: np.ndarray, period: float) -> np.ndarray:
-    """Return the signal (T,) shifted by whole periods, so that its median is at most half a period from 0."""
+    """Return a signal (T,) shifted by whole periods, so that its median is at most half a period from 0."""
     return np.asarray(values - period * np.round(np.median(values) / period))
 
 
@@ -50,27 +50,28 @@ def is_lost(values: np.ndarray) -> np.ndarray:
     lost = np.zeros(len(values), bool)
     logged = np.flatnonzero(values)
     if not logged.size or logged[-1] - logged[0] == len(logged) - 1:
-        return lost  # Zeros occur only at the ends of the signal, where the arm may have been at rest.
+        return lost  # Zeros only at the ends of a signal are not lost samples: the arm may have been at rest.
     steps = np.abs(np.diff(values[logged]))
-    # Zeros between samples close to 0 are not lost: a continuous signal may pass through 0.
+    # Zeros between samples close to 0 are not lost samples: a continuous signal may pass through 0.
     nearest = np.minimum(np.abs(values[logged[:-1]]), np.abs(values[logged[1:]]))
-    lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _usual(steps), np.diff(logged))
+    lost[logged[0] : logged[-1]] = np.repeat(nearest > TUNING.jump * _typical_step(steps), np.diff(logged))
     return np.asarray(lost & (values == 0))
 
 
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     """Return a mask (T,) of the samples that are lost or outliers.
 
-    An outlier is one of at most five samples between two opposite jumps. smooth: True for positions, which change
-    gradually. False for torques and velocities, which may have genuine steps: an outlier must also lie above or below
-    all other samples by more than half of their range.
+    An outlier is one of at most five samples between two opposite jumps. Torques and velocities may have genuine steps:
+    their outliers must also lie above or below all other samples by more than half of the range of these samples.
+
+    smooth: True for positions, which change gradually; False for torques and velocities.
     """
     outliers = is_lost(values)
     if len(values) < TUNING.jump_window:
         return outliers
     steps = np.diff(values)
     sizes = np.abs(steps)
-    largest_step = TUNING.jump * _usual(sizes)
+    largest_step = TUNING.jump * _typical_step(sizes)
     logged = np.flatnonzero(values)
     # Zeros at the beginning or end of positions are lost samples if the neighbouring position is far from 0. Torques
     # and velocities may be 0 there.
@@ -79,20 +80,20 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         outliers[:first] |= abs(values[first]) > largest_step
         outliers[last + 1 :] |= abs(values[last]) > largest_step
     is_jump = sizes > largest_step
-    # a signal in which more than 5 % of the steps are large is noisy: its large steps are no outliers
+    # A signal in which more than 5 % of the steps are jumps is noisy: it has no outliers except lost samples.
     if not is_jump.any() or is_jump.mean() > 0.05:
         return outliers
     rows = np.flatnonzero(is_jump)
     first, last, window = rows[0], rows[-1], TUNING.jump_window
-    # an outlier of one or two samples at an end of the recording has only one jump
+    # An outlier of one or two samples at an end of the recording has only one jump: the signal begins or ends with it.
     if first < 2 and sizes[first] > 4.0 * sizes[first + 1 : first + 1 + window].max():
         outliers[: first + 1] = True
     if last > len(sizes) - 3 and sizes[last] > 4.0 * sizes[last - window : last].max():
         outliers[last + 1 :] = True
     for first, second in pairwise(rows):
         out, back = steps[first], steps[second]
-        # An excursion consists of two opposite jumps of similar size, with at most five samples between them. A signal
-        # that returns later has jumped twice and has no outlier.
+        # `is_excursion`: an excursion consists of two opposite jumps of similar size, with at most five samples between
+        # them. A signal that returns later has jumped twice and has no outlier.
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
@@ -115,8 +116,10 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
     Stale values form a block of equal values that is more than 20 times as long as the median block, and within which
-    the signal `changes` changes by more than `min_change`. A quantised signal has genuine blocks of equal values:
-    there, the step at the end of a stale block must also be larger than four typical steps. values, changes: (T,).
+    the signal `changes` changes by more than `min_change`. A quantised signal has genuine blocks of equal values: in
+    such a signal, the step at the end of a stale block must also be larger than four typical steps.
+
+    values: the signal (T,). changes: another signal (T,), which shows that the measured quantity must have changed.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -126,7 +129,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
         return stale
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
     is_quantised = len(np.unique(values)) < len(starts) / 2
-    is_long &= (steps > 4.0 * _usual(steps[:-1]) * is_quantised) & (len(starts) > 1)
+    is_long &= (steps > 4.0 * _typical_step(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
         rows = slice(start + 1, start + length)
         if np.ptp(changes[rows]) > min_change:
@@ -135,7 +138,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
 
 
 def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rows after which a position q (T,) at times t (T,) jumps.
+    """Return the indices of the samples after which a position q (T,) [rad, m] at times t (T,) [s] jumps.
 
     A jump is a step that is faster than any arm, and more than 20 times the typical step. Steps across gaps in time are
     no jumps, since the arm may have moved in the gap.
@@ -144,7 +147,7 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
         return np.zeros(0, int)
     sizes, dt = np.abs(np.diff(q)), np.diff(t)
     median = float(np.median(dt))
-    is_jump = (sizes > TUNING.jump * _usual(sizes)) & (dt <= TUNING.gap * median)
+    is_jump = (sizes > TUNING.jump * _typical_step(sizes)) & (dt <= TUNING.gap * median)
     # No arm is faster than 40 rad/s or m/s. A step is assumed to last at least the median time step, since messages
     # that arrive in bursts have time stamps that are too close to each other.
     return np.flatnonzero(is_jump & (sizes > 40.0 * np.maximum(dt, median)))
@@ -153,10 +156,12 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    Equal rows are repeats of the first of them if the arm moved while they were written: the step at the end of a block
-    of k equal rows is then about as large as k steps of the following motion. Equal rows of an arm at rest are not
-    repeats. The exception is a logger that writes each row m times during motion: at rest, too, one of m rows is
-    original, and the others are repeats. positions: number of leading columns that are positions.
+    In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
+    at the end of the block is then about as large as k steps of the following motion. Equal rows of an arm at rest are
+    not repeats. The exception is a logger that writes each row m times during motion (m is the number of copies, else
+    1): at rest, too, one of m rows is original, and the others are repeats.
+
+    positions: number of leading columns that are positions.
     """
     starts = np.flatnonzero(np.append(True, (np.diff(columns, axis=0) != 0).any(axis=1)))
     lengths = np.diff(np.append(starts, len(columns)))
@@ -164,7 +169,7 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     index = np.arange(len(columns)) - np.repeat(starts, lengths)
     if len(starts) < 4 or not index.any():
         return np.repeat(is_held, lengths), 1
-    # step of each position at the end of each block of equal rows; the last block has no step
+    # `steps`: step of each position at the end of each block of equal rows; the last block has no step.
     steps = np.abs(np.diff(columns[starts, :positions], axis=0))
     speeds = steps[1:] / lengths[1:-1, None]
     quantum = np.min(np.where(steps > 0, steps, np.inf), axis=0)
@@ -176,12 +181,12 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 
 def held_samples(values: np.ndarray) -> int:
-    """Return the number of consecutive samples that a logger writes for each value of a signal (T,); normally 1."""
+    """Return the number of consecutive rows in which a logger repeats each value of a signal (T,); normally 1."""
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # Equal samples of a slow quantised signal are no repetitions, so only steps of several quantisation steps count.
+    # Only changes by several quantisation steps are counted: equal samples of a slow quantised signal are genuine.
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -189,7 +194,7 @@ def held_samples(values: np.ndarray) -> int:
 
 
 class Word(NamedTuple):
-    """Decoding of a signal as register words.
+    """Decoding of a logged signal as register words, the raw integers of a drive's register.
 
     Attributes:
         key: setting of the mapping that decodes the signal, "period" or "sign_bit".
@@ -203,7 +208,7 @@ class Word(NamedTuple):
 
 
 def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
-    """Return the decoding of a signal as register words that removes at least half of its jumps; None if none does.
+    """Return the decoding of a signal as register words if a decoding removes at least half of its jumps; else None.
 
     The candidates are words with a sign bit and words that overflow at a period. The sign bit or the period is a
     multiple 2^k of a revolution or of the quantisation step. The decoding with the fewest remaining jumps is returned;
@@ -211,7 +216,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
     values: (T,) in the unit of the log. turn: one revolution in this unit; None for a joint that does not rotate.
     """
-    # With fewer than four values, the median step might itself be a jump.
+    # A signal with fewer than four values is not decoded: its median step might itself be a jump.
     if len(values) < 4:
         return None
     steps = np.diff(values)
@@ -221,18 +226,18 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     # changes a sign bit at half of the steps at most.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
-    jump, usual = float(np.median(np.abs(steps[rows]))), _usual(np.abs(steps))
-    # Torques may reverse abruptly, so a jump of a signal with negative values is an overflow only if it is nearly as
-    # large as the range of the signal.
+    jump, typical = float(np.median(np.abs(steps[rows]))), _typical_step(np.abs(steps))
+    # Torques may reverse abruptly, so a jump of a signal with negative values counts as an overflow only if it is
+    # nearly as large as the range of the signal.
     is_signed = values.min() < -FINEST_WORD * np.ptp(values)
-    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * usual):
+    if is_signed and jump < max(0.9 * np.ptp(values), TUNING.jump * typical):
         return None
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
     for size in sizes:
-        # Words that overflow have a range of at most one period (plus 1 % for noise). Words with a sign bit have values
-        # above the sign bit, which represent negative numbers.
+        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise).
+        # Words with a sign bit have values above the sign bit, which represent negative numbers.
         readings = []
         if np.ptp(values) < 1.01 * size:
             readings.append(Word("period", size, centred(unwrapped(values, size), size)))
@@ -242,7 +247,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             jumps = np.abs(np.diff(reading.values))
             # A decoding is rejected if the jumps become shorter by one period but remain large: they are then steps of
             # the motion.
-            if np.median(jumps[rows]) > TUNING.jump * usual:
+            if np.median(jumps[rows]) > TUNING.jump * typical:
                 continue
             bends = np.abs(np.diff(reading.values, 2))
             score = (
@@ -255,11 +260,14 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit in the log's unit: 2^k revolutions, and 2^k quantisation steps."""
+    """Return candidates for the period or sign bit of register words: 2^k revolutions, and 2^k quantisation steps.
+
+    values: signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not rotate.
+    """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # smaller differences are rounding errors, since the values were converted to SI units and back
+    # Smaller differences between values are rounding errors, since the values were converted to SI units and back.
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
@@ -269,7 +277,7 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     return sizes
 
 
-def _usual(sizes: np.ndarray) -> float:
-    """Return the typical step, the median of the nonzero step sizes (T,); infinity if all are zero."""
+def _typical_step(sizes: np.ndarray) -> float:
+    """Return the typical step of a signal: the median of its nonzero step sizes (T,); infinity if all are zero."""
     moving = sizes[sizes > 0]
     return float(np.median(moving)) if moving.size else np.inf

@@ -14,7 +14,7 @@ from spelgen.logs.tables import LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = "joints"  # name of an optional array with the names of the joints in the columns of matrices
+JOINT_NAMES = "joints"  # name of the optional array with the joints' names, in the order of matrix columns
 TRAJECTORY = "{trajectory}"
 
 Columns = dict[str, tuple[str, int]]
@@ -22,7 +22,7 @@ Columns = dict[str, tuple[str, int]]
 
 
 class NpzArrays:
-    """Arrays of an NPZ archive. An array is read when it is first used; pickled objects are rejected."""
+    """Arrays of an NPZ archive by name. An array is read when it is first used; pickled objects are rejected."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -35,7 +35,8 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # The stated size bounds the memory even if it is wrong, since zipfile does not read more bytes of an array.
+            # The size of an array that the archive states bounds the memory even if it is wrong: zipfile reads no more
+            # bytes.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, expected = (
@@ -60,12 +61,12 @@ class NpzArrays:
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def is_vector(self, name: str) -> bool:
-        """Return True for an array (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
+        """Return True if an array has the shape (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
         return max(self[name].shape, default=0) == self[name].size
 
 
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return one table per recording; only the arrays that the mapping names are read.
+    """Return one table per recording in an NPZ archive; only the arrays that the mapping names are read.
 
     If the mapping's name of the times contains `{trajectory}`, the archive contains several recordings: with
     "t_{trajectory}", the arrays "t_a" and "t_b" are the times of the recordings "a" and "b".
@@ -73,7 +74,8 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
         return [_table(None, arrays, joints, mapping)]
-    # A text that occurs several times is the same text: a second wildcard could take exponential time on long names.
+    # A placeholder that occurs several times in a name must match the same text each time (by a back reference): a
+    # second wildcard could take exponential time on long names.
     first, *others = map(re.escape, times.split(TRAJECTORY))
     pattern = re.compile(first + "(.+)" + r"\1".join(others), re.DOTALL)
     texts = [match[1] for match in map(pattern.fullmatch, arrays.names) if match]
@@ -83,24 +85,24 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
-    """Return the table of one recording of the archive; `recording` is its name, None if it is the only one."""
+    """Return the table of one recording of an archive; `recording` is its name, None if it is the only one."""
     columns: Columns = {}
     patterns: dict[str, str] = {}
     for quantity in mapping.quantities if joints else ():
         pattern = mapping.pattern(quantity)
-        # The name of a matrix may have no placeholder.
+        # The mapping may name a matrix with one column per joint, without the placeholder `{joint}`.
         named = pattern if "{joint}" in pattern else pattern + "_{joint}"
         of_matrix = _matrix_columns(named, arrays, [mapping.log_name(joint) for joint in joints])
         if of_matrix:
             columns, patterns[quantity] = columns | of_matrix, named
     mapping = mapping.model_copy(update={"columns": mapping.columns.model_copy(update=patterns)})
-    # The other columns in the mapping are vectors, or elements of a matrix, such as data[0].
+    # `vectors`: columns in the mapping that are vectors, or elements of a matrix, such as data[0].
     vectors = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
 
     def read(names: list[str] | None) -> pa.Table:
         return _longest(arrays) if names is None else _equally_long(arrays, names, vectors, columns)
 
-    # the schema has names without types, since the type of an array is known only after reading it
+    # The schema has names without types, since the type of an array is known only after it is read.
     schema = pa.schema([(name, pa.null()) for name in [*arrays.names, *columns]])
     return LogTable(schema, read, mapping, recording=recording)
 
@@ -108,9 +110,11 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
 def _equally_long(
     arrays: NpzArrays, names: Sequence[str], vectors: Collection[str], matrix_columns: Columns
 ) -> pa.Table:
-    """Return a table of arrays; other matrices (T, n) become columns of lists. Raises LogError if lengths differ.
+    """Return a table of the arrays `names`, all of T rows. Raises LogError if their lengths differ.
 
-    vectors: names of arrays that are vectors, also if they have the shape (T, 1) or (1, T).
+    An array (T,) becomes a column, and a matrix (T, n) a column of lists. matrix_columns: {name: (matrix, index)}
+    for names that are single columns of a matrix. vectors: names of arrays that are vectors, also if they have the
+    shape (T, 1) or (1, T).
     """
     table: dict[str, pa.Array] = {}
     samples = None
@@ -133,7 +137,7 @@ def _equally_long(
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table of the arrays with as many rows as the longest one; matrices (T, n) become columns of lists."""
+    """Return a table of all arrays with the largest number of rows, T, to draft a mapping; matrices become lists."""
     names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
@@ -142,11 +146,11 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return the columns of a matrix (T, n) by names such as `q_<joint>`; {} if the archive has no such matrix.
+    """Return {`q_<joint>`: ("q", index)} for each column of the matrix q (T, n) of an archive; {} without this matrix.
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
 
-    pattern: name of the columns, with a placeholder. names: names of the arm's joints in the log.
+    pattern: name of the columns, such as `q_{joint}`. names: names of the arm's joints in the log.
     """
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:

@@ -16,10 +16,10 @@ from spelgen.logs.tables import LogTable, reading
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
-INFO = "meta/info.json"  # file that describes a LeRobot data set, in its folder
+INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
-# Largest normalised position: 100, with a tolerance for rounding to single precision.
+# Largest position that LeRobot may have normalised: 100, with a tolerance for rounding to single precision.
 LARGEST_NORMALISED = 100.001
 # Text of the remark that positions may be normalised and not in degrees. The check of servo logs removes this remark if
 # the step size of the encoders determines the unit.
@@ -27,13 +27,13 @@ UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a file. The mapping is ignored for files that spelgen wrote."""
+    """Return a list with one table, the content of a Parquet file, whose columns are read when they are needed."""
     schema = pa.parquet.read_schema(file)
 
     def read(names: list[str] | None) -> pa.Table:
         if names is not None:
             names = [x for x in schema.names if any(name == x or name.startswith(f"{x}.") for name in names)]
-        # Pre-buffering would keep the compressed file in memory in addition to the table.
+        # Without pre-buffering, which would keep the compressed Parquet file in memory in addition to the table.
         return _flat(pa.parquet.read_table(file, columns=names, pre_buffer=False))
 
     return [LogTable(_flat(schema.empty_table()).schema, reading(file)(read), mapping)]
@@ -98,7 +98,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
 def _with_scale(
     folder: Path, files: Sequence[Path], joints: Sequence[str], mapping: LogMapping
 ) -> tuple[LogMapping, tuple[str, ...]]:
-    """Return the mapping with the unit of the positions in a data set, and remarks on the unit.
+    """Return the mapping with the unit of the positions in a LeRobot data set, and remarks on the unit.
 
     By default LeRobot normalises the calibrated range of each motor to -100..100; degrees or radians are options. The
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
@@ -136,7 +136,7 @@ def _with_scale(
 
 
 def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return {motor: calibration} from the file calibration.json of a data set; {} if there is no such file."""
+    """Return {motor: calibration} from the file calibration.json of a LeRobot data set; {} if there is no such file."""
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             document = YamlDocument(file, None)
@@ -145,15 +145,18 @@ def _calibration(folder: Path) -> dict[str, MotorCalibration]:
 
 
 def dataset_motors(folder: Path) -> list[str]:
-    """Return the names of the motors of a data set, in the order of the elements of `observation.state`."""
+    """Return the names of the motors of a LeRobot data set, in the order of the elements of `observation.state`."""
     return _motor_names(folder, read_json(folder / INFO, LogError), STATE)
 
 
 def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
-    """Return the motors' names for a feature ("observation.state" or "action"), without LeRobot's suffix ".pos"."""
+    """Return the motors of the elements of a feature, "observation.state" or "action", without LeRobot's suffix ".pos".
+
+    info: content of the file that describes the data set.
+    """
     try:
         names = info["features"][feature]["names"] or []
-        if isinstance(names, dict):  # LeRobot writes a list, or a dict of lists
+        if isinstance(names, dict):  # LeRobot writes the names of motors as a list, or as a dict of lists.
             names = chain(*names.values())
         return [str(name).removesuffix(ENDING) for name in names]
     except (KeyError, TypeError, AttributeError) as error:

@@ -42,8 +42,8 @@ class Preprocessing:
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
         """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
 
-        The record of a training run contains the resolved options. The cutoff remains None for logs whose rate is too
-        low for the default filter.
+        The record of a training run contains the resolved options, in which an absent torque delay is 0. The cutoff
+        remains None, no filter, for logs whose rate is too low for the default filter.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
@@ -57,19 +57,25 @@ class Preprocessing:
 
     @property
     def acceleration_cutoff(self) -> float | None:
-        """Cutoff [Hz] of the low-pass filter for samples with accelerations; None: no filter."""
+        """Cutoff [Hz] of the low-pass filter for `DynamicsSamples`, which contain accelerations; None: no filter."""
         if self.cutoff is None:
             return TUNING.automatic_cutoff
         return self.cutoff or None
 
     @property
     def filtered(self) -> bool:
-        """True if q, qd and tau are filtered before windows are cut from the logs; the options must be ``resolved``."""
+        """True if q, qd and tau are filtered before windows are cut from the logs.
+
+        The options must be a result of ``resolved``: before, the cutoff None is not yet decided.
+        """
         return bool(self.cutoff)
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """List with one remark, the cutoff, if the logs are filtered, else []; the options must be ``resolved``."""
+        """A list with a remark that states the cutoff; [] if the logs are not filtered.
+
+        The options must be a result of ``resolved``.
+        """
         if not self.cutoff:
             return []
         message = f"q, qd and tau filtered at {self.cutoff:g} Hz, zero phase"
@@ -78,7 +84,7 @@ class Preprocessing:
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
         """Return the filtered gap-free pieces of the trajectories that have at least `shortest` samples.
 
-        The options must be ``resolved``. Raises LogError for a trajectory without a piece of this length.
+        The options must be a result of ``resolved``. Raises LogError for a trajectory without a piece of this length.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []

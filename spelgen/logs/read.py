@@ -50,7 +50,7 @@ def read_logs(
 
 
 class BoundedLogs(NamedTuple):
-    """Trajectories that fit into a limit of memory, and a note on the kept samples; no note if all were kept."""
+    """Trajectories that fit into a limit of memory, and a note on how many samples were kept; no note if all were."""
 
     trajectories: list[Trajectory]
     notes: list[Diagnostic]
@@ -85,10 +85,15 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files, after `segments` has collected and reduced the rows.
+    """Return the trajectories of all files, whose rows `segments` collects and reduces.
 
-    If files have faults, the first error of each file is raised, in one LogError. source: joints and mapping. role: see
-    `read_logs`. joint_types: types of the joints, for the check of the units in the mapping.
+    If files have faults, the first error of each file is raised, all of them together.
+
+    Args:
+        paths, role: see `read_logs`.
+        source: joints of the logs, and the mapping of their columns.
+        segments: empty collector of rows, which determines the limit of memory.
+        joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))
     files, errors = log_files(paths, role)
@@ -96,7 +101,7 @@ def _read(
         try:
             for layout, table in read_tables(file, source.joints, source.mapping):
                 segments.add(layout, table)
-                del table  # so that its memory can be freed before the next table is read
+                del table  # The memory of a table is freed before the next one is read.
         except LogError as error:
             errors.append(error)
     trajectories = []
@@ -126,7 +131,7 @@ def write_logs(path: Path | str, trajectories: Sequence[Trajectory], arm: Logged
     for quantity in trajectories[0].quantities:
         values = joined_column(trajectories, quantity)
         columns |= {f"{quantity}_{joint}": column for joint, column in zip(joints, values.T, strict=True)}
-    # Metadata declare SI units, so that no mapping is applied when the file is read.
+    # The metadata of a Parquet file declare SI units, so that no mapping is applied when the file is read.
     table = pa.table(columns).replace_schema_metadata({UNITS_KEY: UNITS})
     with replacing(path) as unfinished:
         if path.suffix == ".csv":
@@ -142,7 +147,7 @@ def _with_unique_names(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     If names occur more than once, all names are preceded by the stems or paths of their files.
     """
     names: list[str] = []
-    # The shortest unique form is used, since names occur in tables and messages.
+    # The shortest form of names that is unique is used, since names occur in tables and messages.
     for form in ("{0.name}", "{0.file.stem}/{0.name}", "{0.file}/{0.name}"):
         names = list(map(form.format, trajectories))
         if len(set(names)) == len(names):

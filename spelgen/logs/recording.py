@@ -57,11 +57,11 @@ class Rows:
         return dict(zip(self.signals, self.data[:, 1:].T, strict=True))
 
     def keep(self, rows: np.ndarray) -> None:
-        """Keep the rows of a mask (T,), or rows with the given indices in the given order."""
+        """Remove all rows except the rows of a mask (T,), or the rows with the given indices, in the given order."""
         self.data, self.numbers = self.data[rows], self.numbers[rows]
 
     def leave_out(self, rows: np.ndarray, reason: str) -> None:
-        """Remove the rows of a mask (T,), if there are any, with a message that begins with their number."""
+        """Remove the rows of a mask (T,), if there are any, and add a message: their number and the `reason`."""
         if rows.any():
             self.keep(~rows)
             self.repairs.append(f"{counted(int(rows.sum()), 'row')} {reason}")
@@ -100,7 +100,7 @@ def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name:
     if "qd" not in logged:
         logged["qd"] = np.zeros_like(q)
         for piece in _pieces(t):
-            logged["qd"][piece] = np.gradient(q[piece], t[piece], axis=0)  # central difference of q
+            logged["qd"][piece] = np.gradient(q[piece], t[piece], axis=0)  # qd: central difference of q
     logged.setdefault("tau", np.zeros((len(t), 0)))
     return Trajectory(
         t, **logged, name=name, file=layout.file, accepted=layout.accepted, mapping=mapping,
@@ -109,7 +109,7 @@ def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name:
 
 
 def _unwrap(rows: Rows) -> None:
-    """Unwrap the signals for which the mapping states a period, with remarks about the wraps."""
+    """Unwrap the signals for which the column mapping states a period, and add remarks about the wraps."""
     mapping, columns = rows.layout.mapping, rows.columns
     for (quantity, joint), column in columns.items():
         period = mapping.period(quantity, joint)
@@ -119,7 +119,7 @@ def _unwrap(rows: Rows) -> None:
         count = jump_count(column, period)
         if count and quantity == "q":
             word = read_as_words((column - offset) / scale, 2 * pi / abs(scale))
-            # a sign bit of whole turns: unwrapped, the words would be magnitudes
+            # Words with a sign bit are not unwrapped, since their jumps are no wraps: a check reports them.
             if word is not None and word.key == "sign_bit":
                 continue
         result = unwrapped(column, period)
@@ -127,8 +127,8 @@ def _unwrap(rows: Rows) -> None:
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - columns["q", joint]) / period)
-        # Signals are shifted by whole periods to a median close to 0. Only angles without a wrap remain unchanged:
-        # their revolution is known.
+        # Other signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
+        # period. Exception: an angle without wraps whose period is one turn is correct as logged.
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
@@ -144,12 +144,13 @@ def _leave_out_repeats(rows: Rows) -> None:
     Otherwise repeated rows are only reported.
     """
     t, samples = rows.t, len(rows.t)
-    # a recording of so few rows does not show whether the arm moves or rests
+    # A recording of fewer than eight rows does not show whether the arm moves or rests, so that repeats cannot be
+    # recognised.
     if samples < TUNING.jump_window:
         return
     repeats, copies = repeated_rows(rows.data[:, 1:], len(rows.layout.joints))
     count = int(np.count_nonzero(repeats))
-    # up to 2 % of repeated rows have no effect on a fit
+    # Up to 2 % of repeated rows are kept, since they have no effect on a fit.
     if count <= 0.02 * samples:
         return
     is_kept = copies == 1 and rows.layout.mapping.dropouts == "kept"
@@ -179,7 +180,7 @@ def _leave_out_outliers(rows: Rows) -> None:
 
 
 def _remove_delays(rows: Rows) -> None:
-    """Shift signals back by their delays in the mapping.
+    """Shift each signal back by its delay in the column mapping.
 
     Rows near the ends of a gap-free piece, for which a delayed signal was not logged, are removed.
     """
@@ -198,27 +199,34 @@ def _remove_delays(rows: Rows) -> None:
 
 
 def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of lost samples and outliers of "q", "qd" or "tau".
+    """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them.
+    quantity: "q", "qd" or "tau". Velocities of exactly 0 are no lost samples: a joint at rest has them.
     """
     rows = is_outlier(values, smooth=quantity == "q")
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
 def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of the samples of "q", "qd" or "tau" that repeat an old value although the joint moves.
+    """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
     A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
     torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
+
+    Args:
+        quantity: name of the signal, "q", "qd" or "tau".
+        values: (T,) the signal of one joint.
+        t: (T,) times [s].
+        q: (T,) positions of the joint [rad, m].
+        qd: (T,) velocities of the joint [rad/s, m/s].
     """
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
-    from scipy.integrate import cumulative_trapezoid  # imported only if needed, since the import takes long
+    from scipy.integrate import cumulative_trapezoid  # SciPy is slow to import, so it is imported only here
 
-    # If q or qd is frozen while the joint moves, the integral of qd drifts from q. Values are stale if it drifts by
-    # more than 0.05 rad or m.
+    # If q or qd is frozen while the joint moves, the integral of qd drifts from q. Equal values are stale if this
+    # difference changes by more than 0.05 rad or m.
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
 
 
@@ -230,20 +238,22 @@ def listed_times(t: np.ndarray) -> str:
 
 
 def _order_in_time(rows: Rows) -> None:
-    """Give the rows increasing times, with messages about the repairs.
+    """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
     Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
     kept. If many of them differ, the resolution of the clock is too low, and evenly spaced times are reconstructed.
     Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
-    if len(rows.t) and abs(rows.t[0]) > 1e8:  # a date, if the first rows had no time
+    # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
+    # the file has done so before, except if its first row has no time.
+    if len(rows.t) and abs(rows.t[0]) > 1e8:
         rows.t[:] -= rows.t[0]
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
         order = np.argsort(rows.t, kind="stable")
-        # If sorted positions are rougher, the clock restarted between two recordings in the file, and sorting would
-        # interleave the recordings.
+        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting
+        # would interleave the recordings.
         if _roughness(rows.positions[order]) > _roughness(rows.positions):
             raise _backward_times(rows)
         rows.keep(order)
@@ -270,9 +280,9 @@ def _is_timeless(t: np.ndarray) -> np.ndarray:
 def _join_signals(rows: Rows) -> None:
     """Join signals that are logged in separate rows to rows that contain all signals.
 
-    The times are the times of the signal with the fewest samples. If more than 90 % of its rows contain all signals,
-    only the complete rows are kept. Otherwise the other signals are interpolated at these times. Rows within a gap of a
-    signal, or before its first or after its last sample, are omitted.
+    The joined rows have the times of the signal with the fewest samples. If more than 90 % of the rows of this signal
+    contain all signals, only the complete rows are kept. Otherwise the other signals are interpolated at these times.
+    Joined rows within a gap of any signal, or before its first or after its last sample, are omitted.
     """
     data, mapping = rows.data, rows.layout.mapping
     finite = np.isfinite(data)
@@ -288,7 +298,7 @@ def _join_signals(rows: Rows) -> None:
     for k, signal in enumerate(rows.signals, start=1):
         t, values = data[finite[:, k], 0], data[finite[:, k], k]
         period = mapping.period(*signal)
-        if period:  # interpolated angles are wrong across a wrap
+        if period:  # Angles are unwrapped first: interpolation across a wrap would be wrong.
             values = unwrapped(values, period)
         joined[:, k] = np.interp(times, t, values, left=np.nan, right=np.nan)
         following = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
@@ -300,13 +310,13 @@ def _join_signals(rows: Rows) -> None:
 
 
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
-    """Return evenly spaced times (T,) [s] for times t (T,) of a clock with a low resolution, and a message.
+    """Return evenly spaced times (T,) [s] in place of times t (T,) of a clock with a low resolution, and a message.
 
     Raises LogError if a reconstructed time differs from the logged one by more than a tick of the clock.
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # a step that is too long for the resolution of the clock is a gap; times are evenly spaced between gaps only
+    # A time step that is too long for the resolution of the clock is a gap: times are evenly spaced between gaps.
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):
@@ -328,14 +338,17 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
 
 
 def _roughness(positions: np.ndarray) -> float:
-    """Return the roughness of positions (T, n): each joint's path length divided by its range, summed over joints."""
+    """Return the roughness of positions (T, n): the path length of a joint divided by its range, summed over joints.
+
+    Rows in a wrong order are rougher than rows in the order of time.
+    """
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
 
 
 def _backward_times(rows: Rows) -> LogError:
-    """Return the error about times that do not increase."""
+    """Return the error about the first row whose time is not later than the time of the row before."""
     t, backward = rows.t, np.flatnonzero(np.diff(rows.t) < TUNING.shortest_step)
     k = backward[0]
     got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
@@ -344,18 +357,18 @@ def _backward_times(rows: Rows) -> LogError:
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:
-    """Yield the rows of each gap-free piece of at least two samples in the times t (T,)."""
+    """Yield a slice of rows for each gap-free piece of at least two samples in the times t (T,) [s]."""
     yield from (slice(start, stop) for start, stop in pairwise(gap_ends(t)) if stop - start > 1)
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return delayed values (T, ...), sampled at times t (T,), shifted back by the delay [s].
+    """Return a delayed signal (T, ...), sampled at times t (T,) [s], shifted back by its delay [s]: values(t + delay).
 
     At the ends of a gap-free piece, the first or last value of the piece replaces values that were not logged.
     """
     if not delay:
         return values
-    from scipy.interpolate import CubicSpline  # imported only if needed, since the import takes long
+    from scipy.interpolate import CubicSpline  # SciPy is slow to import, so it is imported only here
 
     moved = values.copy()
     for rows in _pieces(t):

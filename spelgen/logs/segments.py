@@ -52,7 +52,7 @@ class LogSegments:
         self._bytes = self._recordings = self._count = 0
 
     def add(self, layout: Layout, table: pa.Table) -> None:
-        """Add the recordings of a table.
+        """Convert the recordings of a table to segments in SI units, and add the segments that are kept.
 
         Raises LogError if the table has no rows, or if a kept row contains values that are not numbers.
         """
@@ -68,7 +68,7 @@ class LogSegments:
         # error can state the number of faulty rows in the whole table.
         data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
-            values = values_in_si(_taken(table, rows), layout, start, rows) if data is None else data[rows]
+            values = values_in_si(_rows_of(table, rows), layout, start, rows) if data is None else data[rows]
             self._segments.append(Segment(recording, name, layout, rows, values))
             self._bytes += values.nbytes
         self.rows += table.num_rows
@@ -78,8 +78,8 @@ class LogSegments:
 
         The collector is empty afterwards.
         """
-        # Segments are removed from the list before they are joined, so that the list does not keep a second copy of all
-        # rows.
+        # Segments are removed from the collector before they are joined to a recording, so that there is no second copy
+        # of all rows.
         segments, self._segments = self._segments[::-1], []
         while segments:
             group = [segments.pop()]
@@ -94,7 +94,7 @@ class LogSegments:
                 yield error
 
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
-        """Return the segments of a table that are kept.
+        """Return the segments to keep of `pieces`, the segments of a table.
 
         If the limit of memory is exceeded, `every` is doubled, and every second one of the segments that were collected
         before is removed. row_bytes: memory of one row of the table [B].
@@ -105,14 +105,14 @@ class LogSegments:
             if size <= self._kept_bytes or len(self._segments) + len(selected) <= 1:
                 self._count += len(pieces)
                 return selected
-            # Every second segment is removed, so that the remaining segments are evenly spread.
+            # Every second collected segment is removed, so that the remaining segments are evenly spread.
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)
 
 
-def _taken(table: pa.Table, rows: np.ndarray) -> pa.Table:
-    """Return the rows of a table whose indices are `rows` (T,); consecutive rows are not copied."""
+def _rows_of(table: pa.Table, rows: np.ndarray) -> pa.Table:
+    """Return a table of the rows with the indices `rows` (T,) of a table; consecutive rows are not copied."""
     first, count = int(rows[0]), len(rows)
     return table.slice(first, count) if int(rows[-1]) - first + 1 == count else table.take(rows)
 
@@ -121,11 +121,12 @@ def _recordings(layout: Layout, table: pa.Table) -> list[tuple[str, np.ndarray]]
     """Return (name, row numbers (T,)) for each recording in a table, in the order of their first rows."""
     if layout.labels is None:
         return [(layout.recording or layout.file.stem, np.arange(table.num_rows))]
-    # Labels are encoded as numbers, so that each text is stored once: a small compressed file may repeat a label of a
-    # megabyte in a million rows.
+    # Names of recordings (labels) are encoded as numbers, so that each text is stored once: a small compressed file may
+    # repeat a label of a megabyte in a million rows.
     labels = table[layout.labels].dictionary_encode("encode").combine_chunks()
     numbers = labels.indices.to_numpy()
-    # Rows are sorted by label once, which avoids a search of all rows for each recording.
+    # Rows of a table are sorted by the name of their recording once, which avoids a search of all rows for each
+    # recording.
     rows = np.argsort(numbers, kind="stable")
     ends = np.cumsum(np.bincount(numbers))
     return list(zip(map(str, labels.dictionary.to_pylist()), np.split(rows, ends[:-1]), strict=True))

@@ -35,7 +35,7 @@ COMMANDED = {
     "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
     "demand", "planned", "ipo", "set", "soll", "u",
 }  # fmt: skip
-# Words in names of signals other than measured joint signals.
+# Words in names of columns that mark signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
     "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
 }  # fmt: skip
@@ -51,13 +51,13 @@ UNITS = {
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
-# Letters that are units only in brackets: without brackets they may be part of a name.
+# Letters in column names that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
 CURRENT = {"current", "currents", "curr", "cur", "strom"}
 
 
 class Suggestion(NamedTuple):
-    """Draft of a mapping as YAML text, with comments on its assumptions. missing: quantities without a column."""
+    """Draft of a column mapping as YAML text with comments on its assumptions. missing: quantities without a column."""
 
     text: str
     missing: tuple[str, ...]
@@ -72,7 +72,7 @@ class ColumnName(NamedTuple):
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
-    """Return a draft of the mapping for a log file.
+    """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
     read, if it has no column of times, or commanded positions and no torques without `commands`.
@@ -94,26 +94,26 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
         do = "name it so, or write 'columns' and 'sample_rate' under 'logs' if there is none and rows are evenly spaced"
         raise LogError(got, file=file, expected="one of times, called t or time", do=do)
-    # The register "load" of a servo is no torque.
+    # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
-    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the name with the fewest words is used.
+    # Of several columns of times, the stamp in a message header is used: the others may be times of receipt and not of
+    # measurement. Without a stamp, the column whose name has the fewest words is used.
     clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
     stamp = re.sub(r"secs?$", "", clock.name)
     nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
     if stamp != clock.name and nanoseconds:
         clock = ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
-    # Numbered columns are assigned by cells that contain joint names, since the order in a log may differ from the
-    # arm's: ROS often sorts joints by name.
+    # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
+    # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
     by_joint = {
         quantity: _by_joint(_of_one_signal(named, joints), joints, order)
         for quantity, named in columns_of.items()
     }
-    # A mapping has columns of velocities for all joints or for none. If one is absent, all velocities are computed from
-    # positions.
+    # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
+    # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
@@ -135,7 +135,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
             lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
     used = {column.name for named in by_joint.values() for column in named.values()}
     unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
-    # Unused columns are, for example, columns of a gripper, or of another arm with similar names.
+    # A comment of the draft lists unused columns, for example of a gripper, or of another arm with similar names.
     if unused:
         lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
@@ -166,7 +166,10 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _column_name(name: str, words: set[str]) -> ColumnName:
-    """Return the parts of a column's name; its unit is in brackets, or its last word. words: additional words."""
+    """Return the words and the unit in a column's name; the unit is in brackets, or the last word.
+
+    words: additional words of the column, which its name does not contain.
+    """
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
     unit_names = set().union(*UNITS.values())
@@ -180,7 +183,7 @@ def _column_name(name: str, words: set[str]) -> ColumnName:
 def _by_quantity(
     columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
 ) -> dict[str, list[ColumnName]]:
-    """Return the columns of each quantity, by the name of the quantity.
+    """Return {quantity: columns} for the quantities "t", "q", "qd", "tau" or "u".
 
     The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
@@ -205,7 +208,10 @@ def _by_quantity(
 def _units(
     clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
 ) -> dict[str, str]:
-    """Return {quantity: unit}, from the names of the columns; the unit of times may be derived from the time steps."""
+    """Return {quantity: unit} from the units and words in column names; the unit of times also from the time steps.
+
+    clock: column of the times. by_joint: {quantity: {joint: column}}. table: first rows of the log.
+    """
     units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
     for quantity, named in by_joint.items():
         for column in named.values():
@@ -221,7 +227,7 @@ def _units(
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
-    """Return the unit in which the median step of a column of times is plausible; None if there is no such unit."""
+    """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
     if name not in table.schema.names:
         return None
     times = table[name].drop_null()
@@ -232,7 +238,7 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: index in the log} from the cells of the first row that contain joint names.
+    """Return {joint: index of its columns in the log}, from cells of the first row that contain joint names.
 
     Such cells are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
     omitted.
@@ -249,9 +255,9 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 
 
 def _names(table: pa.Table) -> list[str]:
-    """Return the names of the columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
+    """Return the names of a table's columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
 
-    Columns with the same name as another column are omitted.
+    Names that two columns have are omitted.
     """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -269,11 +275,13 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
 
 
 def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
-    """Return the columns of one of the signals of a quantity that a log contains for all joints.
+    """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
-    Names of a signal's columns differ only in the words of the joint. Torques are preferred to currents, names with a
-    word such as "actual" to others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`. All columns
-    are returned if no signal has a column for each joint.
+    A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
+    differ only in the words of the joint. Torques are preferred to currents, names with a word such as "actual" to
+    others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`.
+
+    columns: all columns of the quantity, which are returned if no signal has a column for each joint.
     """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
@@ -292,8 +300,8 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names: `order` contains
-    {joint: number}. If `order` does not contain all joints, they are assigned to the numbers in ascending order.
+    If no column name contains a joint name, columns are assigned by the last number in their names. order: {joint:
+    number}; if it does not contain all joints, the joints are assigned to the numbers in ascending order.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]

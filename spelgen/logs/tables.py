@@ -17,10 +17,10 @@ from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-UNITS_KEY = b"units"  # key of the units that a Parquet file declares in its metadata
+UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # declaration of units in files that spelgen wrote
+UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units that files of spelgen declare
 
 # Types of the errors that Arrow, NumPy and zipfile raise for damaged files.
 UNREADABLE = (
@@ -30,7 +30,7 @@ UNREADABLE = (
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a table: the columns that contain the quantities of an arm, and the mapping with their units.
+    """Layout of a log table: the columns that contain the quantities of an arm, and the mapping with their units.
 
     Attributes:
         file: path of the log, for errors and trajectories.
@@ -56,14 +56,14 @@ class Layout:
     header: int | None = None
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the value in a row (counted from 0) and column; for text files also with the line."""
+        """Return an error about the value in a row (from 0) and column; for a text file it also states the line."""
         line = int(row) + 1 + self.header if self.header is not None else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
 
 
 class LogTable(NamedTuple):
-    """Columns of a log as logged, the common result of all readers.
+    """Columns of a log with unchanged values, the common result of the readers of all formats.
 
     Attributes:
         schema: names of the columns; also their types and metadata, if they are known before values are read.
@@ -81,7 +81,10 @@ class LogTable(NamedTuple):
 
     @classmethod
     def of(cls, table: pa.Table, mapping: LogMapping, **properties: Any) -> Self:
-        """Return the log table of a table in memory. properties: values of the other attributes."""
+        """Return the log table for an Arrow table in memory.
+
+        properties: values of the attributes `remarks`, `header` and `recording`.
+        """
         return cls(table.schema, lambda names: table, mapping, **properties)
 
 
@@ -107,14 +110,16 @@ SERVO_ADVICE = (
 
 
 def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
-    """Return the layout of a table. Raises LogError if a column is missing or occurs twice.
+    """Return the layout of a log table: the column of each quantity and joint, by the mapping.
+
+    Raises LogError if a column is missing or occurs twice.
 
     Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
     position), the accepted checks and the wraps of angles apply to them.
     """
     schema, mapping = log.schema, log.mapping
     metadata = schema.metadata or {}
-    # files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger
+    # Files of spelgen, e.g. simulated logs, are in SI units, even if the arm's mapping describes another logger.
     if metadata.get(UNITS_KEY) == UNITS:
         mapping = mapping.in_si()
     columns = [mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))]
@@ -128,7 +133,7 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
             got = f"the same name for the columns {', '.join(numbers)}"
             raise LogError(got, file=file, element=element, expected="it once", do="rename one of them")
     missing = [x for x in columns if not stored_names(x, schema.names)]
-    # Times of evenly spaced rows need no column.
+    # Evenly spaced rows (setting `sample_rate`) need no column of times.
     if mapping.sample_rate and missing[:1] == columns[:1]:
         del missing[0]
     if missing:
@@ -136,12 +141,12 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
     labels = mapping.columns.trajectory if log.recording is None else None
     if labels not in schema.names:
         labels = None
-    # A column of lists is rejected here: used as names of recordings, it would raise an error that is hard to
+    # A column of lists as names of recordings is rejected here: later it would raise an error that is hard to
     # understand.
     if labels and pa.types.is_nested(schema.field(labels).type):
         got = f"values of type {schema.field(labels).type}"
         raise LogError(got, file=file, element=f"column {labels}", expected="names")
-    # Units are not checked if the file declares them.
+    # The checks of units are omitted if the file declares its units.
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
@@ -186,14 +191,14 @@ def missing_columns(
 ) -> LogError:
     """Return the error about missing columns of a log, with advice for the most likely cause.
 
-    columns: names of all columns of the file.
+    missing: names in the mapping of the columns that are missing. columns: names of all columns of the file.
     """
     of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
-    # If only some joints have no column at all, they were not logged. A wrong name in the mapping affects one column
-    # only, or all joints.
+    # If only some joints have no column at all, these joints were not logged: a wrong name in the mapping would affect
+    # one column only, or all joints.
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -207,7 +212,7 @@ def missing_columns(
             "write its name as 'columns: {t: NAME}' under 'logs' in the robot's YAML, or 'sample_rate: HZ' if there is "
             "none and the rows are evenly spaced"
         )
-    # Many loggers do not log velocities, which can be computed from the positions.
+    # If only velocities are missing, they can be computed from the positions: many loggers do not log velocities.
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
@@ -231,7 +236,7 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
 def _renaming(
     name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
 ) -> str:
-    """Return the advice for the missing column `name`: rename a similar column, or map the names.
+    """Return the advice, for an error message, about the missing column `name`: rename a similar column, or map names.
 
     A similar column is an unused column whose name contains the same joint. of_quantity: names of the expected columns
     per quantity. joints: the joints' names in the log.
@@ -263,7 +268,7 @@ def names_joint(column: str, joint: str) -> bool:
 
 @contextmanager
 def reading(file: Path) -> Iterator[None]:
-    """Context manager that converts exceptions of libraries about a damaged file to a LogError with its name."""
+    """Context manager that converts exceptions of libraries about a damaged file to a LogError with the file's name."""
     try:
         yield
     except UNREADABLE as error:

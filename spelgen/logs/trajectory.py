@@ -63,8 +63,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         columns = ("t", *self.quantities)
         for column in columns:
-            # Lists and tensors are converted to arrays. The dataclass is frozen and does not permit a normal
-            # assignment.
+            # Lists and tensors are converted to arrays. `object.__setattr__` is used, because the dataclass is frozen.
             object.__setattr__(self, column, self._as_array(column))
         if self.t.ndim != 1 or not self.t.size:
             raise self.error(f"an array of shape {self.t.shape}", "(T,), a time for each sample", column="t")
@@ -76,7 +75,7 @@ class Trajectory:
                 raise self.error(f"an array of shape {shape}", expected, column=column)
         for column in columns:
             values, largest = self.column(column), TUNING.latest if column == "t" else TUNING.largest_value
-            possible = np.abs(values) < largest  # False for NaN, too: comparisons with NaN are False
+            possible = np.abs(values) < largest  # comparisons with NaN are False, so NaN is an error, too
             if not possible.all():
                 row = int(np.argwhere(~possible)[0, 0])
                 is_finite = np.isfinite(values[row]).all()
@@ -93,12 +92,12 @@ class Trajectory:
         return len(self.t)
 
     def __getitem__(self, rows: slice) -> Trajectory:
-        """Return a recording that contains only the samples of a slice."""
+        """Return a trajectory that contains only the samples of a slice."""
         u = None if self.u is None else self.u[rows]
         return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
 
     def column(self, name: str) -> np.ndarray:
-        """Return t (T,), or q, qd, tau or u (T, n), by name; an empty array for commands that were not logged."""
+        """Return a signal by its name: t (T,), or q, qd, tau or u (T, n); an empty array if u was not logged."""
         values: np.ndarray | None = getattr(self, name)
         return np.zeros(0) if values is None else values
 
@@ -116,14 +115,14 @@ class Trajectory:
     def sample_rate(self) -> float:
         """Sample rate outside gaps [Hz], the inverse of the mean time step; 0 for a single sample.
 
-        The median time step would be biased by jitter.
+        The mean is used, because jitter would bias the median time step.
         """
         steps = self.regular_steps
         return float(1.0 / steps.mean()) if steps.size else 0.0
 
     @cached_property
     def regular_steps(self) -> np.ndarray:
-        """Time steps between samples [s] without the gaps, which would bias the mean sample rate."""
+        """Time steps between samples that are no gaps, (steps,) [s]; their mean is the sample interval."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
 
@@ -137,9 +136,9 @@ class Trajectory:
     def _as_array(self, column: str) -> np.ndarray:
         values: object = getattr(self, column)
         try:
-            if hasattr(values, "detach"):  # a tensor may be on another device, or require gradients
+            if hasattr(values, "detach"):  # A tensor may be on a GPU, or require gradients.
                 values = values.detach().cpu()
-            if isinstance(values, np.ma.MaskedArray):  # NumPy would return the values under the mask
+            if isinstance(values, np.ma.MaskedArray):  # Masked values become NaN; NumPy would return them.
                 return np.asarray(np.ma.filled(values.astype(float), np.nan))
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
@@ -147,7 +146,7 @@ class Trajectory:
             raise self.error(got, "an array of numbers", column=column) from error
 
     def error(self, got: str, expected: str, do: str | None = None, column: str = "") -> LogError:
-        """Return an error about the recording, or about one of its columns."""
+        """Return an error about the trajectory, or about its signal `column`; for other texts see `SpelgenError`."""
         element = f"trajectory {self.name}" + (f": {column}" if column else "")
         return LogError(got, file=self.file, element=element, expected=expected, do=do)
 
@@ -186,7 +185,7 @@ def require_joints(trajectory: Trajectory, joints: Sequence[str]) -> None:
 
 
 def recordings(logs: Trajectory | Iterable[Trajectory], joints: Sequence[str]) -> list[Trajectory]:
-    """Return one or several trajectories as a list.
+    """Return one or several trajectories as a list, after a check of their types and joints.
 
     Raises LogError for other objects, such as paths, for no trajectories, and for a wrong number of joints.
     """
@@ -209,8 +208,8 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
     A gap is a time step longer than `gap` median steps and longer than `hole` [s].
     """
     steps = np.diff(t)
-    # Few recordings have gaps. This test of the longest and shortest step avoids the median, which takes most of the
-    # time.
+    # Few recordings have gaps. A comparison of the longest with the shortest step shows it for most of them, without
+    # the median, which takes most of the time.
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
@@ -219,7 +218,7 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
 def split_at_gaps(
     trajectory: Trajectory, gap: float = GAP, hole: float = 0.0, *, shortest: int = 1
 ) -> list[Trajectory]:
-    """Return the gap-free pieces with at least `shortest` samples, in order.
+    """Return the gap-free pieces of a trajectory with at least `shortest` samples, in the order of time.
 
     Each piece has the name of the trajectory. A gap is a time step longer than `gap` median steps and longer than
     `hole` [s].
@@ -231,7 +230,7 @@ def split_at_gaps(
 
 
 def joined_column(trajectories: Sequence[Trajectory], name: str) -> np.ndarray:
-    """Return a signal of all trajectories, concatenated: t (T,), or q, qd, tau or u (T, n), by name."""
+    """Return one signal, by its name, of all trajectories concatenated: t (T,), or q, qd, tau or u (T, n)."""
     return np.concatenate([x.column(name) for x in trajectories])
 
 
@@ -267,7 +266,7 @@ LogRows = tuple[Trajectory, slice]
 
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
-    """Return the number of integration steps per sample interval, so that a step is at most ``longest`` [s]."""
+    """Return the number of integration steps per mean sample interval, so that a step is at most ``longest`` [s]."""
     # `longest` is 3.4 ms by default: with longer steps, fits of position servos had armatures biased by a few per cent.
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
@@ -275,16 +274,17 @@ def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
 def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: int) -> np.ndarray:
     """Return the commands (K, steps, n) [rad, m], delayed by `delay` [s] and averaged over each integration step.
 
-    `rows` selects K + 1 samples. Each of the K intervals between them is divided into `steps` integration steps of
-    equal length. A command is constant until the next command. The averages are differentiable with respect to the
-    delay, unlike the values of a step function at single times.
+    `rows` selects K + 1 samples of n joints. Each of the K intervals between them is divided into `steps` integration
+    steps of equal length. A command is constant until the next command. The averages are differentiable with respect to
+    the delay, unlike the values of a step function at single times.
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # The first of these rows contains the command that acts at the earliest delayed time.
+    # The first of the `held_rows` contains the command that acts at the earliest delayed time.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    previous = np.concatenate([u[:1], u[:-1]])  # command that acts before each sample
+    # `previous`: command that acts in the interval before each sample, (H, n) [rad, m] for H held rows.
+    previous = np.concatenate([u[:1], u[:-1]])
     # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])
     integral = np.zeros((len(t) + 1, u.shape[1]))

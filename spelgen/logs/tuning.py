@@ -44,12 +44,13 @@ class LogTuning:
 
 @dataclass(frozen=True)
 class SignalCheckTuning:
-    """Thresholds of the checks of logs that several checks use."""
+    """Thresholds that several checks of logs use."""
 
     # [1] Two signals count as proportional if their correlation is at least this number. A factor between signals
     # counts as 1 if it differs from 1 by at most 1 minus this number.
     agreement: float = 0.9
-    # [rad, m] A joint is at rest if the range of its positions is at most this: noise of an encoder is smaller.
+    # [rad, m] A joint is at rest in a log if the range of its positions is at most this number: noise of an encoder is
+    # smaller.
     rest_range: float = 1e-3
     # [1] Number of samples over which the changes of q and of the integral of qd are compared. Between neighbouring
     # samples the quantisation step of q may be larger than the change of q.
@@ -67,13 +68,15 @@ class SignalCheckTuning:
 class SampleTuning:
     """Constants of the filtered samples at a common rate to which dynamics are fitted."""
 
-    # [rad/s, m/s] A joint is at rest if its speed is lower. Samples at which all joints are at rest are omitted.
+    # [rad/s, m/s] A joint is at rest at a sample if its speed is at most this number. Samples at which all joints are
+    # at rest are omitted.
     moving: float = 0.02
 
 
 TUNING, SIGNALS, SAMPLES = LogTuning(), SignalCheckTuning(), SampleTuning()
 
-SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff  # [Hz] lowest sample rate for accelerations
+# [Hz] Lowest sample rate of logs from which accelerations are computed.
+SLOWEST = TUNING.samples_per_period * TUNING.automatic_cutoff
 # [1] Tolerance of comparisons with a sample rate: loggers with a nominal rate of 50 Hz have measured rates between
 # 49.95 Hz and 50.1 Hz.
 FAST = 1.002

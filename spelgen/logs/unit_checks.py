@@ -18,7 +18,7 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
-TURNS = 4 * np.pi  # [rad] largest range of a joint with limits; if the range of q is larger, q is not in rad
+TURNS = 4 * np.pi  # [rad] largest range of a joint with limits; a q with a larger range is not in rad
 # Units of positions and of velocities that loggers use, per joint type. The SI unit is first.
 UNITS = {
     "revolute": (("rad", "deg", "turns", "mrad"), ("rad/s", "deg/s", "rpm", "turns/s", "mrad/s")),
@@ -29,9 +29,10 @@ UNITS = {
 def velocity_products(trajectory: Trajectory) -> np.ndarray:
     """Return the Gram matrix (2n, 2n) of 2n signals: n integrals of qd, then n positions q.
 
-    An element is the scalar product of the increments of two signals over ten samples.
+    An element is the scalar product of the increments of two signals; an increment is the change over ten samples. The
+    matrix shows whether qd is the derivative of q, see `velocity_agreement`.
     """
-    # SciPy is imported here, since the import takes half a second.
+    # SciPy is imported within the function, since its import takes half a second.
     from scipy.integrate import cumulative_trapezoid
 
     products = np.zeros((2 * trajectory.q.shape[1],) * 2)
@@ -50,7 +51,7 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return factors (n,) and correlations (n, n) between velocities qd and derivatives of positions dq/dt.
 
     The factor c of a joint is the least-squares solution of dq/dt = c qd. Correlation (i, j) is between qd of joint i
-    and dq/dt of joint j; it is NaN if one of these joints is at rest. products: (2n, 2n), see `velocity_products`.
+    and dq/dt of joint j; it is NaN if joint i or joint j is at rest. products: (2n, 2n), see `velocity_products`.
     """
     n = len(products) // 2
     qd_squares, q_squares = np.split(products.diagonal(), 2)
@@ -72,7 +73,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-    # of readings that differ by rounding only, the unit that loggers use most is the first
+    # Of combinations of units whose distances differ by rounding only, the first is used: its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     if distance > log(1.25):
@@ -86,14 +87,17 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
-    """Yield (distance, settings of the joint) for all combinations of units of q and qd that the mapping permits.
+    """Yield (distance, settings of the joint) for all units of q and qd that the column mapping permits.
 
-    The distance is |log r|, with r the ratio of dq/dt to qd in these units, plus a penalty for units other than SI.
-    is_far: True if the range of q is more than two turns; combinations in which q exceeds two turns are then omitted.
+    The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
+    dq/dt to qd in these units, plus a penalty for units other than SI.
+
+    is_far: True if q of a revolute joint with limits has no stated unit and, as logged, a range above 4 pi (two turns
+    in rad): units in which |q| would exceed two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # The ratio r is known only if velocities were logged and are proportional to dq/dt. If it is unknown, only the
-    # range of q indicates a unit.
+    # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
+    # unknown, only the range of q indicates a unit.
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     is_known &= "qd" in mapping.quantities
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
@@ -108,7 +112,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     if stated:
         positions = positions[:1]
     elif is_far and (signals.is_whole or not is_known):
-        positions = positions[:3]  # milliradians and counts of an encoder have similar ranges
+        positions = positions[:3]  # mrad is omitted: encoder counts have similar ranges
     if not is_known or mapping.unit("qd", joint):
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
@@ -142,7 +146,7 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
         is_known = signals.correlation > SIGNALS.agreement
         unit = next((x for x in TIMES if x != "s" and is_known and is_factor(signals.factor, TIMES[x])), None)
     elif signals.number:
-        # All joints have the same times, so the fault is reported only for joint 0.
+        # A wrong unit of times is a fault of all joints, which is reported only once, for joint 0.
         return None
     elif unit is not None:
         message += f", {1 / (step * TIMES[unit]):.4g} Hz if times are in {unit}"
@@ -152,17 +156,21 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 
 
 def _rate_by_velocities(signals: JointSignals) -> float | None:
-    """Return the sample rate [Hz] at which qd of all joints is dq/dt; None if the times may be right or in a unit."""
+    """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
+
+    Return None if the times may be right, or if another unit of the times, such as ms, explains the factor.
+    """
     factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
     if "qd" not in mapping.quantities or len(factors) < 2 or len(steps) <= 2 * SIGNALS.increments:
         return None
     factor = float(np.median(factors))
-    # velocities of one joint in another unit, and times that are not evenly spaced, have other causes
+    # The times are assumed to be wrong only if dq/dt is the same multiple of qd for all joints, and steps are even.
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    # a factor near 1 is more likely one of the velocities
+    # A factor near 1 is more probably an error of the velocities. For a factor between two units of time, such as 1000,
+    # the caller reports the unit.
     if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
@@ -170,9 +178,9 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
 
 
 def time_unit(step: float) -> str | None:
-    """Return the unit in which a time step of a robot's log is plausible; None if there is no such unit."""
-    # Several units may be plausible, since they differ by factors of 1000, and the plausible steps range over a factor
-    # of 5000. The largest plausible unit is returned.
+    """Return the unit of time in which a step of a robot's log is plausible (0.1 ms to 0.5 s); None without one."""
+    # Several units of time may be plausible, since they differ by factors of 1000, and the plausible steps range over a
+    # factor of 5000. The largest plausible unit is returned.
     slowest, fastest = SIGNALS.slowest_step, SIGNALS.fastest_step
     return next((unit for unit, size in TIMES.items() if fastest <= step * size <= slowest), None)
 
@@ -196,10 +204,11 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # At most ten samples have a single increment, whose correlation is always 1 or -1: too little for advice.
+        # A log of at most ten samples has a single increment, whose correlation is always 1 or -1: too little for
+        # advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
-        # Only the sign of qd is wrong: q is correct, and its derivative can replace qd.
+        # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
     for joint, fit in zip(signals.joints, signals.correlations.tolist(), strict=True):
@@ -215,11 +224,11 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
 
 
 def _velocity_sum(signals: JointSignals) -> str:
-    """Return a text if the joint's qd is a sum or difference of dq/dt of several joints, as at a coupled wrist."""
+    """Return a text if the joint's qd is a sum or difference of dq/dt of several joints (coupled wrist), else ""."""
     products = velocity_products(signals.trajectory)
     n, power = len(signals.joints), products[signals.number, signals.number]
     gram, target = products[n:, n:], products[n:, signals.number]
-    # coefficients of a differential are -1, -1/2, 0, 1/2 and 1
+    # `factors` are rounded to the coefficients of a differential: -1, -1/2, 0, 1/2 or 1.
     factors = np.round(2 * np.linalg.lstsq(gram, target, rcond=1e-9)[0]) / 2
     terms = np.flatnonzero(factors).tolist()
     residual = power - 2 * factors @ target + factors @ gram @ factors
@@ -249,7 +258,8 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # Noise also makes q and the integral of qd differ, so the delay must explain 75 % of the squared difference.
+    # The delay must explain 75 % of the squared difference between q and the integral of qd, since noise also causes
+    # one.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 
@@ -262,7 +272,8 @@ def find_copied(signals: JointSignals) -> str | None:
     lengths = np.linalg.norm(centred, axis=0)
     correlations = np.abs(centred[:, k] @ centred) / np.where(lengths > 0, lengths[k] * lengths, np.inf)
     correlations[k] = 0.0
-    # Two sensors are never correlated this closely: even noise of 18-bit sensors lowers the correlation by 1e-11.
+    # The torques of two sensors are never correlated this closely: even noise of 18-bit sensors lowers the correlation
+    # by 1e-11.
     copies = np.flatnonzero(correlations > 1 - 1e-12)
     if not copies.size:
         return None
@@ -271,7 +282,7 @@ def find_copied(signals: JointSignals) -> str | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Return a message if a measured signal of the joint keeps each value for several rows."""
+    """Return a message if the values of a measured signal of the joint are each repeated in consecutive rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -282,7 +293,7 @@ def find_held(signals: JointSignals) -> str | None:
 
 
 def find_too_rare(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if a signal keeps each value for so long that accelerations cannot be computed.
+    """Return a finding if a signal changes too rarely for the computation of accelerations: below 24 Hz.
 
     Return None for logs of position commands, whose fits do not need accelerations.
     """
@@ -299,9 +310,10 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
 
 
 def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
-    """Return True for each signal (T, ...) that is nearly always positive or nearly always negative.
+    """Return a mask (...) of the signals `values` (T, ...) that are nearly always positive or nearly always negative.
 
-    share: bound of the largest magnitude in one direction, divided by the largest magnitude in the other direction.
+    share: a signal is nearly always positive if its smallest value is at least -share times its largest value, and
+    nearly always negative if this is true of -signal.
     """
     below, above = np.maximum(-values.min(axis=0), 0.0), np.maximum(values.max(axis=0), 0.0)
     return np.asarray(np.minimum(below, above) <= share * np.maximum(below, above))
@@ -310,7 +322,7 @@ def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    # Velocities in both directions have a sign, and so do velocities computed from positions.
+    # Logged velocities in both directions have a sign, and so have velocities computed from positions.
     if "qd" not in trajectory.mapping.quantities or not is_one_sided(qd, share) or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

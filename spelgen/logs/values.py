@@ -24,7 +24,7 @@ Column: TypeAlias = "pa.ChunkedArray | pa.Array"
 def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows: Rows) -> np.ndarray:
     """Return the C columns of a layout as numbers (T, C) in SI units.
 
-    Absent values are NaN in rows of another topic or publisher (see `foreign_rows`), in logs whose signals are in
+    Absent values become NaN in rows of another topic or publisher (see `foreign_rows`), in logs whose signals are in
     separate rows (see `is_split`), and with the setting 'dropouts: dropped'. Raises LogError, with row and column, for
     values that are absent elsewhere, that are not numbers, or that are beyond the range of any arm.
 
@@ -36,8 +36,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     """
     times, unit = _clock(table, layout)
     if start is not None:
-        # The start is subtracted from the integers, before the conversion to doubles: doubles near 1.7e18 ns are 256 ns
-        # apart.
+        # The start time is subtracted from integer times, before the conversion to doubles: doubles near 1.7e18 ns are
+        # 256 ns apart.
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
@@ -52,7 +52,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         data: np.ndarray = np.stack(logged, axis=1) * factors + offsets
     largest = np.array([TUNING.latest, *[TUNING.largest_value] * len(signals)])
     foreign = foreign_rows(data, len(layout.joints))
-    bad = ~(np.abs(data) < largest)  # True for NaN, too: comparisons with NaN are False
+    bad = ~(np.abs(data) < largest)  # NaN is a bad value, too: comparisons with NaN are False
     if is_split(data):
         bad[:, 1:] &= ~np.isnan(data[:, 1:])
     elif not foreign.all():
@@ -72,9 +72,9 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of the rows of another topic or publisher: they contain positions only, or no values at all.
+    """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
 
-    data: (T, 1 + C), times and C values. joints: number of joints, whose positions are the first values.
+    data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
     empty = np.isnan(data[:, 1 + joints :])
     return np.asarray(empty.all(axis=1))
@@ -83,21 +83,22 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
 def is_split(data: np.ndarray) -> bool:
     """Return True if at least one of the C signals of a log (T, 1 + C) has values in at most half of the rows.
 
-    Signals are in separate rows if topics have different rates, or if joints are in different messages.
+    The signals of such a log are in separate rows, which must be joined: topics have different rates, or joints are in
+    different messages. The first column contains the times.
     """
     rarest = int(np.isfinite(data[:, 1:]).sum(axis=0).min(initial=len(data)))
     return TUNING.jump_window <= rarest <= len(data) / 2
 
 
 def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
-    """Return the first logged time if the times are dates, to be subtracted from them; None for relative times."""
+    """Return the first logged time, to be subtracted from all, if the times are dates; None for relative times."""
     first_row = table.slice(0, 1)
     times, _ = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None
-    # Times since 1970 have too few digits as floating-point numbers. A clock that starts with the recording has a first
-    # time below 1e8 in any unit.
+    # Times since 1970 would have too few digits as floating-point numbers, so their start is subtracted. A clock that
+    # starts with the recording has a first time below 1e8 in any unit.
     first = times[0].as_py()
     is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
     return times[0] if is_date else None
@@ -125,15 +126,15 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
         return times.cast(counted).cast(pa.int64()), TIMES["ns"]
     except pa.ArrowInvalid as error:
         raise LogError(
-            f"dates beyond what nanoseconds count ({times.type})", file=layout.file, element=f"column {name}",
+            f"dates beyond the range of nanosecond stamps ({times.type})", file=layout.file, element=f"column {name}",
             expected="years from 1678 to 2262", do="check the unit of the stamps",
         ) from error  # fmt: skip
 
 
 def _nanoseconds(texts: Column) -> pa.Array | None:
-    """Return times [ns] from texts of a clock ("10:00:00.123", also with a date) or with a unit ("10 ms").
+    """Return times (T,) [ns] from texts of a clock ("10:00:00.123", also with a date) or with a unit ("10 ms").
 
-    Times of day continue to increase after midnight. Returns None for other texts.
+    Times of day increase by a day at midnight. Returns None for other texts.
     """
     texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
     first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
@@ -158,14 +159,14 @@ def _nanoseconds(texts: Column) -> pa.Array | None:
 
 
 def _numbers(texts: Column) -> np.ndarray:
-    """Return the numbers in texts (T,), with a decimal point or comma; NaN for an empty text or null."""
+    """Return the numbers (T,) in texts with a decimal point or comma; NaN for an empty text or null."""
     texts = pa.compute.replace_substring(texts, ",", ".")
     texts = pa.compute.if_else(pa.compute.equal(texts, ""), None, texts)
     return np.asarray(texts.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
 def _column(table: pa.Table, name: str) -> Column:
-    """Return a column, or for a name like `position[2]` the element 2 of each list in the column `position`.
+    """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
     A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. Row
     numbers replace absent times, which the mapping's `sample_rate` makes superfluous.
@@ -181,7 +182,7 @@ def _column(table: pa.Table, name: str) -> Column:
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
-    # Arrow would raise an error for lists that are too short, so they are replaced by null.
+    # Lists that are too short are replaced by null, since Arrow would raise an error for them.
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
     lists = pa.compute.if_else(long_enough, lists, pa.scalar(None, lists.type))
     elements = pa.compute.list_element(lists, index)
@@ -189,7 +190,7 @@ def _column(table: pa.Table, name: str) -> Column:
 
 
 def stamps(seconds: Column, nanoseconds: Column) -> Column:
-    """Return times from columns of whole seconds and of the nanoseconds within the second, as ROS stores stamps."""
+    """Return times, as Arrow durations, from the columns of a ROS stamp: seconds, and nanoseconds in the second."""
     rounded = pa.compute.multiply(seconds.cast(pa.int64()), 1_000_000_000)
     return pa.compute.add(rounded, nanoseconds.cast(pa.int64())).cast(pa.duration("ns"))
 
@@ -205,7 +206,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
-        # Arrow's error does not state the row of the value, so the row is searched.
+        # The row of the first value that is no number is searched, since Arrow's error does not state it.
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
         for index, text in enumerate(texts):
             if text and not is_number(text):
@@ -222,7 +223,7 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
 
 
 def is_number(text: str) -> bool:
-    """Return True if a text is a number in Python's notation."""
+    """Return True if a text, such as a cell of a CSV file, is a number in Python's notation."""
     try:
         float(text)
     except ValueError:

@@ -42,11 +42,11 @@ class Windows:
         return Windows(*(x[rows] for x in self.columns()))
 
     def split(self, size: int) -> list[Windows]:
-        """Return the windows divided into consecutive batches of at most `size` windows."""
+        """Return the W windows divided into consecutive batches of at most `size` windows."""
         return [self[start : start + size] for start in range(0, len(self), size)]
 
     def to(self, device: str | torch.device) -> Windows:
-        """Return the same windows on another device."""
+        """Return the same windows on another torch device."""
         return Windows(*(x.to(device) for x in self.columns()))
 
     def columns(self) -> list[torch.Tensor]:
@@ -75,7 +75,7 @@ def cut_windows(
     measured: bool,
     reach: BristleReach | None = None,
 ) -> Windows:
-    """Return the windows of `window` samples, cut from gap-free pieces.
+    """Return all windows of `window` samples of gap-free pieces of logs.
 
     The input of a step, from one sample of a window to the next, is the time average of the torque over the step.
 
@@ -87,8 +87,8 @@ def cut_windows(
         measured: if True, tau[k] was measured at t[k], and the torque between two samples is the mean of both;
             otherwise torques would be delayed by half a sample. If False, tau[k] is constant from t[k] to t[k+1], as in
             a simulation with zero-order hold.
-        reach: (n, B) break-away displacements of the bristles whose states z are computed, starting from zero at the
-            start of each piece; None: z is not computed.
+        reach: (n, B) break-away displacements of the B bristles of each joint, whose states z are computed, starting
+            from zero at the start of each piece; None: z is not computed.
 
     Raises:
         LogError: if no piece is long enough for a window.
@@ -100,8 +100,8 @@ def cut_windows(
             tau = piece.tau[:-1]
             if measured:
                 tau = (tau + piece.tau[1:]) / 2
-            # A step of a window spans `decimation` sample intervals of the log. Its torque is the mean of the torques
-            # in these intervals, weighted by their durations, which differ if the clock has jitter.
+            # A step of a window spans `decimation` sample intervals of the log. The torque of a step is the mean of the
+            # torques in these intervals, weighted by their durations, which differ if the clock has jitter.
             impulses = tau * np.diff(piece.t)[:, None]
             # Integral of the torque over a step from each sample of the log, (T - decimation, n) [Nm s, N s].
             impulse = sliding_window_view(impulses, decimation, axis=0).sum(axis=-1)
@@ -118,18 +118,18 @@ def cut_windows(
 
 
 def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> torch.Tensor:
-    """Return values (T, n) cut into W windows, (W, window, n).
+    """Return a signal (T, n) cut into W windows of `window` samples, (W, window, n).
 
     stride: number of values between the starts of consecutive windows. decimation: number of values between
     neighbouring samples of a window.
     """
-    # The array is made contiguous, since torch does not accept reversed views.
+    # The array `values` is made contiguous, since torch does not accept reversed views.
     windows = torch.tensor(np.ascontiguousarray(values)).unfold(0, (window - 1) * decimation + 1, stride)
     return windows[..., ::decimation].transpose(1, 2)
 
 
 class Split(NamedTuple):
-    """Trajectories for training, others for validation, and a note that names the validation trajectories."""
+    """Split of logs: trajectories for training, others for validation, and a note that names the latter."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
@@ -154,7 +154,7 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         note = Diagnostic("info", "validation-split", "logs", None, message)
         last = replace(trajectory[cut:], name=trajectory.name + LAST_PART)
         return Split((trajectory[:cut],), (last,), note)
-    # Validation uses whole trajectories, since neighbouring windows of one trajectory have common samples.
+    # Whole trajectories are used for validation, since neighbouring windows of one trajectory have common samples.
     count = min(max(1, round(fraction * total)), total - 1)
     training, validation = set_aside(trajectories, np.random.default_rng(seed).permutation(total)[:count])
     names = ", ".join(x.name for x in validation) if count <= 3 else f"{count} of {total} trajectories"

@@ -57,7 +57,10 @@ def inspection_page(
 
 
 def identification_page(identification: Identification, arm: Arm) -> str:
-    """Return the page about an identification: base parameters with intervals, the arm, and the torque residual."""
+    """Return the page about an identification: base parameters with intervals, the arm, and the torque residual.
+
+    identification: result of least squares. arm: the arm, for its picture and the values of its URDF.
+    """
     record: Content = identification.to_dict()
     # The page is made from the content of the JSON output, so that page and JSON agree.
     words = [parameter["determined"] for parameter in record["base_parameters"]]
@@ -82,7 +85,8 @@ def motion_page(excitation: Excitation, arm: Arm) -> str:
     """Return the page about a proposed motion of `arm`, including the approach to its first position."""
     motion = excitation.approach.then(excitation.motion)
     # Charts subsample their lines, but the animation shows every point. Therefore the motion is subsampled here.
-    step = -(-len(motion.t) // (2 * TUNING.points))  # The quotient is rounded up.
+    # `step` is rounded up, so that at most 2 * TUNING.points points remain.
+    step = -(-len(motion.t) // (2 * TUNING.points))
     t, q, qd = (x[::step] for x in (motion.t, motion.q, motion.qd))
     drawn = AnimatedMotion("motion", "approach and motion", t.round(3), q.round(4))
     rows = [
@@ -100,7 +104,10 @@ def motion_page(excitation: Excitation, arm: Arm) -> str:
 
 
 def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
-    """Return the page about a report on logs. inputs: input matrix G (n, n): joint torques = G times logged torques."""
+    """Return the page about a report on logs, with charts of up to two logs.
+
+    inputs: input matrix G (n, n): joint torques = G times logged torques.
+    """
     return render_page(
         "logs.html.jinja",
         robot=report.robot,
@@ -113,11 +120,11 @@ def logs_page(report: LogReport, arm: Chain, inputs: np.ndarray) -> str:
 
 
 def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
-    """Return the charts of each joint: position, velocity and torque.
+    """Return the charts of each joint along a log: position, velocity and torque.
 
-    The chart of the velocity also shows dq/dt, and the chart of the torque also shows the gravity torque of the URDF.
-    A log of position servos has only the chart of the position, which also shows the command. inputs: input matrix G
-    (n, n): joint torques = G times logged torques.
+    The chart of the velocity also shows dq/dt, and the chart of the torque also shows the gravity torque of the URDF. A
+    log of position servos has only the chart of the position, which also shows the command. inputs: input matrix G (n,
+    n): joint torques = G times logged torques.
     """
     # The log is split at gaps first, so that dq/dt contains no difference across a gap.
     segments = [segment[:: -(-len(log.t) // TUNING.points)] for segment in split_at_gaps(log)]
@@ -134,7 +141,7 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
         if any(body.inertia for body in arm.bodies):
             # Only the gravity torque is shown: with the other terms a wrong sign or unit of the torque is hard to see.
             still = np.zeros_like(q)
-            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # (T, n) [Nm, N]
+            gravity = regressor(arm, q, still, still) @ urdf_parameters(arm)  # gravity torque (T, n) [Nm, N]
             torque.append(("gravity of the URDF", gravity, "predicted"))
         rows.append(JointRow("velocity", "velocity", "velocity", velocity))
         rows.append(JointRow("torque", "torque", "torque", torque))

@@ -40,7 +40,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class AnimatedMotion:
-    """A motion of the animated picture.
+    """A motion of the arm in the animated picture of a page.
 
     Attributes:
         name: Identifier by which charts refer to this motion.
@@ -73,7 +73,7 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return the table of M: n rows of n cells, one cell per entry of M."""
+    """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M."""
     explanations = _explanations(arm, structure)
     cells = {}
     for entry in structure.entries:
@@ -85,7 +85,7 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 
 def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
-    """Return {name of an entry of M: explanation}.
+    """Return {name of an entry of M: explanation of its structure for the reader of a page}.
 
     The explanation states the joints that the entry depends on, the facts that mention the entry, and its formula.
     """
@@ -146,7 +146,10 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 
 
 def _colour(error: np.ndarray) -> np.ndarray:
-    """Return colour values (T, n) for relative errors (T, n): 0 for no error, 1 for an error of 0.5 or -0.5."""
+    """Return colours (T, n) of the links of the animated arm, as numbers, for relative errors (T, n) of its joints.
+
+    0: no error, 1: an error of 0.5 or -0.5.
+    """
     return np.asarray((np.abs(error) / 0.5).round(3))
 
 
@@ -154,7 +157,8 @@ def _sweep(arm: Chain) -> AnimatedMotion:
     """Return a motion of 12 s in which each joint moves sinusoidally about the middle of its range."""
     t = np.linspace(0, 12, 121)
     low, high = np.array([x.working_range for x in arm.coordinates]).T
-    # Amplitudes are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a picture.
+    # Amplitudes of the motion are at most 1.2 rad and 0.3 m: some URDFs have limits of 100 revolutions, too fast for a
+    # picture.
     largest = [0.3 if coordinate.joint_type == "prismatic" else 1.2 for coordinate in arm.coordinates]
     joint = np.arange(len(low))
     # Neighbouring joints have different periods (12, 6 or 4 s), so that their motions can be distinguished. The motion

@@ -17,7 +17,10 @@ Values = Sequence[float] | np.ndarray
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins around the plot area [pixels]. `bare` replaces `bottom` if the x axis has no numbers and no label."""
+    """Margins around the plot area of a chart [pixels].
+
+    `bare` replaces `bottom` if the x axis has no numbers and no label.
+    """
 
     left: int = 52
     right: int = 14
@@ -75,7 +78,7 @@ class Axis:
         return np.asarray(self.start + (clipped - low) / (high - low) * (self.end - self.start))
 
     def contains(self, values: np.ndarray) -> np.ndarray:
-        """Return a mask (T,): true for the values (T,) within the axis."""
+        """Return a mask (T,) of the values (T,) that are within the axis."""
         return (values >= self.low) & (values <= self.high)
 
     def ticks(self) -> list[tuple[float, str]]:
@@ -101,13 +104,13 @@ class Line:
 
     @property
     def heights(self) -> np.ndarray:
-        """Values (T,) that determine the range of the y axis."""
+        """Values (T,) of the curve, from which the range of the y axis is computed."""
         return _floats(self.y)
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the segments between gaps; coordinates are rounded to tenths of a pixel."""
+        """Return the curve as an SVG path: its segments between gaps, rounded to tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
-        # The samples are evenly spaced and include the last sample, so that the line ends at the last value.
+        # The drawn samples are evenly spaced and include the last sample, so that the line ends at the last value.
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
         x, y = x[rows], y[rows]
         gaps = ~(np.isfinite(x) & np.isfinite(y))
@@ -126,12 +129,12 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Dots(Line):
-    """Points without a connecting line."""
+    """Points x, y (T,) without a connecting line."""
 
     shape = "dots"
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the points within both axes.
+        """Return the points within both axes as an SVG path.
 
         Each point is a line of length zero, whose round caps are visible as a dot.
         """
@@ -154,14 +157,17 @@ class Band:
 
     @property
     def heights(self) -> np.ndarray:
-        """Values of both curves (2 T,), which determine the range of the y axis."""
+        """Values of both curves (2 T,), from which the range of the y axis is computed."""
         return np.concatenate([_floats(self.low), _floats(self.high)])
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the SVG path of the outline, clipped to both axes. Values that are NaN are drawn at the top."""
+        """Return the outline of the area between two curves as an SVG path, clipped to both axes.
+
+        NaN is drawn at the top.
+        """
         # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
-        # The outline follows the lower curve, then the upper curve backwards.
+        # The outline of the band follows the lower curve, then the upper curve backwards.
         x = x_axis.pixels(_floats(self.x))
         columns = np.concatenate([x, x[::-1]])
         rows = y_axis.pixels(np.concatenate([low, high[::-1]]))
@@ -253,7 +259,7 @@ def _spaced(pixels: np.ndarray) -> str:
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return the finite values of all columns as one vector; if `positive`, only the positive values."""
+    """Return the finite values of several arrays as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
     return np.asarray(values[np.isfinite(values) & ((values > 0) | (not positive))])
 
@@ -269,7 +275,8 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
     room = pad * (high - low)
     # A nearly constant curve gets a wider axis; otherwise its rounding errors of about 1e-16 would fill the chart.
     if high - low <= 1e-9 * max(abs(low), abs(high)):
-        room = 0.5 * abs(high) or 1.0  # With equal margins above and below, the line lies in the middle.
+        # The margins above and below a constant line are equal, so that it lies in the middle.
+        room = 0.5 * abs(high) or 1.0
     return Axis(low - room, high + room, start, end)
 
 
@@ -297,7 +304,7 @@ def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     # The step is the smallest of 1, 2, 5 or 10 times a power of ten that gives at most five intervals.
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    # The tolerance accepts a step that is smaller than `rough` only by rounding.
+    # The tolerance 1e-9 accepts a step that is smaller than `rough` only by rounding.
     step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

@@ -1,4 +1,4 @@
-"""HTML page of a comparison: the result as a sentence and a table, then curves."""
+"""HTML page of a comparison of presets on arms: the result as a sentence and a table, then curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ STYLES = ("c1", "c2", "c3", "gravity", "c4", "c5", "c6")
 
 @dataclass(frozen=True)
 class SimulatedCurves:
-    """Charts of a simulated arm: validation losses, predictions, and entries of M.
+    """Charts of the runs on a simulated arm: validation losses, predictions, and entries of M.
 
     The charts show only the first run of each preset, as lines of several seeds would overlap.
     """
@@ -36,7 +36,10 @@ class SimulatedCurves:
 
 
 def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
-    """Write comparison.html into the study's folder; return its path."""
+    """Write comparison.html, the page about a comparison of presets, into the study's folder; return its path.
+
+    sections: results of the runs on each arm.
+    """
     curves = {}
     jobs = {job.arm: job for job in study.jobs}
     for section in sections:
@@ -58,7 +61,14 @@ def write_comparison(study: Study, sections: Sequence[ArmResults]) -> Path:
 
 
 def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -> SimulatedCurves:
-    """Return the charts of one simulated arm. truth: URDF of the simulated arm."""
+    """Return the charts of one simulated arm in a comparison of presets.
+
+    Args:
+        study: jobs and results of the comparison.
+        section: results of the runs on this arm.
+        inputs: files of the arm.
+        truth: URDF with the true parameters of the simulated arm.
+    """
     first: dict[str, SimulatedFigures] = {}
     for result in section.results:
         if result.simulated is not None:
@@ -77,7 +87,7 @@ def _curves(study: Study, section: ArmResults, inputs: ArmInputs, truth: Path) -
         # every example.
         along = next(iter(examples.values()))
         true = true_mass(truth, torch.from_numpy(along.q), arm.joint_names).numpy()
-        # Only the lower triangle is shown, since M is symmetric.
+        # Only the lower triangle of M is shown, since M is symmetric.
         rows, columns = np.tril_indices(len(arm.joint_types))
         entries = {name: m[:, rows, columns].T for name, m in {"true": true, **learned}.items()}
         mass = mass_panels(along.t, entries, {"true": "truth", **styles}, arm.joint_types, width=400)

@@ -16,7 +16,14 @@ from spelgen.templates import render_page
 
 
 def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate], path: Path) -> Path:
-    """Write the page about the estimates along logs; return the path of the page."""
+    """Write the page about the estimates of payload, external torque and friction drift along logs; return its path.
+
+    Args:
+        fit: fit of the model with which the estimates were made.
+        levels: noise levels that the estimators use.
+        results: estimates along each log.
+        path: file of the page.
+    """
     sections = [
         (result, payload_sentence(result.payload), mass_chart(result), joint_panels(fit, result))
         for result in results

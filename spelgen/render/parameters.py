@@ -37,7 +37,7 @@ class ParameterTable(Listing):
 def parameter_tables(
     model: ArmModel | None, arm: Arm | None, identified: Content | None, posterior: Posterior | None
 ) -> list[Listing]:
-    """Return the tables of a run's parameters.
+    """Return the tables of the parameters of a run for a page: base parameters, bodies, joints, constants of M.
 
     Args:
         model: The trained model; None if the run has no weights.
@@ -61,7 +61,10 @@ def parameter_tables(
 
 
 def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
-    """Return the inertial parameters in the order of ``Body.inertia``, (bodies, 10) [kg, kg m, kg m^2]."""
+    """Return the inertial parameters of the bodies of a model, (bodies, 10) [kg, kg m, kg m^2].
+
+    They are in the order of ``Body.inertia``.
+    """
     return np.asarray(model.inertial_parameters.detach())
 
 
@@ -72,6 +75,12 @@ def base_table(
 
     Its columns are the values of the URDF, of the model and of linear least squares. The values of least squares have
     95 % intervals; the values of the model have 95 % intervals if there is a posterior.
+
+    Args:
+        model: The trained model; None: no column of the model.
+        arm: The arm with the parameters of the URDF.
+        identified: Result of linear least squares, as JSON content.
+        posterior: Posterior of the model; None: no intervals of the model.
     """
     effects = identified["method"]["effects"]
     friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
@@ -80,7 +89,8 @@ def base_table(
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
     nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # A cell is empty if the URDF has no value: it has none for friction and drives, and may have no inertials.
+    # A cell of the URDF's column is empty if the URDF has no value: it has none for friction and drives, and may have
+    # no inertials.
     nominal[base.bodies :] = np.nan
     if not arm.chain.inertials_complete:
         nominal[:] = np.nan
@@ -119,19 +129,26 @@ def base_table(
 
 
 def _number(value: float) -> str:
-    """Return the text of a number with four digits; "" for NaN."""
+    """Return the text of a number with four significant digits; "" for NaN."""
     return f"{value:.4g}".replace("nan", "")
 
 
 def _interval(parameter: Content) -> str:
-    """Return the value of a base parameter as text, with its confidence interval if it has one."""
+    """Return the text of a base parameter of least squares: its value and, if known, half its 95 % interval.
+
+    parameter: the base parameter in its JSON form.
+    """
     if parameter["deviation"] is None:
         return _number(parameter["value"])
     return Interval("", parameter["value"], parameter["deviation"]).text
 
 
 def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None) -> Listing:
-    """Return the table of mass, centre of mass and principal moments. values: inertial parameters (bodies, 10)."""
+    """Return the table of mass, centre of mass and principal moments of each body.
+
+    values: inertial parameters of the model, (bodies, 10). arm: arm with the parameters of the URDF for comparison;
+    None if unknown. posterior: intervals of the identifiable parameters; None if unknown.
+    """
     alone = ""
     if posterior is not None:
         alone = ", ".join(f"{x.name} = {x.text} {x.unit}" for x in posterior.bodies)
@@ -158,7 +175,10 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
 
 
 def _about_center(body: np.ndarray) -> tuple[str, str, str]:
-    """Return mass, centre of mass and principal moments about the centre as text. body: inertial parameters (10,)."""
+    """Return mass, centre of mass and principal moments about the centre of a body, each as text for a table.
+
+    body: inertial parameters (10,).
+    """
     # A body in a URDF may have no mass. The cells of its centre of mass and principal moments are then empty.
     if body[0] <= 0:
         return f"{body[0]:.4g}", "", ""
@@ -212,7 +232,8 @@ def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]
     # M is linear in the learned functions of q and in the learned constants. Therefore the derivative of M with respect
     # to a constant does not depend on q. `bases` contains the derivatives, (constants, n, n).
     functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # The derivative is M itself if this constant is 1, and all other constants and all functions are 0.
+    # The derivative of M with respect to a constant is M for the value 1 of this constant, if all other constants and
+    # all functions are 0.
     zeros = torch.zeros(functions, count, dtype=torch.float64)
     units = torch.eye(count, dtype=torch.float64)
     rows = []

@@ -116,10 +116,10 @@ def growth_panels(
 
 
 def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
-    """Return the limits of the error axis; None if `errors` has no entry of the model, or no positive error.
+    """Return the limits of the axis of prediction errors, so that errors of diverged baselines do not extend it.
 
-    The limits include the medians of all predictors and the quantiles of the model. Errors of diverged baselines are
-    excluded.
+    The limits include the medians of all predictors and the quantiles of the model. None is returned if `errors`, {name
+    of a line: quantiles}, has no entry of the model, or no positive error.
     """
     # A page of several runs has one line per run and no baselines, so its axis is not limited.
     if labels.MODEL not in errors:
@@ -176,7 +176,7 @@ def mass_panels(
     joint_types: Sequence[str],
     width: int = 330,
 ) -> list[Panel]:
-    """Return charts of the entries of M that are not always zero.
+    """Return one chart over time for each entry of M that is not always zero.
 
     Args:
         t: Times, (T,) [s].

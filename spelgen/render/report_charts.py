@@ -32,7 +32,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
         drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
-    if traces.torques:  # One trajectory is sufficient to show the terms of the energy balance.
+    if traces.torques:  # one trajectory is sufficient to show the terms of the energy balance
         drawn["energy"] = energy_chart(traces.torques[0])
     torques, trajectories = {}, {}
     for trace in traces.torques:
@@ -51,7 +51,7 @@ def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
         distance = None if example.error is None else 1000 * example.error
         off = f"{number(distance)} {thousandths(spec.joint_types)} off"
         return f"{which} log replayed: {example.trajectory}, {off}"
-    start = f"{example.trajectory}, {example.start:.3g} s into it"
+    start = f"{example.trajectory}, from t = {example.start:g} s"
     return f"{which} prediction: {start}, relative error {number(example.error)}"
 
 
@@ -71,7 +71,10 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
 
 
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
-    """Return the charts of each joint: measured and predicted torque, residual, and terms of the predicted torque."""
+    """Return the charts of each joint along a trajectory: torque, residual, and terms of the model's torque.
+
+    The chart of the torque shows the measured and the predicted torque.
+    """
     measured, predicted = trace.measured, trace.predicted[MODEL]
     curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
     components = [(name, torque, name.lower()) for name, torque in trace.parts.items()]
@@ -87,11 +90,16 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
 def friction_panels(
     friction: FrictionTrace, torques: Sequence[TorqueTrace], joints: Sequence[NamedJoint]
 ) -> list[Panel]:
-    """Return one chart per joint: friction over velocity.
+    """Return one chart per joint: friction torque over velocity.
 
     A chart shows the friction of each model at constant velocity, and the measured and modelled friction along the
     trajectories. The measured friction is the measured torque minus the rigid-body torque of the model. Along a
     trajectory the curve forms loops if friction has hysteresis or depends on the load.
+
+    Args:
+        friction: friction of the model and of the baselines at constant velocity.
+        torques: measured and modelled torques along trajectories.
+        joints: Names and units of the joints.
     """
     panels = []
     for k, joint in enumerate(joints):
@@ -118,7 +126,7 @@ def friction_panels(
 
 
 def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, float] | None:
-    """Return limits of the y axis that contain the model's curve, and all values except outliers.
+    """Return limits of the friction axis that contain the model's curve, and all measured values except outliers.
 
     values: measured friction [Nm, N]. curve: friction of the model [Nm, N]. None if no value is finite.
     """
@@ -134,7 +142,14 @@ def _friction_limits(values: np.ndarray, curve: np.ndarray) -> tuple[float, floa
 def coverage_panels(
     traces: Traces, identified: Content | None, joints: Sequence[NamedJoint], limits: Limits
 ) -> list[Panel]:
-    """Return charts per joint: histograms of position and velocity in training and test logs, and position limits."""
+    """Return charts per joint: histograms of position and velocity in training and test logs, and position limits.
+
+    Args:
+        traces: curves of the evaluation, with the histograms of the test logs.
+        identified: content of least_squares.json, with the histograms of the training logs; None if absent.
+        joints: Names and units of the joints.
+        limits: position limits of the joints.
+    """
     logs = {"training": (identified or {}).get("coverage")}
     logs["test"] = traces.coverage
     panels = []
@@ -157,7 +172,10 @@ def coverage_panels(
 
 
 def _histogram(name: str, histogram: Content) -> Band:
-    """Return the outline of a histogram, scaled so that the heights of its bars sum to one."""
+    """Return the outline of a histogram of logged values, scaled so that the heights of its bars sum to one.
+
+    name: "training" or "test". histogram: counts of the bars, and lowest and highest value.
+    """
     counts = array(histogram["counts"])
     # Each bar has two points, which form the steps of the outline.
     edges = np.linspace(histogram["low"], histogram["high"], len(counts) + 1)
@@ -167,7 +185,10 @@ def _histogram(name: str, histogram: Content) -> Band:
 
 
 def energy_chart(trace: TorqueTrace) -> Chart:
-    """Return the chart of the terms of the energy balance along a trajectory."""
+    """Return the chart of the energy balance along a trajectory, in joule over time.
+
+    Its curves are the work of the drives, the stored energy, the work of friction, and the work of the torque residual.
+    """
     styles = ("truth", "urdf", "friction", "model")
     terms = zip(trace.energy.items(), styles, strict=True)
     lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]

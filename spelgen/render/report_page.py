@@ -53,7 +53,10 @@ def write_report(
 
 
 def report_data(folder: Path | str) -> Content:
-    """Return the data of the page for programs: assessment, evaluation, baselines and parameters."""
+    """Return the content of the page about a run as data for programs: assessment, evaluation, parameters.
+
+    Baselines and the posterior are included.
+    """
     run = Run(folder)
     tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
     bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
@@ -124,17 +127,20 @@ STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
 def write_runs(folders: Sequence[Path], output: Path) -> Path:
-    """Write the page about several runs; return its path. Raises RunError for a folder without an evaluated run."""
+    """Write the page that compares several runs; return its path.
+
+    Raises RunError for a folder without an evaluated run.
+    """
     return write_text(output, render_runs(folders))
 
 
 def render_runs(folders: Sequence[Path]) -> str:
-    """Return the page about several runs as HTML."""
+    """Return the page that compares several evaluated runs, as HTML."""
     # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
     runs = {}
     results = {}
     for name, folder in zip(_names(folders), folders, strict=True):
-        RunFolder(folder).read_record()  # This call only checks that the folder contains a run.
+        RunFolder(folder).read_record()  # the record is read only to check that the folder contains a run
         run = Run(folder)
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
@@ -156,7 +162,7 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
     Whole paths are avoided, since they would disclose the user's home folder.
     """
-    # Paths are resolved, because `.` has no name.
+    # Paths of run folders are resolved, because the path `.` has no name.
     paths = list(map(Path.resolve, folders))
     names = []
     for count in range(1, max(len(path.parts) for path in paths) + 1):
@@ -167,8 +173,12 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 
 def _verdict(runs: Mapping[str, Results]) -> str:
-    """Return sentences that name the run with the smallest value of each error that all runs have."""
-    # {label of an error: (value, run, text) of each run}. The value is the first element, so that `min` compares it.
+    """Return sentences that name the run with the smallest value of each error that all runs have.
+
+    runs: {name of a run: its results}.
+    """
+    # `errors`: {label of an error: (value, run, text) of each run}. The value is the first element, so that `min`
+    # compares it.
     errors: dict[str, list[tuple[float, str, str]]] = {}
     for run, results in runs.items():
         for figure in figures(results):

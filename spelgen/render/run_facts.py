@@ -1,4 +1,4 @@
-"""Facts about a run: most important figures, training, options, and the commands that reproduce the run."""
+"""Facts about a run for its page: most important figures, training, options, and commands that reproduce the run."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from spelgen.spec import ModelSpec, Options
 
 
 class Run:
-    """The content of a run folder; an attribute is None if its file is absent.
+    """The content of a run folder, read for its page; an attribute is None if its file is absent.
 
     Attributes:
         config: Record of the fit.
@@ -42,7 +42,7 @@ class Run:
     """
 
     def __init__(self, path: Path | str) -> None:
-        """Read the files. Raises RunError or ModuleError."""
+        """Read the files of the run folder `path`. Raises RunError or ModuleError."""
         folder = self.folder = RunFolder(path)
         self.spec = folder.read_spec()
         self.config = folder.read_record() if folder.config.is_file() else None
@@ -62,19 +62,19 @@ class Run:
 
     @cached_property
     def metrics(self) -> list[Content]:
-        """Losses of each training epoch; empty for a fit without epochs."""
+        """Records of the training, one per epoch, with its losses; empty for a fit without epochs."""
         return self.folder.read_metrics()
 
     @cached_property
     def model(self) -> ArmModel | None:
-        """The trained model; None for a run without weights."""
+        """The trained model of the run; None for a run without weights."""
         if not self.folder.weights.is_file():
             return None
         return fitted_model(self.folder).requires_grad_(False).eval()
 
     @cached_property
     def posterior(self) -> Posterior | None:
-        """Posterior of the trained model; None if its checkpoint has none."""
+        """Posterior distribution of the parameters of the trained model; None if its checkpoint has none."""
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
@@ -84,7 +84,7 @@ class Run:
 
 
 def head_numbers(run: Run) -> list[tuple[str, str]]:
-    """Return the most important figures of a run, each as its text and label."""
+    """Return the most important figures of a run for the head of its page: (text, label) of each."""
     numbers = []
     if run.results is not None:
         numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
@@ -116,7 +116,10 @@ def outlier_note(results: Results) -> str:
 
 
 def best_epoch(metrics: Sequence[Content]) -> int:
-    """Return the epoch of the best model; 0 if no epoch was better than the initial model."""
+    """Return the epoch of the best model (validation loss); 0 if no epoch was better than the initial model.
+
+    metrics: records of the training, one per epoch.
+    """
     # "best" of the last record is the smallest validation loss of the fit, including the loss of the initial model.
     best = metrics[-1]["best"]
     return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
@@ -155,7 +158,7 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
 
 
 def settings(record: Record) -> dict[str, str]:
-    """Return {name: value} of the options of a fit, both as text."""
+    """Return {name: value} of the options of a fit, both as text for the page about a run."""
     options = record.options.items()
     return {key.replace("_", " "): str(value) for key, value in options if value is not None}
 
@@ -166,16 +169,16 @@ def _names(trajectories: Sequence[str]) -> str:
 
 
 def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str]:
-    """Return the commands that reproduce a run.
+    """Return the commands of a shell that reproduce a run, for its page.
 
     The run does not record the paths of its logs, so the commands contain the placeholder LOGS.
     """
-    # Options with default values are omitted, to keep the command short.
+    # Options of `spelgen build` with default values are omitted, to keep the command short.
     options = asdict(spec.options)
     # The run folder has no copy of the design's YAML file, so the command names a file of the user.
     if spec.options.design is not None:
         options["preset"] += ".yaml"
-    # The folder of the URDF is omitted, as it may be a folder of another machine.
+    # The command names the URDF without its folder, as it may be a folder of another machine.
     robot, option = shlex.quote(Path(spec.urdf).name), ""
     if run.urdf.exists():
         robot, option = f"RUN/{run.urdf.name}", f" --robot RUN/{run.urdf.name}"
@@ -193,7 +196,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
-        # A mapping from the command line, stored in the run folder, has replaced the mapping of the robot's settings.
+        # The command contains a mapping that is stored in the run folder: it has replaced the mapping of the robot's
+        # settings.
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SceneLink:
-    """A link and its motion relative to its parent.
+    """A link in the animated picture of an arm, and its motion relative to its parent.
 
     The displacement of the joint is ratio * q[joint] + offset [rad, m].
 
@@ -59,7 +59,7 @@ class SceneLink:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The links of an arm for the animated picture; parents precede their children.
+    """The links of an arm with their shapes for the animated picture; parents precede their children.
 
     extent: sum of the distances between joints [m]. tubes: sentence about the links that are drawn as tubes.
     """
@@ -70,7 +70,10 @@ class Scene:
 
 
 def scene(urdf: Path, joints: Sequence[str]) -> Scene:
-    """Return the scene of an arm. joints: names of its moving joints. Raises the errors of ``read_urdf``."""
+    """Return the links of an arm with their shapes, for the animated picture on a page.
+
+    joints: names of the moving joints of the arm. Raises the errors of ``read_urdf``.
+    """
     robot = read_urdf(urdf)
     constraint = mimic_constraint(robot, joints)
     # Other branches of the robot (a second arm, a base with wheels) are not drawn.
@@ -122,10 +125,10 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
-    """Return the names of the drawn links, parents first.
+    """Return the names of the links that the animated picture of an arm shows, parents first.
 
-    The drawn links are the links from the root to each of the `joints`, all links that move with the joints, and links
-    that are fixed to another drawn link.
+    The picture shows the links from the root to each of the `joints`, all links that move with the joints, and links
+    that are fixed to another shown link.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried = set()
@@ -141,7 +144,11 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 
 
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
-    """Return tubes from the link's origin to its child joints, or to the centre of mass of the last link."""
+    """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
+
+    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum or block. names: the drawn
+    links. radius: radius of the tubes [m].
+    """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
     meshes = []
@@ -164,19 +171,22 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
 
 
 def _axis(joint: UrdfJoint) -> np.ndarray:
-    """Return the unit vector of the joint axis (3,), in the joint frame."""
+    """Return the unit vector of the axis of a URDF joint, (3,), in the joint frame."""
     axis = np.array(joint.axis, dtype=float)
     return axis / (np.linalg.norm(axis) or 1.0)
 
 
 def _rotation(joint: UrdfJoint) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of the joint frame from roll, pitch and yaw about fixed axes [rad]."""
+    """Return the rotation matrix (3, 3) from the frame of a URDF joint to its parent's frame.
+
+    It is computed from roll, pitch and yaw about fixed axes [rad].
+    """
     return np.asarray(Rotation.from_euler("xyz", joint.rpy).as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Triangle mesh in the link frame.
+    """Triangle mesh of a link, in the frame of the link.
 
     vertices: (V, 3) [m], V vertices. faces: (F, 3), vertex indices of F triangles, counterclockwise from outside.
     """
@@ -186,7 +196,7 @@ class Shape:
 
 
 def joined(meshes: Sequence[Trimesh]) -> Shape:
-    """Return one shape with the triangles of all meshes."""
+    """Return one shape with the triangles of all meshes, which are in the frame of one link."""
     import trimesh
 
     if not meshes:
@@ -206,14 +216,14 @@ def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> 
     """
     import trimesh
 
-    # Between joints at nearly the same place a tube would be a disc, so it is omitted.
+    # A tube between joints at nearly the same place would be a disc, so it is omitted.
     if np.linalg.norm(end - start) <= radius / 2:
         return []
     return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
 
 
 def triangles(shape: LinkShape) -> Trimesh:
-    """Return the triangles of a shape in the frame of its link."""
+    """Return the triangle mesh of a visual shape (mesh, box, cylinder or sphere) in the frame of its link."""
     from trimesh import Trimesh, creation
 
     # Cylinders have 12 sides and spheres 8 x 10 faces: pages must remain small, and edges are not visible.

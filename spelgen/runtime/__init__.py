@@ -1,4 +1,4 @@
-"""The classes and functions that modules of `spelgen build` consist of; they depend on PyTorch only."""
+"""Runtime of emitted modules: the model classes that a module of `spelgen build` uses; PyTorch only."""
 
 from spelgen.runtime.derived_mass import ConstantMass, DenseMass, DerivedMass
 from spelgen.runtime.friction_laws import FrictionLaws, SlidingFriction

@@ -1,4 +1,4 @@
-"""The bodies of an arm: their inertial parameters and motion. Four point masses represent each body."""
+"""Kinematics and inertial parameters of the bodies of an arm, each represented by four point masses."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,19 +13,19 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class ChainConfiguration(NamedTuple):
-    """Positions, joint axes and Jacobian of a ``BodyChain`` at q, in the base frame (configuration cache).
+    """Configuration cache of ``BodyChain``: all its quantities that depend on q only, in the base frame.
 
-    Each body is represented by four point masses.
+    Each of the B bodies is represented by four point masses.
     """
 
-    place: Tensor  # positions [m] of the points times the square roots of their masses, (..., 3, bodies, 4)
-    mass: Tensor  # square roots of the masses of the four points of each body, (..., 1, bodies, 4)
-    axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, bodies)
-    # Derivatives of the coordinates of all points with respect to the joint displacement of each of B bodies,
-    # times the square roots of the points' masses, (..., B, 12 B): 3 coordinates of 4 points per body.
+    place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
+    mass: Tensor  # square roots of the point masses, (..., 1, B bodies, 4 points) [kg^(1/2)]
+    axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, B bodies)
+    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each of B
+    # bodies, times sqrt(mass), (..., B, 12 B): 3 coordinates of 4 point masses per body.
     jacobian: Tensor
-    # Minus the acceleration of gravity, times the square root of the point's mass, for each coordinate of
-    # each point of each of B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
+    # Minus the acceleration of gravity, times sqrt(mass), for each coordinate of each point mass of B
+    # bodies, (..., 12 B) [m/s^2 kg^(1/2)].
     weight: Tensor
 
 
@@ -44,12 +44,12 @@ class BodyChain(nn.Module):
         self,
         n: int,
         gravity: Row,
-        parent: Sequence[int],  # index of the carrying body; -1: the base
+        parent: Sequence[int],  # index of each body's parent body; -1: the base
         joint: Sequence[int],
         revolute: Sequence[bool],  # True: rotation about z of the joint frame; False: translation along z
         ratio: Row,  # displacement of a body's joint: ratio * q + offset
         offset: Row,
-        placement: Sequence[Rows],  # joint frame in the parent frame: three rows of [R p], p in m
+        placement: Sequence[Rows],  # joint frame in the frame of the parent body: three rows of [R p], p in m
     ) -> None:
         super().__init__()
         self.parents, count, turns = parent, len(parent), vector(revolute)
@@ -68,8 +68,8 @@ class BodyChain(nn.Module):
         blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
         self.table = nn.Buffer(torch.cat(blocks, dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())
-        # Linear map, (6, 12), from a twist to the 3 x 4 matrix that maps (position, 1) of a point to
-        # its velocity.
+        # `motions`: linear map, (6, 12), from a twist to the 3 x 4 matrix that maps (position, 1) of a point
+        # to the velocity of the point.
         unit = torch.eye(3).double()
         skew = torch.linalg.cross(unit.unsqueeze(-1), unit.unsqueeze(0), dim=1)
         self.motions = nn.Buffer(
@@ -79,18 +79,20 @@ class BodyChain(nn.Module):
         for index, carrier in enumerate(parent):
             if carrier >= 0:
                 carriers[:, index] += carriers[:, carrier]
-        # Mask, (bodies, bodies): 1 if the row's body carries the column's body or is the same, else 0.
+        # `carriers`, (bodies, bodies): entry (i, j) is 1 if body i carries body j or i = j, else 0.
         self.carriers = nn.Buffer(carriers)
-        # The same mask with a column for each coordinate of each point, (bodies, 12 bodies).
+        # `carried`, (bodies, 12 bodies): `carriers` with a column for each coordinate of each point mass.
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
-        # Minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
+        # `base`: minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
 
     def forward(self, q: Tensor, points: Tensor) -> ChainConfiguration:
-        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m].
+        """Return the configuration cache at q: positions and Jacobian of the point masses, and joint axes.
 
-        points: point masses of the bodies in body frames, four columns (position, 1) * sqrt(mass) per
-        body, as a block diagonal matrix, (4 bodies, 4 bodies).
+        Args:
+            q: joint positions, (..., n) [rad, m].
+            points: block diagonal matrix, (4 bodies, 4 bodies); the block of a body has a column (position,
+                1) * sqrt(mass) for each of its four point masses, in the body frame [m, kg].
         """
         # Joint displacements of all bodies; the displacement of a mimic joint is linear in q of its leader.
         value = q @ self.ratios.mT + self.offset
@@ -107,19 +109,19 @@ class BodyChain(nn.Module):
         # The twist of a unit rate is (z, origin x z) for a rotation, (0, z) for a translation.
         axes = torch.cat([angular, torch.linalg.cross(origin, angular, dim=-2) + (z - angular)], dim=-2)
         points = frames @ points
-        # Velocity of every point per unit rate of every joint. The mask `carried` sets it to zero for the
-        # points that the joint does not carry.
+        # Velocity of every point mass per unit rate of every joint. The mask `carried` sets the velocity to
+        # zero for points that the joint does not carry.
         motions = torch.unflatten(axes.mT @ self.motions, -1, (3, 4)).flatten(-3, -2) @ points
         jacobian = torch.unflatten(motions, -2, (-1, 3)).flatten(-2) * self.carried
         place, mass = torch.unflatten(points, -1, (-1, 4)).tensor_split((3,), dim=-3)
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of the points, twists of the bodies, and time derivatives of the joint axes.
+        """Return the velocities of all bodies at the joint velocities qd, (..., n) [rad/s, m/s].
 
-        qd: velocities, (..., n). The velocities of the points, (..., 3, bodies, 4), are multiplied by the
-        square roots of the masses. Twists and derivatives of the axes are (..., 6, bodies) (Featherstone,
-        2.31).
+        Returns:
+            velocities of the point masses times sqrt(mass), (..., 3, bodies, 4); twists of the bodies,
+            (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies) (Featherstone, 2.31).
         """
         rates = qd @ self.ratios.mT
         # The product with the Jacobian, and with the mask `carriers`, sums over the joints that carry a body.
@@ -131,7 +133,18 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return the points' accelerations at qdd = 0 minus gravity, times sqrt(mass), (..., 12 bodies)."""
+        """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
+
+        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian``, which has one
+        row per joint, times the returned vector is the Coriolis, centrifugal and gravity torque.
+
+        Args:
+            cache: configuration cache at q.
+            qd: joint velocities, (..., n) [rad/s, m/s].
+
+        Returns:
+            (..., 12 bodies) [m/s^2 kg^(1/2)]: 3 coordinates of 4 point masses per body.
+        """
         velocity, twists, turning = self.motion(cache, qd)
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
@@ -141,9 +154,12 @@ class BodyChain(nn.Module):
         return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 
     def kinetic_gradient(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return the gradient of 1/2 qd^T M(q) qd with respect to q at constant qd, (..., n) [Nm, N]."""
+        """Return the gradient of 1/2 qd^T M(q) qd with respect to q at constant qd, (..., n) [Nm, N].
+
+        cache: configuration cache at q. qd: joint velocities, (..., n) [rad/s, m/s].
+        """
         velocity, _, turning = self.motion(cache, qd)
-        # Angular momentum of the points about the origin of the base, and linear momentum.
+        # Angular momentum about the origin of the base, and linear momentum, of each point mass.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
         # The derivative with respect to a joint's displacement is the scalar product of the momentum of all
         # bodies that the joint carries and the time derivative of the joint's axis. The rotation of the
@@ -153,7 +169,10 @@ class BodyChain(nn.Module):
 
 
 def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row) -> BodyChain:
-    """Return the ``BodyChain`` of the links; gravity: acceleration in the base frame, (3,) [m/s^2]."""
+    """Return the ``BodyChain`` of an arm with these joints and links.
+
+    gravity: gravitational acceleration in the base frame, (3,) [m/s^2].
+    """
     names, number = [link.name for link in links], {joint.name: k for k, joint in enumerate(joints)}
     types = [link.joint_type or joints[number[link.joint]].joint_type for link in links]
     return BodyChain(
@@ -171,10 +190,13 @@ def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row)
 
 
 def body_factor(parameters: Tensor) -> Tensor:
-    """Return the upper triangular matrix T, (..., 4, 4), of log-Cholesky parameters.
+    """Return the upper triangular factor T of the pseudo-inertia C T T^T C^T of a body, (..., 4, 4).
 
-    The pseudo-inertia of a body is C T T^T C^T, with C C^T its initial value (see ``InertialParameters``).
-    parameters: upper triangular matrix, (..., 4, 4), with the logarithms of extents and mass on the diagonal.
+    C C^T is the initial pseudo-inertia of the body (see ``InertialParameters``).
+
+    Args:
+        parameters: log-Cholesky parameters as an upper triangular matrix, (..., 4, 4): logarithms of three
+            extents and of the mass on the diagonal, shears and displacement of the center of mass above it.
     """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2
@@ -183,10 +205,10 @@ def body_factor(parameters: Tensor) -> Tensor:
 
 
 def pseudo_inertia(link: Link) -> Tensor:
-    """Return the pseudo-inertia [[S, m c], [(m c)^T, m]] of a link in the joint's frame, (4, 4).
+    """Return the pseudo-inertia [[S, m c], [(m c)^T, m]] of a link in the link's joint frame, (4, 4).
 
-    m: mass; c: center of mass; I: inertia tensor about c. S = tr(I)/2 1 - I + m c c^T has the second
-    moments of mass.
+    With the mass m [kg], the center of mass c [m] and the inertia tensor I about c [kg m^2],
+    S = tr(I)/2 1 - I + m c c^T is the matrix of the second moments of mass.
     """
     xx, xy, xz, yy, yz, zz = link.inertia
     inertia = torch.tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=torch.float64)
@@ -197,22 +219,22 @@ def pseudo_inertia(link: Link) -> Tensor:
 
 
 class InertialParameters(nn.Module):
-    """Inertial parameters of bodies that are physically consistent for any trained parameters.
+    """Inertial parameters of all bodies, physically consistent for any values of the trained parameters.
 
-    The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]] with the second moments of mass S in the
-    joint's frame. It is C T T^T C^T with upper triangular C and T, where C C^T is the initial pseudo-inertia,
-    of the links that are passed. T is a function of the trained log-Cholesky parameters (Rucker and Wensing,
-    IEEE RA-L 7:4352, 2022). The parameters of a body are the logarithms of its mass and of its extents along
-    three axes, divided by the initial values, and shear and displacement of the center of mass in units of
-    the extents. All parameters are initially zero, so that T is the identity.
+    The pseudo-inertia of a body is [[S, m c], [(m c)^T, m]] with mass m, center of mass c and second moments
+    of mass S in the joint frame. It is computed as C T T^T C^T with upper triangular C and T. C C^T is the
+    pseudo-inertia of the link in ``links`` (initial value). T is a function of the ten trained log-Cholesky
+    parameters of the body (Rucker and Wensing, IEEE RA-L 7:4352, 2022): the logarithms of its mass and of its
+    extents along three axes, relative to the initial values, and three shears and the displacement of the
+    center of mass, in units of the extents. All parameters are initially zero, so that T is the identity.
     """
 
     parameter_groups = (("raw", "bodies", "kg, kg m, kg m^2"),)
 
     def __init__(self, links: Sequence[Link]) -> None:
         super().__init__()
-        # Linear map, (10, 16), from the entries of an upper triangle, in row-major order, to the flattened
-        # matrix.
+        # `triangle`: linear map, (10, 16), from the entries of an upper triangle, in row-major order, to the
+        # flattened 4 x 4 matrix.
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
@@ -222,8 +244,9 @@ class InertialParameters(nn.Module):
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
-        """Return the four point masses of each body as the columns of C T, (bodies, 4, 4).
+        """Return four point masses for each body, (bodies, 4, 4), which have the body's pseudo-inertia.
 
-        A column is (position, 1) * sqrt(mass), in the joint's frame.
+        They are the columns of the factor C T of the pseudo-inertia C T T^T C^T (see the class). A column is
+        (position, 1) * sqrt(mass), in the joint frame [m, kg].
         """
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))

@@ -1,7 +1,8 @@
-"""Mass matrices M(q) from functions and constants: M = sum_j f_j(q) B_j + sum_k c_k A_k + armature.
+"""Mass matrices M(q) of network models: structured (``DerivedMass``, ``ConstantMass``) and ``DenseMass``.
 
-The matrices B_j and A_k are derived from the structure of the arm, with the minimum number of functions
-and constants (``DerivedMass``). M of ``ConstantMass`` does not depend on q. ``DenseMass`` uses no
+In ``DerivedMass``, M = sum_j f_j(q) B_j + sum_k c_k A_k + armature has learned functions f_j and trained
+constants c_k; the constant matrices B_j and A_k are derived from the kinematics of the arm, with the minimum
+number of functions and constants. M of ``ConstantMass`` does not depend on q. ``DenseMass`` uses no
 structure: all entries of M are functions of the positions of all joints.
 """
 
@@ -19,10 +20,10 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
 class LinearMass(nn.Module):
-    """Base class of mass matrices whose entries are linear combinations of functions of q and of constants.
+    """Base class of mass matrices M whose entries are linear in learned functions of q and in constants.
 
-    The base class has the trained constants and the armature (rotor inertia). Derived classes have the
-    functions.
+    This class has the trained constants and the armature (rotor inertia, added to the diagonal of M). Derived
+    classes add the functions of q, if there are any.
     """
 
     parameter_groups = (
@@ -46,63 +47,65 @@ class LinearMass(nn.Module):
             self.function_scale = nn.Buffer(vector(f.scale for f in functions))
         self.raw_constants = nn.Parameter(vector(x.initial / x.scale for x in constants))
         self.nominal_armature = nn.Buffer(vector(joint.armature for joint in joints))
-        # Logarithm of armature / nominal armature.
+        # `raw_armature`: logarithm of armature / nominal armature, (n,).
         self.raw_armature = nn.Parameter(torch.zeros_like(self.nominal_armature))
 
     def armature(self) -> Tensor:
-        """Return the rotor inertia on the joint side, part of the diagonal of M, (n,) [kg m^2, kg]."""
+        """Return the rotor inertia on the joint side, which is added to diag(M), (n,) [kg m^2, kg]."""
         return self.nominal_armature * self.raw_armature.exp()
 
     def constants(self) -> Tensor:
-        """Return the constants of M, (constants,) [kg m^2, kg m, kg]."""
+        """Return the trained constants c_k of the entries of M, (constants,) [kg m^2, kg m, kg]."""
         return self.constant_scale * self.raw_constants
 
 
 class ConstantMass(LinearMass):
-    """A mass matrix M that does not depend on q, (..., n, n).
+    """A mass matrix M, (..., n, n), that does not depend on q, for example of a gantry.
 
-    M is ``entries(*constants)`` plus the armature; ``entries`` is a function in the emitted module.
-
-    The absolute values of the trained constants are used: a negative constant could make M indefinite.
+    M is ``entries(*constants)`` plus the armature on the diagonal. ``entries`` is a function in the emitted
+    module that places the constants in the matrix. The constants are absolute values of the trained
+    parameters, since a negative constant could make M indefinite.
     """
 
     def constants(self) -> Tensor:
-        """Return the constants of M, (constants,) [kg m^2, kg m, kg]."""
+        """Return the trained constants of the entries of M, all > 0, (constants,) [kg m^2, kg m, kg]."""
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
     def prepare(self) -> Tensor:
-        """Return M, (n, n)."""
+        """Return the parameter cache, which is M itself, (n, n)."""
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return M, (..., n, n), and the encoding of q, (..., 2 n), unchanged.
+        """Return M, (..., n, n), and as intermediate values the encoding of q, (..., 2 n), unchanged.
 
+        M comes from the parameter cache ``parameters``, (n, n), and is expanded to the batch of the encoding.
         ``kinetic_vjp`` uses only the shape of the encoding, because the derivatives of M are zero.
         """
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return d(1/2 qd^T M qd) / d encoding, (..., 2 n), which is zero."""
+        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n): zeros."""
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
-        """Return dM/dt, (..., n, n), which is zero."""
+        """Return dM/dt, (..., n, n): zeros. rate: time derivative of the encoding of q, (..., 2 n)."""
         n = len(self.raw_armature)
         return rate.new_zeros(*rate.shape[:-1], n, n)
 
 
 class DerivedMass(LinearMass):
-    """A mass matrix M(q) that is linear in learned functions of q.
+    """A mass matrix M(q), (..., n, n), that is linear in learned functions of q and in trained constants.
 
-    M is ``entries(*functions, *constants)`` plus the armature; ``entries`` is a function in the emitted
-    module.
+    M is ``entries(*functions, *constants)`` plus the armature on the diagonal. ``entries`` is a function in
+    the emitted module that places functions and constants in the matrix; the functions are outputs of
+    ``network``.
 
-    The result is positive definite for all q and all parameters: if M - margin C is not positive definite,
-    with C the nominal mean of M, M is replaced by M' = C + t (M - C). The factor t is the largest of 1/2,
-    1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the spectral norm of L^-1 X
-    L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the derivatives of
-    M. The zeros of M and the linear relations between entries of M are valid for C, and therefore for M',
-    too.
+    The result is positive definite for all q and all parameters. C denotes M at the nominal means of the
+    functions, without armature. If M - margin C is not positive definite, M is replaced by
+    M' = C + t (M - C). The factor t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The
+    norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise
+    constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the linear relations
+    between entries of M are valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -118,27 +121,30 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is C, the nominal mean of M, and `smallest` is margin C. `forward` corrects M if M -
-        # `smallest` is not positive definite.
+        # `center` is C, M at the nominal means of the functions, and `smallest` is margin C. `forward`
+        # corrects M if M - `smallest` is not positive definite.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # |X| is the Frobenius norm of D X D divided by the smallest eigenvalue of D C D, with D =
-        # diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T. `unit` has the factors of the
-        # entries of X, which include 1 / (1 - margin).
+        # The norm |X| of a matrix X is the Frobenius norm of D X D divided by the smallest eigenvalue of
+        # D C D, with D = diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T, C = L L^T.
+        # `unit`, (n, n), has the factors of the entries of X in |X| / (1 - margin).
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
-        """Return dM / d output for each network output, then M at zero outputs, (outputs + 1, n, n)."""
-        # M is affine in the outputs. All but the last column of `functions` are derivatives with respect to
-        # one output each; the last column is at zero outputs: the means of the functions.
+        """Return the coefficients of M as an affine function of the network outputs, (outputs + 1, n, n).
+
+        For each output the matrix is dM / d output; the last matrix is M at zero outputs, without armature.
+        """
+        # A function is mean + scale * output. All but the last column of `functions` are derivatives of the
+        # functions with respect to one output each; the last column has the means of the functions.
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())
 
     def prepare(self) -> Layers:
-        """Return the layers of a network whose outputs are the entries of M."""
+        """Return the parameter cache: the layers of a network whose outputs are the n n entries of M."""
         rows = self._by_outputs()
         # The linear map from the learned functions to the entries of M is multiplied into the weights of the
         # last layer, which saves an operation per evaluation.
@@ -146,9 +152,10 @@ class DerivedMass(LinearMass):
         return self.network.prepare(rows[:-1].flatten(1).mT, offset.flatten())
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
-        """Return M'(q), (..., n, n), and the values that the derivatives of M' need.
+        """Return the mass matrix M'(q), (..., n, n), and intermediate values for its derivatives.
 
-        The values are the intermediate values of the network, and the factor t (see the class).
+        encoded: encoding of q, (..., 2 n). layers: parameter cache. The intermediate values are the values of
+        the network's layers, and the factor t of M' = C + t (M - C), (...).
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -156,16 +163,22 @@ class DerivedMass(LinearMass):
         return torch.lerp(self.center, mass, fraction[..., None, None]), (intermediates, fraction)
 
     def fraction(self, mass: Tensor) -> Tensor:
-        """Return the factor t of M' = C + t (M - C), (...), for matrices M, (..., n, n); 1 if M is valid."""
+        """Return the factor t of M' = C + t (M - C), (...), for the matrices M in ``mass``, (..., n, n).
+
+        t is 1 if M - margin C is positive definite (see the class).
+        """
         # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
         # matrices are indefinite.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # `norm` is |M - C| / (1 - margin).
+        # `norm` is |M - C| / (1 - margin), see ``DerivedMass``; `unit` contains the divisor.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
+        """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n).
+
+        M' = C + t (M - C) is the corrected mass matrix, see ``DerivedMass``.
+        """
         network, fraction = intermediates
         # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T, since dM' = t dM;
         # the network's outputs are the entries of M.
@@ -173,30 +186,35 @@ class DerivedMass(LinearMass):
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return dM/dt, (..., n, n), for `rate`, the time derivative of the encoding, (..., 2 n)."""
+        """Return dM'/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
         return rows.reshape(*rows.shape[:-1], *self.center.shape)
 
 
 class DenseIntermediates(NamedTuple):
-    """Intermediate values of ``DenseMass.forward`` for the derivatives of M.
+    """Intermediate values of ``DenseMass.forward``, from which the derivatives of M are computed.
 
     M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives the lower triangular U and e > 0; A is constant
     (see ``DenseMass``).
     """
 
     network: Intermediates
-    factor: Tensor  # U of this formula without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A of this formula, (..., 3 n, n)
-    scale: Tensor  # e of this formula, (..., 3 n)
+    factor: Tensor  # U of `DenseMass` without its diagonal of ones, (..., 3 n, 3 n)
+    moved: Tensor  # U^-1 A of `DenseMass`, (..., 3 n, n)
+    scale: Tensor  # e of `DenseMass`, (..., 3 n)
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the nominal inverse mass matrix of ``DenseMass``.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of a nominal large matrix.
 
-    ``mean`` is the lower triangle of the nominal mean of M without armature. It has the z axes of the joints;
-    the diagonal entries of the x and y axes of a joint are set to the entry of its z axis.
+    The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
+    axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
+    the same joint's z axis.
+
+    Args:
+        joints: joints of the arm, whose nominal armature is added to M.
+        mean: lower triangle, by rows, of the nominal mean of M without armature [kg m^2, kg m, kg].
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -210,13 +228,13 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """A mass matrix M(q), (..., n, n), that is a block of a larger matrix with three axes per joint.
+    """A mass matrix M(q), (..., n, n), without structure: a block of a large matrix with 3 axes per joint.
 
-    The inverse of the larger matrix, (..., 3 n, 3 n), is C U diag(e) U^T C^T. C is a constant, the
-    Cholesky factor of the nominal inverse. A network gives U, which is lower triangular with ones on the
-    diagonal, and e > 0: a Cholesky factorisation without square roots. Joints rotate about or move along
-    their z axes only, so M is the block of the z axes: (U^-1 A)^T diag(1 / e) U^-1 A, where A has the z
-    columns of C^-1.
+    The inverse of the large matrix, (..., 3 n, 3 n), is C U diag(e) U^T C^T. C is constant: the Cholesky
+    factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
+    triangular with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints
+    rotate about or move along their z axes only, so M is the block of the z axes:
+    (U^-1 A)^T diag(1 / e) U^-1 A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -226,7 +244,7 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal in the flattened matrix U, in row-major order.
+        # Indices of the entries below the diagonal of the lower triangular matrix U, in row-major order.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -234,27 +252,30 @@ class DenseMass(nn.Module):
         self.network = network
 
     def prepare(self) -> Layers:
-        """Return the layers of the network whose outputs are U and the argument of softplus in e."""
+        """Return the parameter cache: layers of the network that gives U and softplus^-1(e)."""
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse of the larger matrix with three axes per joint, (..., 3 n, 3 n)."""
+        """Return C U diag(e) U^T C^T, the inverse of the large matrix with 3 axes per joint, (..., 3 n, 3 n).
+
+        encoded: encoding of q, (..., 2 n). layers: parameter cache.
+        """
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
         lower = self.nominal @ (factor + torch.eye(self.size).to(factor))
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n); see ``DenseMass``.
+        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n), of ``DenseMass``.
 
-        raw: outputs of the network, (..., outputs).
+        raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and softplus^-1(e).
         """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
         return self._lower(entries), F.softplus(scale)
 
     def _lower(self, entries: Tensor) -> Tensor:
-        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with these entries.
+        """Return the strictly lower triangular matrix, (..., 3 n, 3 n), with the given entries.
 
-        entries: in row-major order, (..., 3 n (3 n - 1) / 2).
+        entries: entries below the diagonal in row-major order, (..., 3 n (3 n - 1) / 2).
         """
         rows = entries.new_zeros(*entries.shape[:-1], self.size * self.size)
         rows = rows.index_copy(-1, self.below, entries)
@@ -266,34 +287,38 @@ class DenseMass(nn.Module):
         return solution
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, DenseIntermediates]:
-        """Return M(q), (..., n, n), and intermediate values for the derivatives of M."""
+        """Return M(q), (..., n, n), and intermediate values for the derivatives of M.
+
+        encoded: encoding of q, (..., 2 n). layers: parameter cache.
+        """
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
         # U^-1 A is solved from a triangular system. An inversion of the larger matrix C U diag(e) U^T C^T
-        # would lose twice as many digits, since its condition number is squared.
+        # would lose twice as many digits, since the condition number of the large matrix is squared.
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
+        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n)."""
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # For kinetic energy T, w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
+        # For the kinetic energy T = 1/2 qd^T M qd, with w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T
+        # and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
-        # For e = softplus(s), de/ds = 1 - exp(-e) = -expm1(-e).
+        # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).
         by_scale = 0.5 * momentum.squeeze(-1) ** 2 * torch.expm1(-scale)
         cotangent = torch.cat([by_entry, by_scale], dim=-1)
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for `rate`, the time derivative of the encoding, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
-        # The differential of U^-1 A is -U^-1 dU U^-1 A.
+        # The differential of U^-1 A of `DenseMass` is -U^-1 dU U^-1 A.
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2

@@ -1,4 +1,4 @@
-"""Friction of each joint with trained constants and a hysteresis state."""
+"""Joint friction: viscous, Coulomb, Stribeck and load-dependent, with hysteresis by Maxwell-slip bristles."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -9,15 +9,15 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Row
 from spelgen.runtime.rows import Joint, vector
 
-# Initial value of `coulomb_smoothing_velocity`, at which the smooth sign of dry friction reaches
-# 0.7, divided by the typical speed.
+# Initial value of `coulomb_smoothing_velocity` divided by the typical speed of the joint. The smooth sign of
+# the velocity, by which dry friction is multiplied, is 0.7 at the smoothing velocity.
 SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """The friction constants of all joints, (n,), and of K bristles per joint, (n, K).
+    """Parameter cache of ``FrictionLaws``: constants of all joints, (n,), and of K bristles each, (n, K).
 
-    All are >= 0; torques are 0 at joints without friction.
+    All constants are in SI units and >= 0. Constants that are torques are 0 at joints without friction.
     """
 
     viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]
@@ -27,47 +27,53 @@ class FrictionConstants(NamedTuple):
     stribeck: Tensor  # additional dry friction at low velocity [Nm, N]
     stribeck_velocity: Tensor  # velocity scale of the Stribeck curve [rad/s, m/s]
     load_dependence: Tensor  # dry friction per magnitude of the gravity torque [1]
-    stribeck_rounding: Tensor  # speed of the rounding of the Stribeck curve, in Stribeck velocities [1]
+    stribeck_rounding: Tensor  # r of ``FrictionLaws``: the Stribeck curve is rounded below r v_stribeck [1]
     coulomb_smoothing_velocity: Tensor  # speed at which the smooth sign of velocity is 0.7 [rad/s, m/s]
-    min_load: Tensor  # torque below which |gravity torque| is smoothed [Nm, N]
+    min_load: Tensor  # gravity torque below which |gravity torque| is smoothed [Nm, N]
     bristle_fractions: Tensor  # fraction of dry friction per bristle, (n, K); sum 1, or 0 without bristles
-    bristle_reach: Tensor  # break-away displacements, (n, K) [rad, m]
-    memoryless: Tensor  # 1 for a joint without bristles, else 0
+    bristle_reach: Tensor  # break-away displacements of the bristles, (n, K) [rad, m]
+    memoryless: Tensor  # 1 for a joint without bristles (friction without state), else 0
 
     def viscosity(self, qd: Tensor) -> Tensor:
-        """Return the viscous friction torque divided by qd, (..., n) [Nm s/rad, N s/m]."""
+        """Return the viscous friction torque divided by the velocity qd, (..., n) [Nm s/rad, N s/m].
+
+        qd: velocities, (..., n) [rad/s, m/s].
+        """
         return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
 
     def dry(self, qd: Tensor, gravity: Tensor) -> Tensor:
-        """Return the magnitude of dry friction, (..., n) [Nm, N], at gravity torques (..., n)."""
+        """Return the magnitude of dry friction, (..., n) [Nm, N]: Coulomb, Stribeck and load-dependent terms.
+
+        qd: velocities, (..., n) [rad/s, m/s]. gravity: gravity torques (the load), (..., n) [Nm, N].
+        """
         speed = qd.abs() / self.stribeck_velocity
         rounding = self.stribeck_rounding
         # Stribeck curve (1 + x / 8)^-8, an approximation of exp(-x), at v = |qd| / stribeck_velocity. With
         # the rounding r, x = (1 + r) v^2 / (v + r) is close to v^2 for large r and to v for small r.
         slow = 1 / (1 + (1 + rounding) / 8 * speed.square() / (speed + rounding))
         slow = slow.square().square().square()  # Squaring three times takes half the time of ** 8.
-        # smooth approximation of |gravity torque|
+        # The load is a smooth approximation of |gravity torque|.
         load = (gravity.square() + self.min_load**2).sqrt()
         return self.coulomb + self.stribeck * slow + self.load_dependence * load
 
     def torque(
         self, qd: Tensor, gravity: Tensor, z: Tensor | None = None, direction: Tensor | None = None
     ) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N].
+        """Return the friction torque of all joints, (..., n) [Nm, N]; positive at a positive steady velocity.
 
         Args:
             qd: velocities, (..., n) [rad/s, m/s].
-            gravity: gravity torques, (..., n) [Nm, N].
-            z: bristle displacements, (..., n, K) [rad, m]; None if unknown: the dry friction of all joints
-                then depends on velocity.
-            direction: factor of dry friction, from -1 to 1, at joints without bristles, (..., n); None:
+            gravity: gravity torques, on which dry friction depends, (..., n) [Nm, N].
+            z: bristle displacements, (..., n, K) [rad, m]. None, if unknown: dry friction of all joints then
+                depends on velocity, as at joints without bristles.
+            direction: factor of dry friction, from -1 to 1, at joints without bristles, (..., n). None:
                 smooth sign of qd.
         """
         if direction is None:
             direction = qd * turning(qd, self.coulomb_smoothing_velocity)
         if z is not None:
-            # The torque of a bristle is proportional to its displacement. At the break-away displacement
-            # it is a fraction of dry friction.
+            # The torque of bristle k is proportional to its displacement. At the break-away displacement it
+            # is the fraction `bristle_fractions[:, k]` of dry friction.
             deflection = (self.bristle_fractions / self.bristle_reach * z).sum(dim=-1)
             direction = deflection + self.memoryless * direction
         return self.viscosity(qd) * qd + self.dry(qd, gravity) * direction
@@ -81,9 +87,9 @@ class FrictionConstants(NamedTuple):
 
 
 class FrictionLaws(nn.Module):
-    """Friction with trained constants, which dissipates energy for any parameters.
+    """Friction of all joints with trained constants; it dissipates energy for any values of the parameters.
 
-    The friction torque is
+    The friction torque of a joint with velocity qd is
 
         viscous qd + saturation s(qd, saturation_velocity) + dry direction,
         dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load,
@@ -91,9 +97,10 @@ class FrictionLaws(nn.Module):
     with v = |qd| / stribeck_velocity, r = stribeck_rounding, load = sqrt(gravity torque^2 + min_load^2) and
     s(x, width) = x / sqrt(x^2 + width^2).
 
-    The parameters are logarithms of the constants, and logits of the bristle fractions. The direction is from
-    -1 to 1: sum_k fraction_k z_k / breakaway_k over the bristles of a joint, which may return elastic energy;
-    s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if z is unknown. For large r the
+    The trained parameters are logarithms of the constants, and logits of the bristle fractions. The factor
+    ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of the joint, which
+    may return elastic energy. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if the
+    bristle displacements z are unknown. For large r the
     Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991);
     for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982), but without a corner at rest.
     Powers replace exponentials, so that a control loop takes a third of the time.
@@ -105,8 +112,8 @@ class FrictionLaws(nn.Module):
     an oscillating load.
     """
 
-    # (name, group, unit of the constant, initial value of the constant) of each parameter. The initial
-    # values are in units of typical friction and typical speed; the parameters are then zero.
+    # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Initial
+    # values are in units of the joint's typical friction and typical speed. A parameter of zero gives them.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -123,15 +130,18 @@ class FrictionLaws(nn.Module):
     ) -> None:
         """Create the friction of the joints, with all constants at their initial values.
 
-        breakaway: break-away displacements of K bristles per joint type, (K,) [rad, m], shortest first.
+        Args:
+            joints: joints with their typical friction and typical speed, the units of the initial values.
+            breakaway: for each joint type, break-away displacements of K bristles, (K,) [rad, m], shortest
+                first.
+            stribeck_rounding: r of the Stribeck curve (see the class).
         """
         super().__init__()
         self.nominal = nn.Buffer(vector(joint.friction for joint in joints))
         self.speed = nn.Buffer(vector(joint.speed for joint in joints))
         rows = [breakaway[joint.joint_type] for joint in joints]
         self.reach = nn.Buffer(torch.tensor(rows, dtype=torch.float64))  # break-away displacements, (n, K)
-        # This is a buffer, not a parameter: a fit to torques chooses for each joint whether it has
-        # bristles.
+        # `memoryless` is a buffer, not a parameter: a fit to torques sets it to 1 at joints without bristles.
         self.memoryless = nn.Buffer(torch.zeros_like(self.speed))
         self.stribeck_rounding = nn.Buffer(torch.full_like(self.speed, stribeck_rounding))
         for name, *_ in FrictionLaws.parameter_groups[:-1]:
@@ -139,16 +149,15 @@ class FrictionLaws(nn.Module):
         self.raw_bristle_fractions = nn.Parameter(torch.zeros_like(self.reach))
 
     def prepare(self) -> FrictionConstants:
-        """Return the friction constants of all joints in SI units."""
+        """Return the parameter cache: friction constants of all joints in SI units."""
         friction, speed, constants = self.nominal, self.speed, []
         units = {
             "Nm s/rad, N s/m": friction / speed, "Nm, N": friction, "rad/s, m/s": speed, "1": friction.sign()
         }  # fmt: skip
         for name, _, unit, initial in FrictionLaws.parameter_groups[:-1]:
-            # Exponentials keep the constants positive; parameters of zero give typical magnitudes of
-            # the joint.
+            # exp keeps the friction constants positive. Parameters of zero give their initial values.
             constants.append(initial * units[unit] * getattr(self, name).exp())
-        # |gravity torque| has no derivative at zero, so it is smoothed below 1 % of typical friction.
+        # |gravity torque| has no derivative at zero: `load` smooths it below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
         # At joints without bristles the smooth sign has a width of 0.1 % of the typical speed: a wider
@@ -160,12 +169,19 @@ class FrictionLaws(nn.Module):
 
 
 def turning(velocity: Tensor, width: Tensor) -> Tensor:
-    """Return 1 / sqrt(velocity^2 + width^2), (..., n); the product with the velocity is a smooth sign."""
+    """Return 1 / sqrt(velocity^2 + width^2), (..., n) [s/rad, s/m].
+
+    The smooth sign of the velocity is the velocity times the result. width: velocity at which the smooth sign
+    is 0.7, (n,) [rad/s, m/s].
+    """
     return torch.rsqrt(velocity * velocity + width**2)
 
 
 class SlidingFriction(FrictionLaws):
-    """Friction without state: dry friction depends on velocity by a smooth sign, whose width is trained."""
+    """Friction without hysteresis state: dry friction is multiplied by a smooth sign of the velocity.
+
+    The smoothing velocity, at which the smooth sign is 0.7, is trained in addition to the other constants.
+    """
 
     parameter_groups = (("raw_coulomb_smoothing_velocity", "velocities", "rad/s, m/s", SMOOTHING_VELOCITY),)
 
@@ -178,6 +194,6 @@ class SlidingFriction(FrictionLaws):
         self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:
-        """Return the friction constants of all joints in SI units."""
+        """Return the parameter cache: friction constants of all joints in SI units."""
         velocity = SMOOTHING_VELOCITY * self.speed * self.raw_coulomb_smoothing_velocity.exp()
         return super().prepare()._replace(coulomb_smoothing_velocity=velocity)

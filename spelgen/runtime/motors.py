@@ -1,4 +1,4 @@
-"""Motors with gears and couplings, and position servos, whose inputs are commanded positions."""
+"""Inputs of an arm: motors with gears and couplings, and position servos with commanded positions."""
 
 import math
 from collections.abc import Sequence
@@ -15,16 +15,17 @@ from spelgen.runtime.rows import vector
 class MotorInputs(nn.Module):
     """A constant input matrix G, (n, n): entry (i, j) is the torque of joint i per input of motor j.
 
-    A joint without a motor is passive. The sign of an entry is never trained.
+    Motors may drive several joints (couplings). A joint without a motor is passive: its row of G is zero. A
+    trained gain is a positive factor of the given entry, so training cannot change the sign of an entry.
 
     Args:
-        gains: rows of G.
-        trained: rows of a mask, True for entries of G that are trained; None: all entries are constant.
+        gains: rows of G, with the initial values of trained entries.
+        trained: rows of a mask, True for entries of G that are trained. None: all entries are constant.
     """
 
     parameter_groups = (("raw_gains", "gains", "1"),)
 
-    raw_gains: nn.Parameter | None  # log(gain / initial gain)
+    raw_gains: nn.Parameter | None  # log(gain / initial gain) of each trained gain, (trained,)
 
     def __init__(self, gains: Rows, trained: Rows | None = None) -> None:
         super().__init__()
@@ -44,7 +45,7 @@ class MotorInputs(nn.Module):
         self.register_parameter("raw_gains", raw)
 
     def gains(self) -> Tensor:
-        """Return G, (n, n): joint torque per motor torque."""
+        """Return the input matrix G, (n, n): joint torque per input of a motor."""
         if self.raw_gains is None:
             return self.constant_gains
         raw = self.raw_gains
@@ -53,13 +54,14 @@ class MotorInputs(nn.Module):
         return self.constant_gains + gain.unsqueeze(-1) * self.trained_gains
 
     def force(self, tau: Tensor) -> Tensor:
-        """Return G tau, (..., n) [Nm, N]."""
+        """Return the joint torques G tau, (..., n) [Nm, N], at inputs tau, (..., n)."""
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N].
+        """Return the inputs tau, (..., n), that solve G tau = force, for joint torques ``force``, (..., n).
 
-        A passive joint has no input: the result for it is the element of ``force``.
+        A passive joint has no input. Its element of the result is its element of ``force``: the torque that
+        no motor provides.
         """
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))
@@ -67,21 +69,28 @@ class MotorInputs(nn.Module):
 
 
 class ServoConstants(NamedTuple):
-    """The constants of all servos, (n,); all are positive, and the dead zone may be zero."""
+    """Constants of all position servos, (n,): kp, kd and limit are positive, the dead zone is >= 0."""
 
-    kp: Tensor  # torque per position error [Nm/rad, N/m]
-    kd: Tensor  # torque per velocity [Nm s/rad, N s/m]
-    limit: Tensor  # largest torque [Nm, N]
-    dead_zone: Tensor  # half the width of the dead zone [rad, m]
+    kp: Tensor  # servo torque per position error [Nm/rad, N/m]
+    kd: Tensor  # servo torque per velocity [Nm s/rad, N s/m]
+    limit: Tensor  # largest magnitude of the servo torque [Nm, N]
+    dead_zone: Tensor  # half the width of the dead zone of the position error [rad, m]
 
 
 class PositionServo(nn.Module):
     """Position servos: tau = clip(kp d(u - q) - kd qd, -limit, limit), u commanded ``delay`` seconds earlier.
 
-    q and qd are the position and velocity of a joint. d(x) is x reduced in magnitude by half the width of a
-    dead zone, and 0 within the zone, which is due to gear backlash or to the controller. A servo is a spring
-    and a damper: the spring stores the energy 1/2 kp d(q - u)^2, so that the arm with the input u is
-    port-Hamiltonian. The trained parameters are logarithms of kp and kd; a known kp is not trained.
+    u is the commanded position, q and qd are the position and velocity of a joint. d(x) is x reduced in
+    magnitude by half the width of a dead zone, and 0 within the dead zone, which is due to gear backlash or
+    to the controller. A servo is a spring and a damper: the spring stores the energy 1/2 kp d(q - u)^2, so
+    the arm with the input u is port-Hamiltonian. The trained parameters are logarithms of kp and kd, relative
+    to the given values.
+
+    Args:
+        kp: initial kp, (n,) [Nm/rad, N/m].
+        kd: initial kd, (n,) [Nm s/rad, N s/m].
+        limit: largest magnitude of the servo torque, (n,) [Nm, N]. None: unlimited.
+        known: True for joints whose kp is known and not trained, (n,).
     """
 
     parameter_groups = (
@@ -104,18 +113,18 @@ class PositionServo(nn.Module):
         self.nominal_kd = nn.Buffer(vector(kd))
         self.trained = nn.Buffer(vector(float(not x) for x in known))
         self.limit = nn.Buffer(vector(math.inf if x is None else x for x in limit))
-        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # delay of commands [s]
+        self.delay = nn.Buffer(torch.zeros((), dtype=torch.float64))  # delay of all commands [s]
         # The dead zone is a buffer, not a parameter: training must not change it; a fit to commands sets it.
         self.dead_zone = nn.Buffer(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kp = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
         self.raw_kd = nn.Parameter(torch.zeros(len(kp), dtype=torch.float64))
 
     def kp(self) -> Tensor:
-        """Return kp, the torque per position error, (n,) [Nm/rad, N/m]."""
+        """Return kp, the servo torque per position error, (n,) [Nm/rad, N/m]."""
         return self.nominal_kp * (self.trained * self.raw_kp).exp()
 
     def kd(self) -> Tensor:
-        """Return kd, the torque per velocity, (n,) [Nm s/rad, N s/m]."""
+        """Return kd, the servo torque per joint velocity, (n,) [Nm s/rad, N s/m]."""
         return self.nominal_kd * self.raw_kd.exp()
 
     def prepare(self) -> ServoConstants:
@@ -123,18 +132,32 @@ class PositionServo(nn.Module):
         return ServoConstants(self.kp(), self.kd(), self.limit, self.dead_zone.clamp(min=0))
 
     def forward(self, u: Tensor, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the servo torque, (..., n) [Nm, N], for the delayed command u, (..., n) [rad, m]."""
+        """Return the servo torques, (..., n) [Nm, N].
+
+        Args:
+            u: commanded positions, already delayed by ``delay``, (..., n) [rad, m].
+            q: joint positions, (..., n) [rad, m].
+            qd: joint velocities, (..., n) [rad/s, m/s].
+        """
         kp, kd, limit, dead_zone = self.prepare()
         return (kp * beyond(u - q, dead_zone) - kd * qd).clamp(-limit, limit)
 
     def stored_energy(self, u: Tensor, q: Tensor) -> Tensor:
-        """Return the elastic energy of all servos, (...) [J], at commands u and positions q, (..., n)."""
+        """Return the elastic energy 1/2 kp d(q - u)^2 of all servos, summed over the joints, (...) [J].
+
+        d(x) is x reduced in magnitude by half the width of the dead zone. u: commanded positions, (..., n)
+        [rad, m]. q: joint positions, (..., n) [rad, m].
+        """
         return 0.5 * (self.kp() * beyond(q - u, self.dead_zone.clamp(min=0)) ** 2).sum(dim=-1)
 
 
 def beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
-    """Return signed distances x, (..., n), as x - dead_zone above the zone, x + dead_zone below it, else 0.
+    """Return the distances that exceed a dead zone, (..., n): x - dead_zone above it, x + dead_zone below it.
 
-    dead_zone: half the width of the dead zone, (n,), which is centred at zero.
+    The result is 0 within the dead zone.
+
+    Args:
+        distance: signed distances x from the middle of the dead zone, (..., n) [rad, m].
+        dead_zone: half the width of the dead zone, (n,) [rad, m].
     """
     return distance - distance.clamp(-dead_zone, dead_zone)

@@ -1,4 +1,4 @@
-"""Port-Hamiltonian models whose M, V, D and G are networks."""
+"""Port-Hamiltonian models whose mass matrix M, potential V, dissipation D and input matrix G are networks."""
 
 from __future__ import annotations
 
@@ -16,16 +16,25 @@ from spelgen.runtime.rows import Joint, vector
 
 
 class NetworkConfiguration(NamedTuple):
-    """Configuration cache of ``NetworkDynamics``: the quantities that depend on q and not on qd."""
+    """Configuration cache of ``NetworkDynamics``: the quantities that depend on q only, not on qd."""
 
     encoded: Tensor  # encoding of q, (..., 2 n), input of the networks
     mass: Tensor  # M(q), (..., n, n)
-    intermediates: Intermediates  # intermediate values for the derivatives of M
+    intermediates: Intermediates  # intermediate values of M's network, for the derivatives of M
     parameters: dict[str, Parameters]
 
 
 class NetworkDynamics(PortHamiltonian):
-    """A model whose M, V and D are networks; V is ``potential_scale`` [J] times the output of its network."""
+    """A model whose mass matrix M(q), potential V(q) and dissipation matrix D(q, qd) are networks.
+
+    Args:
+        joints: joints of the arm.
+        mass: M(q).
+        potential: network of V / potential_scale, with the encoding of q as input.
+        potential_scale: unit of V [J].
+        friction: D(q, qd).
+        inputs: constant input matrix G; None: each input drives its own joint.
+    """
 
     def __init__(
         self,
@@ -43,53 +52,59 @@ class NetworkDynamics(PortHamiltonian):
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return {"mass", "potential", "friction": parameter cache}."""
-        # The offset of V is zero, since a constant in V has no effect on the motion. It is computed as 0 *
-        # scale, which has the right dtype and device.
+        """Return the parameter caches of M, V and D, with the keys "mass", "potential" and "friction".
+
+        They depend on the trained parameters only, and are valid until a parameter changes.
+        """
+        # The offset of V is zero, since a constant in V has no effect on the motion. It is computed as
+        # 0 * scale, which has the dtype and device of the model.
         potential = self.potential.prepare(self.scale, 0 * self.scale[0])
         return {"mass": self.mass.prepare(), "potential": potential, "friction": self.friction.prepare()}
 
     def configuration(self, q: Tensor, parameters: dict[str, Parameters]) -> NetworkConfiguration:
-        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
+        """Return the configuration cache at q, (..., n) [rad, m]; parameters: caches from ``prepare``."""
         encoded = self.encoding.forward(q)
         mass, intermediates = self.mass.forward(encoded, parameters["mass"])
         return NetworkConfiguration(encoded, mass, intermediates, parameters)
 
     def potential_energy(self, q: Tensor | NetworkConfiguration) -> Tensor:
-        """Return V(q), (...) [J]."""
+        """Return the potential energy V(q), (...) [J]; q: (..., n) [rad, m], or a configuration cache."""
         cache: NetworkConfiguration = self.at(q)
         return self.potential.forward(cache.encoded, cache.parameters["potential"])[0].squeeze(-1)
 
     def gravity(self, q: Tensor | NetworkConfiguration) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
         cache: NetworkConfiguration = self.at(q)
         # At rest, the gradient of the kinetic energy is zero, so the Lagrangian gradient is -dV/dq.
         return -self.lagrangian_gradient(cache, torch.zeros_like(cache.mass[..., 0]))
 
     def lagrangian_gradient(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        """Return the gradient of 1/2 qd^T M(q) qd - V(q) (Lagrangian) with respect to q, (..., n) [Nm, N]."""
         cache: NetworkConfiguration = self.at(q, qd)
         intermediates = self.potential.forward(cache.encoded, cache.parameters["potential"])[1]
         # Reverse mode: one sweep through the network of M for 1/2 qd^T M qd, one through the network of V.
-        # Both are gradients with respect to the encoding, which `encoding.vjp` converts to d/dq.
+        # Both results are gradients with respect to the encoding of q; `encoding.vjp` converts them to d/dq.
         kinetic = self.mass.kinetic_vjp(qd, cache.intermediates)
         return self.encoding.vjp(cache.encoded, kinetic - self.potential.vjp(intermediates, qd.new_ones(1)))
 
     def nonlinear_effects(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
-        """Return dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq, (..., n)."""
+        """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N].
+
+        It is dM/dt qd - d/dq (1/2 qd^T M qd) + dV/dq.
+        """
         cache: NetworkConfiguration = self.at(q, qd)
-        # dM/dt is one directional derivative along qd. This takes less time than the n^3 Christoffel symbols.
+        # dM/dt is one directional derivative along qd, which takes less time than n^3 Christoffel symbols.
         mass_rate = self.mass.jvp(self.encoding.jvp(cache.encoded, qd), cache.intermediates)
         return applied(mass_rate, qd) - self.lagrangian_gradient(cache, qd)
 
     def friction_torque(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
-        """Return D(q, qd) qd, (..., n) [Nm, N]."""
+        """Return the friction torque D(q, qd) qd, (..., n) [Nm, N]."""
         cache: NetworkConfiguration = self.at(q, qd)
         layers = cache.parameters["friction"]
         return self.friction.forward(cache.encoded, qd, layers, qd.unsqueeze(-1)).squeeze(-1)
 
     def dissipation(self, q: Tensor | NetworkConfiguration, qd: Tensor) -> Tensor:
-        """Return D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
+        """Return the dissipation matrix D(q, qd), (..., n, n) [Nm s/rad, N s/m]."""
         cache: NetworkConfiguration = self.at(q, qd)
         return self.friction.forward(
             cache.encoded, qd, cache.parameters["friction"], torch.eye(self.n).to(qd)
@@ -97,10 +112,10 @@ class NetworkDynamics(PortHamiltonian):
 
 
 class DenseInputDynamics(NetworkDynamics):
-    """A model whose M, V, D and diagonal input matrix G(q) are networks.
+    """A ``NetworkDynamics`` whose input matrix G(q) is a network, too; G is diagonal.
 
-    The network of G has three outputs per joint, one for each axis of the joint's frame. Only the output of
-    the z axis, about or along which the joint moves, is used.
+    The network of G has three outputs per joint, one for each axis of the joint frame. Only the output of
+    the z axis, about or along which the joint moves, is used. The gain of a joint is 1 + output.
     """
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
@@ -109,35 +124,36 @@ class DenseInputDynamics(NetworkDynamics):
         self.input_network = input_network
 
     def prepare(self) -> dict[str, Parameters]:
-        """Return {"mass", "potential", "friction", "input": parameter cache}; "input" is the network of G."""
+        """Return the parameter caches of M, V, D and G: "mass", "potential", "friction" and "input"."""
         return super().prepare() | {"input": self.input_network.prepare(self.moving, self.moving.sum(dim=1))}
 
     def _gains(self, cache: NetworkConfiguration) -> Tensor:
-        """Return the diagonal of G, (..., n)."""
+        """Return the diagonal of G(q), (..., n): joint torque per input; cache: configuration cache at q."""
         return self.input_network.forward(cache.encoded, cache.parameters["input"])[0]
 
     def input_matrix(self, q: Tensor) -> Tensor:
-        """Return G(q), (..., n, n)."""
+        """Return the diagonal input matrix G(q), (..., n, n): joint torque per input."""
         return torch.diag_embed(self._gains(self.at(q)))
 
     def input_force(self, cache: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return G(q) tau, (..., n) [Nm, N]."""
+        """Return the joint torques G(q) tau of the inputs tau, (..., n) [Nm, N]; qd has no effect."""
         return self._gains(cache) * tau
 
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G(q) tau = force, with force (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G(q) tau = force, for joint torques force, (..., n)."""
         return force / self._gains(cache)
 
 
 class NetworkFriction(nn.Module):
-    """Base class of dissipation matrices D(q, qd) that a network computes.
+    """Base class of dissipation matrices D(q, qd), (..., n, n), that are computed by a network.
 
-    The network's outputs are in units of the joint's typical friction and typical speed.
+    The outputs of the network are scaled by typical friction and typical speed of the joints, so that they
+    are of the order of one.
     """
 
-    prepare: Callable[[], Parameters]  # returns the quantities that depend on parameters only
-    # Returns the product of D(q, qd) and a matrix, (..., n, k). The arguments are the encoded positions,
-    # qd, the parameter cache, and the matrix, (..., n, k).
+    prepare: Callable[[], Parameters]  # returns the parameter cache (quantities independent of q and qd)
+    # `forward` returns the product of D(q, qd) and a matrix, (..., n, k). Its arguments are the encoding of
+    # q, (..., 2 n), qd, (..., n), the parameter cache, and the matrix, (..., n, k).
     forward: Callable[[Tensor, Tensor, Parameters, Tensor], Tensor]
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork) -> None:
@@ -148,7 +164,7 @@ class NetworkFriction(nn.Module):
 
 
 class JointFrictionParameters(NamedTuple):
-    """Parameter cache of ``JointFriction``: quantities that depend only on trained parameters."""
+    """Parameter cache of ``JointFriction``: quantities that depend on trained parameters only."""
 
     layers: Layers
     viscous: Tensor  # viscous coefficients, (n,) [Nm s/rad, N s/m]
@@ -156,7 +172,12 @@ class JointFrictionParameters(NamedTuple):
 
 
 class JointFriction(NetworkFriction):
-    """A diagonal, positive definite D(q, qd): viscous coefficients, and a network for dry friction."""
+    """A diagonal, positive definite dissipation matrix D(q, qd): viscous and dry friction of each joint.
+
+    The diagonal is viscous + typical friction * softplus(output) / sqrt(qd^2 + w^2), with the output of a
+    network for each joint and a trained smoothing velocity w, below which dry friction changes its sign
+    smoothly. The inputs of the network are the encoding of q, qd and qd / sqrt(qd^2 + w^2).
+    """
 
     parameter_groups = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m"),
@@ -169,13 +190,13 @@ class JointFriction(NetworkFriction):
         self.raw_viscous = nn.Parameter(torch.full_like(self.speed, -2.0))
 
     def viscous(self) -> Tensor:
-        """Return the viscous coefficients, (n,) [Nm s/rad, N s/m]."""
+        """Return the viscous friction coefficients, (n,) [Nm s/rad, N s/m]."""
         return self.nominal * F.softplus(self.raw_viscous) / self.speed
 
     def prepare(self) -> JointFrictionParameters:
-        """Return the quantities that depend on trained parameters only (parameter cache)."""
-        # Dry friction is multiplied by qd / sqrt(qd^2 + smoothing). The root of `smoothing` is initially 3 %
-        # of the typical speed and at least 0.1 %, so that the quotient is always smooth.
+        """Return the parameter cache: quantities that depend on trained parameters only."""
+        # Dry friction is multiplied by qd / sqrt(qd^2 + smoothing). sqrt(smoothing) is a velocity: initially
+        # 3 % of the typical speed, and at least 0.1 %, so that the quotient is smooth for all parameters.
         smoothing = self.speed**2 * (0.001**2 + (0.03 * self.raw_smoothing.exp()) ** 2)
         start = torch.full_like(self.speed, -2.0)
         layers = self.network.prepare(torch.diag(0 * start + 1), start)
@@ -184,42 +205,53 @@ class JointFriction(NetworkFriction):
     def forward(
         self, encoded: Tensor, qd: Tensor, parameters: JointFrictionParameters, right: Tensor
     ) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``; both are (..., n, columns)."""
+        """Return the product of D(q, qd) and the matrix ``right``, (..., n, columns).
+
+        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s].
+        """
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)
         inputs = torch.cat([encoded, qd, qd / smooth_speed], dim=-1)
-        # Dry friction, divided by typical friction; softplus keeps it positive.
+        # `dry`: dry friction of each joint, divided by typical friction; softplus keeps it positive.
         dry = F.softplus(self.network.forward(inputs, layers)[0])
         diagonal: Tensor = viscous + self.nominal * dry / smooth_speed
         return diagonal.unsqueeze(-1) * right
 
 
 class DenseFriction(NetworkFriction):
-    """A dense, positive semi-definite D(q, qd) = L L^T, where L has ``axes`` rows per joint, one per axis.
+    """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
 
-    A joint rotates about or moves along its last axis only, so only the row of the last axis of each joint is
-    computed.
+    L is lower triangular with ``axes`` rows per joint, one per axis of the joint frame. A joint rotates about
+    or moves along its last axis only, so only the row of the last axis of each joint is computed: the result
+    is D, (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
         super().__init__(joints, network)
         rows = axes * len(joints)
         row, column = torch.tril_indices(rows, rows)
-        # Linear map, (rows, rows, entries), from the entries of a lower triangle, in row-major order, to the
-        # matrix.
+        # `spread`: linear map, (rows, rows, entries), from the entries of the lower triangle of L, in
+        # row-major order, to the matrix L.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
         # The initial L is diagonal, in units of the square root of typical friction / typical speed.
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the layers of a network whose outputs are the rows of L for the last axes, flattened."""
+        """Return the parameter cache: layers of a network whose outputs are the flattened rows of L.
+
+        Only the rows of the joints' last axes are included: n rows of n * axes entries
+        [sqrt(Nm s/rad), sqrt(N s/m)].
+        """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
         return self.network.prepare(output_map, (size * self.initial).flatten())
 
     def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``; both are (..., n, columns)."""
+        """Return the product of D(q, qd) and the matrix ``right``, (..., n, columns).
+
+        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s]. layers: parameter cache.
+        """
         rows = self.network.forward(torch.cat([encoded, qd / self.speed], dim=-1), layers)[0]
         factor = rows.reshape(*qd.shape[:-1], *self.initial.shape)
         return factor @ (factor.mT @ right)

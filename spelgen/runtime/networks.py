@@ -1,4 +1,4 @@
-"""Networks in which each output depends on specified joints only, and the encoding of positions as inputs."""
+"""Networks in which each output depends on specified joints only, and the encoding of q as their input."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -16,32 +16,38 @@ SPACING = 2 / (GRID - 1)
 
 
 class JointEncoding(nn.Module):
-    """Encoding of positions, (..., 2 n): cos q of all n joints, then sin q of all joints.
+    """Encoding of joint positions as inputs of networks, (..., 2 n): cos q of all joints, then sin q.
 
-    A prismatic joint has the scaled q in place of cos q, and 0 in place of sin q.
+    A prismatic joint has the scaled position (q - center) / half_range in place of cos q, and 0 in place of
+    sin q, with ``center`` and ``half_range`` of its ``Joint``.
     """
 
     def __init__(self, joints: Sequence[Joint]) -> None:
         super().__init__()
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints))
         self.center = nn.Buffer(vector(joint.center for joint in joints))
-        # d(scaled q)/dq of prismatic joints, zero for revolute joints
+        # `slope`: derivative of the scaled position with respect to q, (n,); zero for revolute joints.
         self.slope = nn.Buffer((1 - self.revolute) / vector(joint.half_range for joint in joints))
 
     def forward(self, q: Tensor) -> Tensor:
-        """Return the encoding, (..., 2 n), of q (..., n) [rad, m]."""
+        """Return the encoding, (..., 2 n), of the joint positions q, (..., n) [rad, m]."""
         scaled = self.slope * (q - self.center)
         return torch.cat([torch.addcmul(scaled, self.revolute, q.cos()), self.revolute * q.sin()], dim=-1)
 
     def jvp(self, encoded: Tensor, qd: Tensor) -> Tensor:
-        """Return the time derivative of the encoding, (..., 2 n), at the velocity qd, (..., n)."""
+        """Return the time derivative of the encoding, (..., 2 n), at the velocity qd, (..., n).
+
+        encoded: encoding of q, (..., 2 n).
+        """
         first, second = encoded.chunk(2, dim=-1)
         return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """Return the gradient of a scalar with respect to q, (..., n).
+        """Return the gradient of a scalar with respect to q, (..., n), from its gradient in the encoding.
 
-        cotangent: gradient of this scalar with respect to the encoding of q, (..., 2 n).
+        Args:
+            encoded: encoding of q, (..., 2 n).
+            cotangent: gradient of the scalar with respect to the encoding, (..., 2 n).
         """
         first, second = encoded.chunk(2, dim=-1)
         by_first, by_second = cotangent.chunk(2, dim=-1)
@@ -49,19 +55,23 @@ class JointEncoding(nn.Module):
 
 
 def hidden_units(outputs: Sequence[tuple[int, ...]], width: int, min_units: int) -> list[tuple[int, ...]]:
-    """Return a tuple of joints for each unit of a hidden layer: the joints that the unit may depend on.
+    """Return for each unit of a hidden layer the indices of the joints that the unit may depend on.
 
-    outputs: the joints that each output of the network depends on. Outputs that depend on the same joints
-    form a group. The ``width`` units are divided among the groups in proportion to their numbers of outputs,
-    but each group has at least ``min_units``.
+    Outputs of the network that depend on the same joints form a group. The units are divided among the groups
+    in proportion to their numbers of outputs.
+
+    Args:
+        outputs: for each output of the network, the indices of the joints that it depends on.
+        width: number of units of the layer.
+        min_units: smallest number of units of a group; the layer is wider than ``width`` if necessary.
     """
     counts = Counter(outputs)
     groups = sorted(counts, key=lambda joints: (len(joints), joints))
     ideal = [width * counts[group] / len(outputs) for group in groups]
     units = [max(min_units, round(share)) for share in ideal]
     index = range(len(groups))
-    # The sum of the rounded numbers of units may differ from `width`. The groups with the largest rounding
-    # errors are corrected first.
+    # The sum of the rounded numbers of units of all groups may differ from `width`. The groups with the
+    # largest rounding errors are corrected first.
     while sum(units) > width and max(units) > min_units:
         units[max(index, key=lambda k: units[k] - ideal[k] if units[k] > min_units else -width)] -= 1
     while sum(units) < width:
@@ -77,16 +87,18 @@ def joint_masks(
     depth: int,
     min_units: int,
 ) -> Iterator[Tensor]:
-    """Yield one mask for each layer, (units, inputs): the factors by which the weights are multiplied.
+    """Yield a mask for each layer of a network, (units, inputs): the factors of the layer's weights.
 
-    A factor is 0 if the input depends on a joint that the unit must not depend on. All other factors are 1;
-    in the first layer, they are the scales of the inputs.
+    A factor is 0 if the input depends on a joint that the unit must not depend on, so that each output of the
+    network depends on specified joints only. All other factors are 1 in hidden and output layers; in the
+    first layer, they are the scales of the inputs.
 
     Args:
         joints: joints of the arm.
-        scales: scales of the inputs; a row (n,) has the scales of one input of each joint.
+        scales: scales of the network's inputs; a row (n,) has the scales of one input of each joint, for
+            example of cos q.
         outputs: names of the joints that each output depends on.
-        width: units of a hidden layer.
+        width: number of units of each hidden layer.
         depth: number of hidden layers.
         min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
@@ -102,25 +114,29 @@ def joint_masks(
 
 
 class MaskedNetwork(nn.Module):
-    """A network in which each output depends on specified joints only, with explicit derivatives.
+    """Base class of networks in which each output depends on specified joints only.
+
+    ``prepare`` returns the masked layers, ``forward`` evaluates them, ``vjp`` and ``jvp`` return explicit
+    derivatives of the outputs with respect to the inputs.
 
     Args:
         generator: random generator of the initial weights; the weights of the last layer are zero.
         joints: joints of the arm.
-        scales: rows (n,) with the scales of the inputs: cos q or the scaled q, sin q, and any others.
-        outputs: names of the joints that each output depends on; masks remove all paths to other
-            joints.
+        scales: rows (n,) with the scales of the inputs of each joint: cos q or the scaled q (see
+            ``JointEncoding``), sin q, and any others, such as qd.
+        outputs: names of the joints that each output depends on; masks set the weights of all paths from
+            other joints to zero.
         width, depth: number of units of a hidden layer, and number of hidden layers.
         min_units: smallest number of hidden units per group of outputs that depend on the same joints.
     """
 
-    points = 0  # number of Gaussians in the function of an edge; 0: an edge is a single weight
+    points = 0  # number of Gaussians in the function of an edge (input to unit); 0: the edge is one weight
 
-    # Returns the outputs, (..., rows), of the layers that ``prepare`` returned, and the intermediate values
-    # that ``vjp`` and ``jvp`` need.
+    # ``forward`` returns the outputs, (..., rows), of the layers that ``prepare`` returned, and the
+    # intermediate values that ``vjp`` and ``jvp`` need.
     forward: Callable[[Tensor, Layers], tuple[Tensor, Intermediates]]
-    vjp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.vjp``
-    jvp: Callable[[Intermediates, Tensor], Tensor]  # see ``MaskedMLP.jvp``
+    vjp: Callable[[Intermediates, Tensor], Tensor]  # returns cotangent^T J, with J = d outputs / d inputs
+    jvp: Callable[[Intermediates, Tensor], Tensor]  # returns J tangent, with J = d outputs / d inputs
 
     def __init__(
         self,
@@ -150,13 +166,17 @@ class MaskedNetwork(nn.Module):
             self.weights.append(nn.Parameter(weight * slopes / readable.sqrt()))
             self.biases.append(nn.Parameter(torch.zeros(len(mask), dtype=torch.float64)))
             self.register_buffer(f"mask{index}", edges)
-        nn.init.zeros_(self.weights[-1])  # The initial outputs are zero.
+        nn.init.zeros_(self.weights[-1])  # The initial outputs of the network are zero.
 
     def prepare(self, output_map: Tensor, offset: Tensor) -> Layers:
-        """Return masked layers that compute offset + output_map y, with y the outputs of this network.
+        """Return the layers (masked weights and biases) of a network with outputs offset + output_map y.
 
-        y: (..., outputs). output_map: (rows, outputs). offset: (rows,). The weights of the last layer are
-        multiplied by output_map, which saves an operation per evaluation.
+        y, (..., outputs), are the outputs of this network. The weights of the last layer are multiplied by
+        output_map, which saves an operation per evaluation.
+
+        Args:
+            output_map: (rows, outputs).
+            offset: (rows,).
         """
         weights = [(w * self.get_buffer(f"mask{i}")).flatten(1) for i, w in enumerate(self.weights)]
         biases = list(self.biases)
@@ -168,7 +188,11 @@ class MaskedMLP(MaskedNetwork):
     """A multilayer perceptron with tanh units; arguments: see ``MaskedNetwork``."""
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return the outputs of the layers, (..., rows), and intermediate values for ``vjp`` and ``jvp``."""
+        """Return the outputs, (..., rows), at the inputs ``encoded``, and values for the derivatives.
+
+        encoded: inputs, (..., inputs). layers: from ``prepare``. ``vjp`` and ``jvp`` need the second result,
+        the intermediate values of the layers.
+        """
         layer, hidden = encoded, []
         for weight, bias in layers[:-1]:
             layer = torch.tanh(F.linear(layer, weight, bias))
@@ -176,7 +200,10 @@ class MaskedMLP(MaskedNetwork):
         return F.linear(layer, *layers[-1]), (hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
+        """Return cotangent^T J, (..., inputs), with J = d outputs / d inputs; cotangent: (..., rows).
+
+        intermediates: from ``forward`` at the same inputs.
+        """
         hidden, layers = intermediates
         layer: Tensor = cotangent @ layers[-1][0]
         for (weight, _), value in zip(reversed(layers[:-1]), reversed(hidden), strict=True):
@@ -185,7 +212,10 @@ class MaskedMLP(MaskedNetwork):
         return layer
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
+        """Return J tangent, (..., rows), with J = d outputs / d inputs; tangent: (..., inputs).
+
+        intermediates: from ``forward`` at the same inputs.
+        """
         hidden, layers = intermediates
         for (weight, _), value in zip(layers[:-1], hidden, strict=True):
             tangent = torch.ops.aten.tanh_backward(F.linear(tangent, weight), value)
@@ -195,17 +225,17 @@ class MaskedMLP(MaskedNetwork):
 class Bumps(NamedTuple):
     """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
 
-    distance: Tensor  # input minus grid point (signed), in grid spacings
+    distance: Tensor  # argument of the Gaussian: input minus grid point (signed), in grid spacings
     height: Tensor
 
 
 class MaskedKAN(MaskedNetwork):
     """A Kolmogorov-Arnold network; arguments: see ``MaskedNetwork``.
 
-    Each edge from an input to a unit has a learned function: a sum of Gaussian bumps on a grid over
+    Each edge from an input to a unit has a learned function: a sum of ``GRID`` Gaussians on a grid over
     [-1, 1] (Li, arXiv 2405.06721, in place of the splines of Liu et al., arXiv 2404.19756). The initial
     functions are nearly linear with random slopes, because training on few samples does not smooth a
-    function that is wavy at first. tanh keeps the outputs of a layer within the grid.
+    function that is wavy at first. tanh keeps the outputs of a hidden layer within the grid.
     """
 
     points = GRID
@@ -215,7 +245,11 @@ class MaskedKAN(MaskedNetwork):
         return Bumps(distance, torch.exp(-distance * distance))
 
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, Intermediates]:
-        """Return the outputs of the layers, (..., rows), and intermediate values for ``vjp`` and ``jvp``."""
+        """Return the outputs, (..., rows), at the inputs ``encoded``, and values for the derivatives.
+
+        encoded: inputs, (..., inputs). layers: from ``prepare``. ``vjp`` and ``jvp`` need the second result,
+        the intermediate values of the layers.
+        """
         bumps, hidden = [self._bumps(encoded)], []
         for weight, bias in layers[:-1]:
             hidden.append(torch.tanh(F.linear(bumps[-1].height.flatten(-2), weight, bias)))
@@ -223,7 +257,10 @@ class MaskedKAN(MaskedNetwork):
         return F.linear(bumps[-1].height.flatten(-2), *layers[-1]), (bumps, hidden, layers)
 
     def vjp(self, intermediates: Intermediates, cotangent: Tensor) -> Tensor:
-        """Return cotangent^T J, (..., inputs), with the network's Jacobian J; cotangent: (..., rows)."""
+        """Return cotangent^T J, (..., inputs), with J = d outputs / d inputs; cotangent: (..., rows).
+
+        intermediates: from ``forward`` at the same inputs.
+        """
         bumps, hidden, layers = intermediates
         layer = self._bumps_vjp(bumps[-1], cotangent @ layers[-1][0])
         for index in reversed(range(len(hidden))):
@@ -236,7 +273,10 @@ class MaskedKAN(MaskedNetwork):
         return (-2 / SPACING) * (bumps.distance * bumps.height * cotangent).sum(dim=-1)
 
     def jvp(self, intermediates: Intermediates, tangent: Tensor) -> Tensor:
-        """Return J tangent, (..., rows), with the network's Jacobian J; tangent: (..., inputs)."""
+        """Return J tangent, (..., rows), with J = d outputs / d inputs; tangent: (..., inputs).
+
+        intermediates: from ``forward`` at the same inputs.
+        """
         bumps, hidden, layers = intermediates
         for index, (weight, _) in enumerate(layers):
             slopes = bumps[index].distance * bumps[index].height

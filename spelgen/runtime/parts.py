@@ -1,4 +1,4 @@
-"""Interfaces of the mass matrix and the input matrix of a model, and the function ``symmetric``."""
+"""Interfaces of the mass matrix M(q) and the input matrix G of a model, and shared types of the runtime."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -8,48 +8,57 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # returns M, (..., n, n), from functions and constants, (...) each
-Layers = tuple[tuple[Tensor, Tensor], ...]  # masked weights, and biases, of each layer of a network
-# The following types are Any, because each class of models defines its own named tuples for them.
-Intermediates = Any  # values of a forward pass that its derivatives need
+Entries = Callable[..., Tensor]  # returns M, (..., n, n), from its functions of q and constants, (...) each
+Layers = tuple[tuple[Tensor, Tensor], ...]  # (masked weights, biases) of each layer of a network
+# The four types below are Any, because each class of models defines its own named tuples for them.
+Intermediates = Any  # intermediate values of a network's evaluation, for its derivatives
 Parameters = Any  # parameter cache: quantities that depend on trained parameters only
 Configuration = Any  # configuration cache: quantities that depend on q, for given parameters
-Position = Any  # q, (..., n), or the configuration cache at q
+Position = Any  # joint positions q, (..., n), or the configuration cache at q
 
 
 class Mass(Protocol):
-    """Interface of a mass matrix M(q) with explicit derivatives."""
+    """Interface of a mass matrix M(q), (..., n, n), with explicit derivatives.
+
+    M and its derivatives are functions of the encoding of q, (..., 2 n), see ``JointEncoding``.
+    """
 
     def prepare(self) -> Parameters:
         """Return the parameter cache: quantities that depend on trained parameters only."""
 
     def forward(self, encoded: Tensor, parameters: Parameters) -> tuple[Tensor, Intermediates]:
-        """Return M(q), (..., n, n), and intermediate values for the derivatives of M."""
+        """Return M(q), (..., n, n), and intermediate values for ``kinetic_vjp`` and ``jvp``.
+
+        encoded: encoding of q, (..., 2 n). parameters: from ``prepare``.
+        """
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return d(1/2 qd^T M(q) qd) / d encoding, (..., 2 n), at the velocity qd (..., n)."""
+        """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding, (..., 2 n); qd: (..., n)."""
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for a time derivative of the encoding, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
 
 
 class Inputs(Protocol):
-    """Interface of a constant input matrix G, for motors that drive several joints and for passive joints."""
+    """Interface of a constant input matrix G: joint torques = G tau, with the inputs tau of the motors.
+
+    G differs from the identity if motors drive several joints, or if joints are passive (without motor).
+    """
 
     def gains(self) -> Tensor:
-        """Return G, (n, n): joint torque per motor torque."""
+        """Return the input matrix G, (n, n): joint torque per input of a motor."""
 
     def force(self, tau: Tensor) -> Tensor:
-        """Return G tau, (..., n) [Nm, N]."""
+        """Return the joint torques G tau, (..., n) [Nm, N], at inputs tau, (..., n)."""
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G tau = force, for joint torques force, (..., n)."""
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:
-    """Return a symmetric matrix, (..., n, n).
+    """Return the symmetric matrix, (..., n, n), with the given lower triangle.
 
-    rows: rows of its lower triangle; the entries are tensors, (...), or numbers.
+    rows: rows of the lower triangle; at least one entry is a tensor, (...), the others may be numbers.
     """
     n = len(rows)
     entries = [rows[max(i, j)][min(i, j)] for i in range(n) for j in range(n)]

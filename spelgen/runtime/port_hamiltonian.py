@@ -19,15 +19,21 @@ def applied(matrix: Tensor, vector: Tensor) -> Tensor:
 
 
 class PortHamiltonian(nn.Module):
-    """q' = dH/dp and p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
+    """Base class of models: q' = dH/dp, p' = -dH/dq - D dH/dp + G tau, with H = 1/2 p^T M(q)^-1 p + V(q).
 
-    The port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014), with
-    momenta p, dissipation matrix D(q, qd) and input matrix G.
+    This is the port-Hamiltonian form (van der Schaft and Jeltsema, Port-Hamiltonian Systems Theory, 2014),
+    with momenta p, mass matrix M(q), potential V(q), dissipation matrix D(q, qd) and input matrix G. Derived
+    classes define M, V and friction; this class has the equations of motion.
 
-    q, qd, qdd, tau and p are (..., n), with any leading dimensions, in rad and Nm for revolute joints,
-    in m and N for prismatic joints. In place of q, methods also accept the configuration cache that
-    ``at`` returns: all quantities that depend on q only, computed once for several calls. inputs: the
-    input matrix G; None: each input drives its own joint.
+    Positions q, velocities qd, accelerations qdd, inputs tau and momenta p are (..., n), with any leading
+    dimensions, in rad and Nm for revolute joints, in m and N for prismatic joints. If friction has a
+    state z, it has the deflections of K bristles per joint, (..., n, K) [rad, m]. In place of q, methods also
+    accept the configuration cache that ``at`` returns: all quantities that depend on q only, computed once
+    for several calls.
+
+    Args:
+        joints: joints of the arm, in the order of q.
+        inputs: input matrix G; None: each input drives its own joint.
     """
 
     prepare: Callable[..., Parameters]
@@ -36,7 +42,7 @@ class PortHamiltonian(nn.Module):
     gravity: Callable[[Position], Tensor]  # dV/dq, (..., n) [Nm, N]
     lagrangian_gradient: Callable[[Position, Tensor], Tensor]  # d/dq of 1/2 qd^T M qd - V, (..., n)
     nonlinear_effects: Callable[[Position, Tensor], Tensor]  # Coriolis, centrifugal and gravity torque
-    friction_torque: Callable[..., Tensor]  # D(q, qd) qd, (..., n)
+    friction_torque: Callable[..., Tensor]  # D(q, qd) qd, or friction with the friction state z, (..., n)
     memory_rate: Callable[[Tensor, Tensor], Tensor]  # dz/dt, (..., n, K), from the friction state z and qd
     elements = 0  # number of bristles per joint, K
 
@@ -65,10 +71,11 @@ class PortHamiltonian(nn.Module):
 
         Args:
             q: positions, (..., n), or a configuration cache, which is returned unchanged.
-            others: further vectors, (..., n), whose dtype and shape are checked.
+            others: other vectors of the caller, such as qd and tau, (..., n); only their dtype and shape are
+                checked.
             prepared: parameter cache that ``prepare`` returned; None: the method calls ``prepare``.
         """
-        # A cache is a named tuple from a previous call, in which q was checked.
+        # A configuration cache is a named tuple. The call that created it has checked q.
         if isinstance(q, tuple):
             return q
         dtype = self.get_buffer("friction.nominal").dtype
@@ -82,7 +89,7 @@ class PortHamiltonian(nn.Module):
         return self.configuration(q, self.prepare() if prepared is None else prepared)
 
     def mass_matrix(self, q: Position) -> Tensor:
-        """Return M(q), (..., n, n) [kg m^2, kg m, kg]."""
+        """Return the mass matrix M(q), (..., n, n) [kg m^2, kg m, kg]."""
         mass: Tensor = self.at(q).mass
         return mass
 
@@ -92,32 +99,45 @@ class PortHamiltonian(nn.Module):
         return matrix.expand(*q.shape, -1)
 
     def input_force(self, cache: Configuration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return G tau, (..., n) [Nm, N]."""
+        """Return the joint torques of the inputs tau: G tau, (..., n) [Nm, N].
+
+        cache: configuration cache at q. Derived classes may add terms, such as torque offsets.
+        """
         return tau if self.inputs is None else self.inputs.force(tau)
 
     def input_torque(self, cache: Configuration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G tau = force, with force (..., n) [Nm, N]."""
+        """Return the inputs tau, (..., n), that solve G tau = force, for joint torques force, (..., n).
+
+        cache: configuration cache at q.
+        """
         return force if self.inputs is None else self.inputs.torque(force)
 
     def momentum(self, q: Position, qd: Tensor) -> Tensor:
-        """Return p = M(q) qd, (..., n)."""
+        """Return the momentum p = M(q) qd, (..., n)."""
         return applied(self.at(q, qd).mass, qd)
 
     def velocity(self, q: Position, p: Tensor) -> Tensor:
-        """Return qd = M(q)^-1 p, (..., n)."""
-        # `solve` ignores that M is positive definite. A Cholesky factorisation is not used, because its
-        # derivative takes several times as long as the derivative of `solve`.
+        """Return the velocity qd = M(q)^-1 p, (..., n) [rad/s, m/s], at the momentum p, (..., n)."""
+        # `torch.linalg.solve` does not use that M is positive definite. A Cholesky factorisation is not used,
+        # because its derivative takes several times as long as the derivative of `solve`.
         qd: Tensor = torch.linalg.solve(self.at(q, p).mass, p.unsqueeze(-1))
         return qd.squeeze(-1)
 
     def hamiltonian(self, q: Position, p: Tensor, *state: Tensor) -> Tensor:
-        """Return the total energy H, (...) [J]; state: friction state, if the model has one."""
+        """Return the total energy H = 1/2 p^T M(q)^-1 p + V(q), (...) [J].
+
+        p: momenta, (..., n). state: friction state z, (..., n, K) [rad, m], whose elastic energy is added to
+        H; without it, the bristles have no energy.
+        """
         cache = self.at(q, p)
         # The kinetic energy 1/2 p^T M^-1 p is 1/2 p^T qd.
         return 0.5 * (p * self.velocity(cache, p)).sum(dim=-1) + self.potential_energy(cache, *state)
 
     def forward_dynamics(self, q: Position, qd: Tensor, tau: Tensor, *state: Tensor | None) -> Tensor:
-        """Return qdd, (..., n), under the input tau; state: friction state, if the model has one."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n).
+
+        state: friction state z, (..., n, K) [rad, m]; without it, friction depends on velocity only.
+        """
         cache = self.at(q, qd, tau)
         force = self.input_force(cache, qd, tau) - self.nonlinear_effects(cache, qd)
         force = force - self.friction_torque(cache, qd, *state)
@@ -125,27 +145,42 @@ class PortHamiltonian(nn.Module):
         return self.velocity(cache, force)
 
     def inverse_dynamics(self, q: Position, qd: Tensor, qdd: Tensor, *state: Tensor | None) -> Tensor:
-        """Return the input tau, (..., n), that gives qdd; state: friction state, if the model has one."""
+        """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n) [rad/s^2, m/s^2].
+
+        state: friction state z, (..., n, K) [rad, m]; without it, friction depends on velocity only.
+        """
         cache = self.at(q, qd, qdd)
         force = applied(cache.mass, qdd) + self.nonlinear_effects(cache, qd)
         force = force + self.friction_torque(cache, qd, *state)
-        # ``input_force`` may be nonzero at tau = 0, for example due to a torque offset of the sensors: it is
-        # subtracted, so that the remaining force is linear in tau.
+        # ``input_force`` may be nonzero at tau = 0, for example due to a torque offset of the sensors. Its
+        # value at tau = 0 is subtracted from the force, so that G tau = force can be solved for tau.
         return self.input_torque(cache, force - self.input_force(cache, qd, 0 * qd))
 
     def port_hamiltonian_rhs(
         self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: Parameters, *state: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Return the time derivatives q' and p', (..., n), under the input tau; None: no input."""
+        """Return the time derivatives q' and p' of positions and momenta, (..., n) each.
+
+        Args:
+            q: positions, (..., n) [rad, m].
+            p: momenta, (..., n).
+            tau: inputs, (..., n); None: no input.
+            prepared: parameter cache that ``prepare`` returned.
+            state: friction state z, (..., n, K) [rad, m]; without it, friction depends on velocity only.
+        """
         cache = self.at(q, p, p if tau is None else tau, prepared=prepared)
         qd = self.velocity(cache, p)
         force = self.lagrangian_gradient(cache, qd) - self.friction_torque(cache, qd, *state)
         return qd, force if tau is None else force + self.input_force(cache, qd, tau)
 
     def forward(self, t: Tensor, state: Tensor) -> Tensor:
-        """Return d/dt of the state (q, p, z), (..., 2 n + n K), or of (q, p, z, tau) with constant tau.
+        """Return the time derivative of the state vector, with the shape of ``state``, for ODE solvers.
 
-        For a state (q, p), (..., 2 n), without the friction state z, friction depends on velocity only.
+        Args:
+            t: time [s], which has no effect: the equations are autonomous.
+            state: (q, p, z), (..., 2 n + n K): positions, momenta, and friction state z of K bristles per
+                joint; or (q, p), (..., 2 n), with friction that depends on velocity only. Constant inputs
+                tau, (..., n), may be appended to (q, p, z); their time derivatives are zero.
         """
         n, size = self.n, self.n * self.elements
         if state.shape[-1] < 2 * n + size:

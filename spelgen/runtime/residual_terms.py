@@ -1,6 +1,7 @@
-"""Residual terms that are added to rigid bodies.
+"""Residual terms: corrections that are added to M(q), V(q) and friction of a rigid-body model.
 
-The terms are functions of the position of one joint, and networks that depend on several positions.
+Torque and friction terms depend on the position of one joint each (splines and harmonics); the terms of M(q),
+and one of V(q), are networks that depend on the positions of several joints.
 """
 
 import math
@@ -17,22 +18,22 @@ from spelgen.runtime.port_hamiltonian import applied
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidConfiguration, RigidParameters
 from spelgen.runtime.rows import Joint, vector
 
-# Number of cubic B-splines over the range of a joint.
+# Number of cubic B-splines over the range of a joint, for its torque term and its friction factor.
 SPLINES = 34
-# Number of ripple harmonics per revolution of the joint. For a gear ratio above this number, there are also
-# the first two harmonics of the motor's revolution, which represent gear teeth and motor poles.
+# Number of harmonics of the joint's revolution in the torque ripple. For a gear ratio above this number, the
+# first two harmonics of the motor's revolution are added, which represent gear teeth and motor poles.
 HARMONICS = 64
-# Largest magnitude of the logarithm of the friction factor: the factor is between 0.1 and 10.
+# Largest magnitude of the logarithm of the friction factor, so that the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
 
 
 class ResidualParameters(NamedTuple):
     """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
-    splines: Tensor  # coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
-    ripple: Tensor  # amplitudes of cosines, then sines [Nm], (n, 2 HARMONICS + 4)
-    constant: Tensor  # part of R that does not depend on q, flattened, (n n,)
-    functions: Tensor  # matrix by which each tanh output is multiplied in R, (functions, n n)
+    splines: Tensor  # spline coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
+    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 HARMONICS + 4)
+    constant: Tensor  # constant part of the residual R of M, flattened, (n n,)
+    functions: Tensor  # matrices by which R's network outputs (after tanh) are multiplied, (functions, n n)
     mass: Layers | None
     potential: Layers | None
 
@@ -41,9 +42,9 @@ class ResidualConfiguration(NamedTuple):
     """Configuration cache of ``ResidualTerms``: quantities at positions q, (..., n) [rad, m]."""
 
     q: Tensor
-    encoded: Tensor  # encoded positions, the inputs of the networks, see ``JointEncoding``
-    torque: Tensor  # dV/dq due to functions of single joints, (..., n) [Nm, N]
-    friction: Tensor  # factor on friction, (..., n)
+    encoded: Tensor  # encoding of q, the input of the networks, (..., 2 n), see ``JointEncoding``
+    torque: Tensor  # dV/dq of splines and harmonics, each of one joint, (..., n) [Nm, N]
+    friction: Tensor  # factor by which the friction of each joint is multiplied, (..., n)
     mass: Tensor  # R(q), the residual term of M, (..., n, n)
     slope: Tensor | None  # d tanh(y) / dy for the outputs y of R's network, (..., functions)
     intermediates: Intermediates  # intermediate values of R's network, for derivatives
@@ -51,19 +52,23 @@ class ResidualConfiguration(NamedTuple):
 
 
 class ResidualTerms(nn.Module):
-    """Residual terms: R(q) is added to M, terms are added to V, and friction is multiplied by a factor.
+    """Residual terms of a rigid-body model: R(q) is added to M, terms to V, and friction gets a factor.
 
-    Torque: dV/dq of each joint has a term that depends on the joint's position only, a sum of cubic B-splines
-    over the range of the joint. A revolute joint has in addition harmonics of its rotation, and of its
-    motor's rotation. Friction: the factor of a joint is the exponential of another sum of splines, between
-    0.1 and 10. The splines fall to zero within three knot spacings beyond the range.
+    Torque: a term that depends on the joint's own position only is added to dV/dq of each joint: a sum of
+    cubic B-splines over the range of the joint and, for a revolute joint, harmonics of its rotation and of
+    its motor's rotation (torque ripple).
+
+    Friction: the friction of a joint is multiplied by a factor between 0.1 and 10, the exponential of another
+    sum of splines in the joint's position. The splines fall to zero within three knot spacings beyond the
+    range.
 
     Mass: R is ``entries(*functions, *constants)``, with ``entries`` a function in the emitted module. A
     function is a bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a
-    parameter. The ``bounds`` make armature + R positive definite for all q and all parameters. Potential:
-    ``potential_scale`` [J] times the output of the network ``potential`` is added to V.
+    trained parameter. The ``bounds`` make armature + R positive definite for all q and all parameters.
 
-    If all parameters are zero, R and the terms of V are zero, and the factor of friction is one.
+    Potential: ``potential_scale`` [J] times the output of the network ``potential`` is added to V.
+
+    If all trained parameters are zero, R and the terms of V are zero, and the friction factor is one.
     """
 
     parameter_groups = (
@@ -88,8 +93,8 @@ class ResidualTerms(nn.Module):
         n = len(joints)
         zeros = torch.zeros(n, SPLINES, dtype=torch.float64)
         self.encoding = JointEncoding(joints)
-        # The range is divided into SPLINES - 3 intervals of length `spacing`. A spline has its middle at each
-        # end of an interval, and one interval beyond each end of the range.
+        # The range of a joint is divided into SPLINES - 3 intervals of length `spacing`. The splines have
+        # their middles at the ends of the intervals, and one interval beyond each end of the range.
         spacing = 2 * vector(joint.half_range for joint in joints).unsqueeze(-1) / (SPLINES - 3)
         knots = torch.arange(SPLINES).double() - (SPLINES - 1) / 2
         self.spacing = nn.Buffer(spacing)
@@ -97,7 +102,7 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(center + spacing * knots)
         self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
-        # Number of ripple periods per revolution of the joint, (n, HARMONICS + 2).
+        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2).
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
         for index, joint in enumerate(joints):
             if joint.gear > HARMONICS:
@@ -110,40 +115,47 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # 1 / |coefficient| of each function and constant in each entry of M, (functions + constants, n, n).
-        # It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores this entry.
+        # `inverse`: 1 / |coefficient| of each function and constant in each entry of M, (functions +
+        # constants, n, n). It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores it.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. The bound of each term is an equal share of this: 0.9
+        # R may reduce the armature by at most 90 %. `part` is the share of each function and constant: 0.9
         # divided by the largest number of functions and constants in one row of M.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution to M, (functions + constants, n, n), of each function and constant.
+        """Return the contribution to R of each function and constant of R, (functions + constants, n, n).
 
-        sizes: values of the functions and constants, (functions + constants,).
+        sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
         """
         rows = torch.diag(sizes).unbind()
         return self.entries(*rows)
 
     def bounds(self, armature: Tensor) -> Tensor:
-        """Return the largest magnitudes of the functions and constants in R, (functions + constants,).
+        """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        armature: matrix A, (n, n). With these bounds, A + R is positive definite, since it is the sum of A -
-        diag(d) and diag(d) + R, with d = 1 / (row sums of |A^-1|). The first is positive semi-definite. The
-        second is positive definite if all row sums of |R| / sqrt(d d^T) are less than one. Both statements
-        follow from diagonal dominance.
+        R is the residual term of M, linear in its functions and constants (see the class). If no function
+        or constant exceeds its bound, A + R is positive definite: it is the sum of A - diag(d) and
+        diag(d) + R, with d = 1 / (row sums of |A^-1|). By diagonal dominance, the first matrix is positive
+        semi-definite, and the second is positive definite if all row sums of |R| / sqrt(d d^T) are less
+        than one.
+
+        Args:
+            armature: matrix A, (n, n): rotor inertia on the joint side.
         """
         root = torch.linalg.inv(armature).abs().sum(dim=-1).rsqrt()
         smallest: Tensor = (root.unsqueeze(-1) * root * self.inverse).amin(dim=(-2, -1))
         return self.part * smallest
 
     def friction_logarithms(self) -> Tensor:
-        """Return the spline coefficients of the friction factor's logarithm, (n, SPLINES)."""
+        """Return spline coefficients, (n, SPLINES), of the log of the position-dependent friction factor."""
         return LARGEST * (self.raw_friction_splines / LARGEST).tanh()
 
     def prepare(self, armature: Tensor) -> ResidualParameters:
-        """Return the parameter cache: quantities that depend on parameters only; armature: matrix, (n, n)."""
+        """Return the parameter cache: quantities that depend on trained parameters only.
+
+        armature: rotor inertia on the joint side, (n, n), from which the ``bounds`` are computed.
+        """
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
         functions, constants = rows.tensor_split((self.functions,))
@@ -163,10 +175,10 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return the quantities that depend on q only (configuration cache); q: (..., n) [rad, m]."""
+        """Return the configuration cache at q, (..., n) [rad, m]; parameters: cache from ``prepare``."""
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
-        # Torque and friction factor have the same splines: both sums are one product.
+        # The torque term and the log friction factor are sums of the same splines: one product gives both.
         smooth, friction = splines.unbind(-1)
         torque = smooth + (self.waves(q) * parameters.ripple).sum(dim=-1)
         mass, slope, intermediates = parameters.constant.expand(*q.shape[:-1], -1), None, None
@@ -181,13 +193,13 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the residual terms of V, (...) [J].
+        """Return the sum of the residual terms of V, (...) [J]; cache: configuration cache at q.
 
         The energy of a B-spline is the integral of its torque from the middle of the spline to q.
         """
         distance = self._distances(cache.q)
         size = distance.abs()
-        # Integral of a B-spline of unit spacing from its middle to the distance `size`.
+        # `step`: integral of a cubic B-spline of unit knot spacing from its middle to the distance `size`.
         step = 0.5 - (2 - size).relu() ** 4 / 24 + (1 - size).relu() ** 4 / 6
         smooth = (self.spacing * distance.sign() * step * cache.parameters.splines[..., 0]).sum(dim=-1)
         # The integral of cos(f q) is sin(f q) / f, the integral of sin(f q) is -cos(f q) / f.
@@ -199,7 +211,10 @@ class ResidualTerms(nn.Module):
         return energy
 
     def gradient(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of the residual terms of 1/2 qd^T M(q) qd - V(q), (..., n) [Nm, N]."""
+        """Return d/dq of the residual terms of 1/2 qd^T M(q) qd - V(q), (..., n) [Nm, N].
+
+        cache: configuration cache at q. qd: velocities, (..., n) [rad/s, m/s].
+        """
         by_encoded = torch.zeros_like(cache.encoded)
         if self.mass is not None and cache.slope is not None:
             # Reverse mode for 1/2 qd^T R qd: its gradient with respect to R is 1/2 qd qd^T, which is
@@ -212,7 +227,10 @@ class ResidualTerms(nn.Module):
         return self.encoding.vjp(cache.encoded, by_encoded) - cache.torque
 
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
-        """Return the contribution to ``nonlinear_effects``: dR/dt qd - ``gradient``, (..., n) [Nm, N]."""
+        """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
+
+        It is dR/dt qd - ``gradient`` [Nm, N]. cache: configuration cache at q. qd: velocities, (..., n).
+        """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)
         rate = self.mass.jvp(cache.intermediates, self.encoding.jvp(cache.encoded, qd))
@@ -220,14 +238,17 @@ class ResidualTerms(nn.Module):
         return applied(mass_rate, qd) - self.gradient(cache, qd)
 
     def splines(self, q: Tensor) -> Tensor:
-        """Return the values of the cubic B-splines at q, (..., n, SPLINES); their maximum is 2/3."""
+        """Return the values of the cubic B-splines of each joint at q, (..., n, SPLINES), at most 2/3."""
         # At the distance d >= 0 from its middle, a cubic B-spline of unit spacing is (max(2 - d, 0)^3 - 4
         # max(1 - d, 0)^3) / 6.
         wide = (2 - self._distances(q).abs()).relu()
         return torch.sub(wide**3, (wide - 1).relu() ** 3, alpha=4) / 6
 
     def waves(self, q: Tensor) -> Tensor:
-        """Return cos(f q) for all frequencies f, then sin(f q), (..., n, 2 HARMONICS + 4)."""
+        """Return cos(f q) for all ripple frequencies f of each joint, then sin(f q).
+
+        The shape is (..., n, 2 HARMONICS + 4). A sum of these functions is the torque ripple of a joint.
+        """
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
 
@@ -237,7 +258,10 @@ class ResidualTerms(nn.Module):
 
 
 class ResidualDynamics(RigidBodyDynamics):
-    """Rigid bodies with residual terms in M, V and friction; ``residuals`` is None after their removal."""
+    """Rigid-body model with residual terms in M, V and friction.
+
+    residuals: the residual terms. None after a fit has removed them: the model is then rigid bodies only.
+    """
 
     residuals: ResidualTerms | None
 
@@ -246,14 +270,17 @@ class ResidualDynamics(RigidBodyDynamics):
         self.residuals = residuals
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache, which is valid until a parameter changes."""
+        """Return the parameter cache of rigid bodies, friction and residual terms.
+
+        It depends on the trained parameters only, and is valid until a parameter changes.
+        """
         prepared = super().prepare()
         if self.residuals is None:
             return prepared
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]; M in the cache includes the residual R."""
+        """Return the configuration cache at q, (..., n) [rad, m], in which M includes the residual R(q)."""
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache
@@ -261,26 +288,29 @@ class ResidualDynamics(RigidBodyDynamics):
         return cache._replace(mass=cache.mass + residual.mass, varied=residual.friction, residual=residual)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
-        """Return the sum of V(q) and the elastic energy of the bristles, (...) [J]."""
+        """Return V(q) with residual terms, plus the elastic energy of the bristles at z, (...) [J].
+
+        z: friction state, (..., n, K) [rad, m]; None: V(q) only.
+        """
         cache: RigidConfiguration = self.at(q)
         energy = super().potential_energy(cache, z)
         return energy if self.residuals is None else energy + self.residuals.energy(cache.residual)
 
     def gravity(self, q: Tensor | RigidConfiguration) -> Tensor:
-        """Return dV/dq, (..., n) [Nm, N]."""
+        """Return dV/dq, (..., n) [Nm, N]: the sum of the gravity torque and of the residual terms' torque."""
         cache: RigidConfiguration = self.at(q)
         if self.residuals is None:
             return cache.gravity
         return cache.gravity - self.residuals.gradient(cache.residual, 0 * cache.gravity)
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of 1/2 qd^T M(q) qd - V(q), (..., n)."""
+        """Return d/dq of 1/2 qd^T M(q) qd - V(q), with residual terms, (..., n) [Nm, N]."""
         cache: RigidConfiguration = self.at(q, qd)
         gradient = super().lagrangian_gradient(cache, qd)
         return gradient if self.residuals is None else gradient + self.residuals.gradient(cache.residual, qd)
 
     def nonlinear_effects(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return Coriolis, centrifugal and gravity torque, (..., n)."""
+        """Return Coriolis, centrifugal and gravity torque with residual terms, (..., n) [Nm, N]."""
         cache: RigidConfiguration = self.at(q, qd)
         torque = super().nonlinear_effects(cache, qd)
         return torque if self.residuals is None else torque + self.residuals.nonlinear(cache.residual, qd)

@@ -1,7 +1,4 @@
-"""Classes of the entries of the tables in an emitted module.
-
-The tables list joints and links, and functions and constants of the mass matrix.
-"""
+"""Rows of the tables in an emitted module: joints, links, and functions and constants of the mass matrix."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -15,12 +12,12 @@ Tensor6 = tuple[float, float, float, float, float, float]  # inertia tensor (xx,
 
 
 def _rounded(value: float) -> float:
-    """Return a value, rounded to six significant digits."""
+    """Return the value rounded to six significant digits."""
     return float(f"{value:.6g}")
 
 
 class Joint(NamedTuple):
-    """A joint. Units are rad and Nm for a revolute joint, m and N for a prismatic joint."""
+    """A joint of the arm. Units are rad and Nm for a revolute joint, m and N for a prismatic joint."""
 
     name: str
     joint_type: Literal["revolute", "prismatic"]
@@ -29,22 +26,22 @@ class Joint(NamedTuple):
     speed: float  # typical velocity [rad/s, m/s]
     friction: float  # typical magnitude of the friction torque [Nm, N]
     armature: float  # nominal rotor inertia times gear^2 [kg m^2, kg]
-    gear: float = 1.0  # motor revolutions per revolution of the joint
-    # (center, half range) of the typical motion [rad, m]; None: computed from the limits.
+    gear: float = 1.0  # gear ratio: motor revolutions per revolution of the joint
+    # (center, half range) of the typical motion [rad, m]. None: computed from the position limits.
     typical_range: tuple[float, float] | None = None
 
     @property
     def center(self) -> float:
-        """Middle of the typical motion, or of the limits [rad, m]."""
+        """Middle of the typical motion if given, else of the position limits; 0 without limits [rad, m]."""
         if self.typical_range is not None:
             return self.typical_range[0]
         return 0.0 if self.lower is None or self.upper is None else _rounded((self.lower + self.upper) / 2)
 
     @property
     def half_range(self) -> float:
-        """Half the range of the typical motion, or of the limits [rad, m].
+        """Half the range of the typical motion if given, else of the position limits; pi without limits.
 
-        Encoding of the position of a prismatic joint: (q - center) / half_range.
+        In rad or m. Networks have the position of a prismatic joint as input (q - center) / half_range.
         """
         if self.typical_range is not None:
             return self.typical_range[1]
@@ -54,23 +51,23 @@ class Joint(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A rigid body that a joint moves. Its frame is the joint's frame, whose z is the joint axis."""
+    """A rigid body that a joint moves. Its body frame is the joint frame, whose z axis is the joint axis."""
 
     name: str
     parent: str | None  # name of the link that carries the joint; None: the base
     joint: str  # name of the joint whose coordinate q displaces the link by ratio * q + offset
-    position: Triple  # origin in the parent's frame, at displacement 0 [m]
-    mass: float  # [kg]
-    center_of_mass: Triple  # in the joint's frame [m]
-    inertia: Tensor6  # about the center of mass [kg m^2]
+    position: Triple  # origin of the joint frame in the frame of the parent, at displacement 0 [m]
+    mass: float  # mass of the link [kg]
+    center_of_mass: Triple  # center of mass in the joint frame [m]
+    inertia: Tensor6  # inertia tensor about the center of mass, in the joint frame [kg m^2]
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # displacement of the link at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: the type of the joint `joint`
+    joint_type: Literal["revolute", "prismatic"] | None = None  # motion of the link; None: type of `joint`
 
 
 class Function(NamedTuple):
-    """A learned function of joint positions: mean + scale * output of a network."""
+    """A learned function of joint positions in the mass matrix: mean + scale * output of a network."""
 
     joints: tuple[str, ...]
     mean: float = 0.0
@@ -78,17 +75,17 @@ class Function(NamedTuple):
 
 
 class Constant(NamedTuple):
-    """A trained constant, scale * parameter, with its initial value."""
+    """A trained constant in the mass matrix, scale * trained parameter, with its initial value."""
 
     initial: float
     scale: float
 
 
 def vector(values: Iterable[float]) -> Tensor:
-    """Return the values as a float64 tensor, (values,)."""
+    """Return the numbers as a float64 tensor, (values,)."""
     return torch.tensor(list(values), dtype=torch.float64)
 
 
 def joints_of(functions: Sequence[Function]) -> list[tuple[str, ...]]:
-    """Return the names of the joints that each function depends on."""
+    """Return for each function the names of the joints that it depends on."""
     return [function.joints for function in functions]

@@ -18,7 +18,7 @@ Optimizer = Literal["adamw", "lbfgs"]
 Adaptation = Literal["load", "friction", "unit"]
 Solver = Literal["rk4", "dopri5"]
 Window = Annotated[Count, Field(ge=2)]
-# The number of integrator steps is bounded, because the duration of a fit is proportional to it.
+# The number of integrator steps per sample interval is bounded, because the duration of a fit is proportional to it.
 Substeps = Annotated[Count, Field(le=1000)]
 
 
@@ -33,7 +33,7 @@ class WindowFitDefaults:
     lbfgs_decay: float = 2e-5
     # [1] Weight decay of AdamW (Loshchilov and Hutter, ICLR 2019).
     adamw_decay: float = 0.2
-    # [1] Windows per step of AdamW.
+    # [1] Number of windows per step of AdamW.
     batch: int = 256
     # [1] Largest learning rate of AdamW: the default value of the authors of this optimizer.
     learning_rate: float = 1e-3
@@ -62,7 +62,7 @@ class GaussianPrior(Group):
         armature: Logarithm of the armature, per joint.
         sizes: Logarithm of the friction coefficients, per joint.
         velocities: Logarithm of the velocity scales of friction, per joint.
-        fractions: Logarithm of the bristle fractions, per joint.
+        fractions: Logits of the bristle fractions, per joint: the shares of a joint's dry friction that bristles carry.
         shared_armature: Common factor of the armatures of all joints.
         shared_sizes: Common factor of one friction effect of all joints.
         shared_velocities: Common factor of one velocity scale of all joints.
@@ -92,7 +92,7 @@ class GaussianPrior(Group):
 
 
 class FitConfig(Group):
-    """Base class of the options of one objective.
+    """Base class of the options of a fit; each objective (torque, momentum, rollout, servo) has a class of its own.
 
     of_rigid_bodies: names of the options that apply only to models of rigid bodies. of_networks: names of the options
     that apply only to models of networks.
@@ -106,7 +106,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
-            # An option that this objective does not have may be an option of other objectives, which the message names.
+            # An unknown option may be an option of other objectives, which the message names.
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -124,16 +124,16 @@ class FitConfig(Group):
         return self
 
     def require(self, *, rigid_bodies: bool) -> None:
-        """Raise OptionError if the objective, or an option with a value, does not apply to a type of model.
+        """Raise OptionError if the objective, or an option that the caller has set, does not apply to a type of model.
 
         rigid_bodies: True for a model of rigid bodies, False for a model of networks.
         """
-        # Models of rigid bodies are fitted to torques directly: the momentum objective is not needed for them.
+        # The momentum objective does not apply to models of rigid bodies, which are fitted to torques directly.
         if rigid_bodies and self.objective == "momentum":
             raise OptionError(
-                "objective", "momentum belongs to models of networks alone, this is one of rigid bodies"
+                "objective", "momentum is for models that consist of networks; this model has rigid bodies"
             )
-        models = "models of networks alone" if rigid_bodies else "models of rigid bodies"
+        models = "models that consist of networks" if rigid_bodies else "models of rigid bodies"
         for name in self.unused(rigid_bodies=rigid_bodies):
             if name in self.model_fields_set:
                 raise OptionError(name, f"with the objective {self.objective} belongs to {models}")
@@ -209,7 +209,7 @@ class OnWindows(FitConfig):
     max_minutes: NonNegative | None = None
 
     def resolved(self, windows: int) -> Self:
-        """Return the configuration with the defaults of optimizer, batch, learning rate and weight decay set.
+        """Return the configuration with an optimizer, and with the batch, learning rate and weight decay for it.
 
         windows: number of training windows, on which the default optimizer depends.
         """
@@ -281,7 +281,7 @@ def fit_config(
     options: Mapping[str, object] | None = None,
     defaults: Mapping[str, object] | None = None,
 ) -> FitConfig:
-    """Return the configuration of an objective.
+    """Return the configuration of a fit, from options of the caller and settings of the robot.
 
     Args:
         objective: Name of the objective, a key of ``CONFIGS``.

@@ -19,7 +19,7 @@ from spelgen.settings.values import Group, Number, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
-# {unit: factor to the SI unit}, for units that are not SI units.
+# LENGTHS, SPEEDS and SCALES: {unit that is no SI unit: factor to the SI unit}.
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
 SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
@@ -28,7 +28,7 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-ONLY = {  # {joint type: units that joints of this type cannot have}
+ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
 }
@@ -108,7 +108,9 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of all columns; default: SI units. Without a unit, positions in degrees are detected.
+    """Units of the times and of the columns of all joints; default: SI units.
+
+    If no unit of positions is set, positions in degrees are detected.
 
     Attributes:
         t: Time.
@@ -168,7 +170,7 @@ class MotorCalibration(Group):
 
     @model_validator(mode="after")
     def _has_range(self) -> MotorCalibration:
-        # An empty range is an error, because normalised positions are fractions of the range.
+        # An empty calibrated range of a motor is an error, because normalised positions are fractions of the range.
         if not self.range_min < self.range_max:
             raise ValueError("a range_max above range_min")
         return self
@@ -254,17 +256,17 @@ class LogMapping(Group):
         # Fits of position servos compare positions only, so that velocities are not needed.
         if self.input == "position":
             return ("q", "u")
-        # No column of velocities is read, because velocities are computed from the positions.
+        # With "velocity: differentiated", velocities are computed from the positions, so a log needs no column of them.
         if self.velocity == "differentiated":
             return ("q", "tau")
         return ("q", "qd", "tau")
 
     def signals(self, joints: Sequence[str]) -> list[tuple[str, str]]:
-        """Return (quantity, joint) of each column, sorted by quantity: first the positions of all joints."""
+        """Return (quantity, joint) of each logged column of these joints, sorted by quantity: positions are first."""
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return the mapping of the columns of a joint, by the name of the joint in the URDF."""
+        """Return the settings of the columns of a joint, by its name in the URDF; the defaults if it has none."""
         return self.joints.get(name, JointLog())
 
     def log_name(self, joint: str) -> str:
@@ -286,7 +288,7 @@ class LogMapping(Group):
 
         The placeholder `{trajectory}` in names of columns is replaced by `text`.
         """
-        # A name without `{trajectory}` is unchanged: its column belongs to all recordings.
+        # A column name without `{trajectory}` is unchanged: its column belongs to all recordings.
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
         return self.model_copy(update={"columns": LogColumns(**named)})
 
@@ -299,14 +301,14 @@ class LogMapping(Group):
         return self.model_copy(update={"joints": joints})
 
     def with_turns(self, joints: Sequence[str]) -> LogMapping:
-        """Return the mapping with a period of one turn for the positions of the given joints.
+        """Return the mapping with a period of one turn for positions of joints without limits: wraps are then removed.
 
-        A period in the mapping is unchanged.
+        joints: names of these joints. A period that the mapping contains already is unchanged.
         """
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # A period in the mapping may be longer than a turn: the range of a register with several turns.
+            # A period that the mapping contains may be longer than a turn: the range of a register with several turns.
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -324,16 +326,20 @@ class LogMapping(Group):
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
-        """Return the period or the sign bit of a quantity of a joint, in logged units; None if it is not set."""
+        """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
+
+        At a period logged values wrap. Both are in the unit of the log. key: name of the setting. quantity: "q", "qd",
+        "tau" or "u".
+        """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size
 
     def period(self, quantity: str, joint: str) -> float:
-        """Return the period of a quantity of a joint in SI units; 0 if it is not set."""
+        """Return the period in SI units at which logged values of a quantity of a joint wrap; 0 if it is not set."""
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of "q", "qd", "tau" or "u" of a joint; None if it is not set."""
+        """Return the unit of the logged "q", "qd", "tau" or "u" of a joint; None if the settings contain none."""
         unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if unit is None and quantity == "u":
@@ -341,7 +347,7 @@ class LogMapping(Group):
         return unit
 
     def scale(self, quantity: str, joint: str) -> float:
-        """Return the factor by which a logged value is multiplied to get SI units; the factor includes `sign`."""
+        """Return the factor, with sign, that converts logged values of a quantity of a joint to SI units."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
@@ -374,6 +380,7 @@ class LogMapping(Group):
         """Return the errors in the units of the mapping for these joints.
 
         An error is a unit that a joint type cannot have, or a unit whose conversion needs a key that is absent.
+        joint_types: "revolute" or "prismatic" per joint; None if the types are unknown.
         """
         errors = []
         kinds: dict[str, str | None] = dict.fromkeys(joints)

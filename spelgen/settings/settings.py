@@ -59,7 +59,7 @@ class JointSettings(Group):
     @field_validator("coulomb")
     @classmethod
     def _resists(cls, value: tuple[float, float]) -> tuple[float, float]:
-        # A coefficient of the wrong sign is an error, because such friction would drive the joint.
+        # A friction coefficient of the wrong sign is an error, because such friction would drive the joint.
         if value[0] < 0 or value[1] > 0:
             raise ValueError("the torque for qd > 0 (not negative), then for qd < 0 (not positive)")
         return value
@@ -81,7 +81,8 @@ class MotorCoupling(Group):
         if {len(self.matrix), *map(len, self.matrix)} != {len(self.joints)}:
             raise ValueError("as many rows, and as many numbers in each, as joints")
         rows = np.array(self.matrix)
-        # Each row is scaled before the rank is tested, because joint torques (rows) may have different units.
+        # Each row of the matrix is scaled before its rank is tested, because joint torques (rows) may have different
+        # units.
         largest = np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
         if np.linalg.matrix_rank(rows / np.where(largest > 0, largest, 1.0)) < len(self.joints):
             raise ValueError("a matrix with an inverse: as many independent motors as joints")
@@ -95,8 +96,8 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # copy and pickle read attributes with double underscores, for which the errors must not be raised. Pydantic
-        # reads the values of the group.
+        # Attributes with double underscores raise AttributeError, because copy and pickle search for some of them. The
+        # attributes `__pydantic...` raise the errors of the group, because pydantic reads the values through them.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)
@@ -186,7 +187,7 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
-        # Without this error a file with the suffix .yml would be ignored silently.
+        # A settings file with the suffix .yml is an error, because it would be ignored silently.
         misnamed = path.with_suffix(".yml")
         if misnamed.exists():
             raise SettingsError(repr(misnamed.name), file=misnamed, expected=repr(path.name), do="rename it")
@@ -202,16 +203,18 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
-        # A group with errors that only one step uses is replaced by a placeholder, so that other steps can run.
+        # If only one step uses a group of keys that has errors, a placeholder replaces the group, so that other steps
+        # can run.
         for each in errors:
             group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:
                 collect([*errors, *chain(*unusable.values())])
             unusable[group] = (*unusable.get(group, ()), each)
-            # The content is checked again without the group, whose errors may have hidden errors of other groups.
+            # The content is checked again without the faulty group, whose errors may have hidden errors of other
+            # groups.
             content.pop(group, None)
     update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
-    # `input` of the arm also applies to the logs, so that a settings file states it only once.
+    # The setting `input` of the arm also applies to its logs, so that a settings file contains it only once.
     if settings.input == "position" and "logs" not in unusable:
         update["logs"] = settings.logs.model_copy(update={"input": "position"})
     return settings.model_copy(update=update)
@@ -239,7 +242,7 @@ def load_mapping(path: Path | str, joints: Collection[str]) -> LogMapping:
 def _require_joints(
     found: Iterable[tuple[Location, str]], names: Collection[str], document: YamlDocument
 ) -> None:
-    """Raise SettingsError, or SpelgenErrors for several errors, if a joint in a file is not among `names`.
+    """Raise SettingsError, or SpelgenErrors for several errors, if a joint in a settings file is not among `names`.
 
     found: (location, name) of each joint in the file.
     """

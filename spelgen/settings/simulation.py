@@ -99,8 +99,8 @@ class TrackingSettings(Group):
 
     @model_validator(mode="after")
     def _used(self) -> Self:
-        # Without this error, users would not notice that these keys have no effect on excitation motions.
+        # `amplitude` and `frequency` with excitation motions are an error: they have no effect on these motions.
         sines = {"amplitude", "frequency"} & self.model_fields_set
         if self.paths == "excitation" and sines:
-            raise ValueError(f"{' and '.join(sorted(sines))} of sines, beside paths: excitation")
+            raise ValueError(f"{' and '.join(sorted(sines))} of sines, with paths: excitation")
         return self

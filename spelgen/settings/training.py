@@ -59,18 +59,18 @@ class TrainingSettings(Group):
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
-                f"nothing beside 'objective: {objective}': this belongs to {' and '.join(owners)}"
+                f"no value with 'objective: {objective}': this belongs to {' and '.join(owners)}"
             )
         return value
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the options of a fit that are not None, of all objectives."""
+        """{name: value} of the settings that are not None and are options of a fit with any objective."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
     def preprocessing(self) -> dict[str, Any]:
-        """{name: value} of the options of `Preprocessing` that are not None."""
+        """{name: value} of all settings that are options of `Preprocessing` and are not None."""
         return self.model_dump(include=PREPROCESSING, exclude_none=True)
 
 

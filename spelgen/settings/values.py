@@ -9,7 +9,7 @@ MAX_MAGNITUDE = 1e12
 
 
 def no_bool(value: object) -> object:
-    """Return the value unchanged. Raises ValueError if it is a bool."""
+    """Return the value of a number in settings, unchanged. Raises ValueError if it is a bool."""
     # YAML reads `yes` as True, and float(True) is 1.0: without this check `yes` would be accepted as a number.
     if isinstance(value, bool):
         raise ValueError("a number")
@@ -17,7 +17,7 @@ def no_bool(value: object) -> object:
 
 
 def bounded(value: float) -> float:
-    """Return the value unchanged. Raises ValueError if its magnitude exceeds MAX_MAGNITUDE."""
+    """Return a number in settings, unchanged. Raises ValueError if its magnitude exceeds MAX_MAGNITUDE."""
     if abs(value) > MAX_MAGNITUDE:
         raise ValueError(f"a number within +-{MAX_MAGNITUDE:g}")
     return value

@@ -19,7 +19,7 @@ from spelgen.files import read_bytes
 Location: TypeAlias = tuple[int | str, ...]
 """Place of a value in a YAML file: keys, and indices of list items from 0, from the outermost group inwards."""
 
-# Expected content per error type of pydantic, for types whose message has words of Python or of pydantic.
+# {type of an error of pydantic: expected content in plain words}, for types whose message has words of Python.
 EXPECTED = {
     "missing": "a value", "model_type": "keys with values", "dict_type": "keys with values", "tuple_type": "a list",
     "list_type": "a list", "too_short": "a longer list", "too_long": "a shorter list", "float_type": "a number",
@@ -45,7 +45,8 @@ class YamlDocument:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
             raise _yaml_error(error, self.path) from error
-        # The loader raises ValueError for some values, for example for the date 2025-99-99.
+        # The loader of PyYAML raises ValueError for some values, for example for the date 2025-99-99: each is an error
+        # of the file, too.
         except ValueError as error:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
@@ -64,10 +65,10 @@ class YamlDocument:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return the node whose line is reported for an entry of `node`, and the node of the entry's value.
+    """Return two nodes of an entry of a YAML mapping or list: the node whose line errors report, and its value.
 
-    key: key of a mapping, for which both nodes are returned, or index of a list item, whose node is returned twice. The
-    result is None if the entry does not exist.
+    The first node is the key of an entry of a mapping; an item of a list is returned twice. The result is None if the
+    entry does not exist. key: key in a mapping, or index in a list.
     """
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
@@ -93,7 +94,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         # Tags are errors, because a tag may contradict its value, as in "!!bool maybe".
         if is_tagged:
             raise ComposerError(None, None, f"the tag {event.tag}", mark)
-        # The depth is bounded, because the parser is recursive. Settings have at most six levels.
+        # The depth of nesting is bounded, because the parser is recursive. Settings have at most six levels.
         if self.depth == 16:
             raise ComposerError(None, None, "more than 16 levels", mark)
         self.depth += 1
@@ -120,8 +121,8 @@ def read_document(path: Path) -> YamlDocument:
     Raises SettingsError if the file cannot be read, is larger than 256 KiB, is not valid YAML in UTF-8, has more than
     one document, or contains a construct that `_Loader` does not permit.
     """
-    # The size is bounded, because larger files could exhaust the memory. Settings of 300 joints with all keys have
-    # 60 kB.
+    # The size of a YAML file is bounded, because larger files could exhaust the memory. Settings of 300 joints with all
+    # keys have 60 kB.
     content = read_bytes(path, SettingsError, "a YAML file", 256 * 1024)
     try:
         return YamlDocument(path, _Loader(content.decode("utf-8")).get_single_node())
@@ -140,7 +141,7 @@ def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
 
 
 def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
-    """Return a group of settings with validated values.
+    """Return an object of the class `group` with validated values.
 
     Raises SettingsError, or SpelgenErrors for several errors; see `explain`.
 
@@ -157,10 +158,10 @@ def validated(group: type[Checked], content: object, document: YamlDocument | No
 
 
 def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[BaseModel]) -> SettingsError:
-    """Return one of pydantic's errors as a `SettingsError` with line and expected value.
+    """Return one error of pydantic as a `SettingsError` with line and expected value.
 
-    detail: an item of `ValidationError.errors`.
-    document: the YAML file; None for values of the command line, which have no lines. group: the validated class.
+    detail: an item of pydantic's `ValidationError.errors`. document: the YAML file; None for values of the command
+    line, which have no lines. group: class of the settings.
     """
     location, error_type = detail["loc"], detail["type"]
     # An unknown key, the most frequent error, is mostly misspelt: the message names the most similar known key.
@@ -169,7 +170,7 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         return unknown_name(location, "key", str(location[-1]), names, document)
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
-    # The location of an invalid key of a dict ends with "[key]", which pydantic adds.
+    # Pydantic adds "[key]" to the location of an invalid key of a dict: it is removed.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
         if error_type == "string_pattern_mismatch":
@@ -210,9 +211,9 @@ def _error_at(location: Location, document: YamlDocument | None, got: str) -> Se
 
 
 def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
-    """Return the pydantic model of the settings at a location, from the model `group` of the document's root.
+    """Return the class of the group of settings at a location, for a document whose root has the class `group`.
 
-    Elements of the location that are keys of dicts or indices of lists are skipped.
+    Elements of the location that are keys of dicts or indices of lists have no class and are skipped.
     """
     for key in map(str, location):
         if key in group.model_fields:
@@ -221,7 +222,7 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
-    """Return the first class of a group of keys in a type annotation such as `dict[str, Group] | None`."""
+    """Return the first class of settings in a type annotation such as `dict[str, JointLog] | None`, if any."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next(filter(None, map(_first_group, get_args(annotation))), None)

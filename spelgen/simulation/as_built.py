@@ -51,7 +51,10 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 
 
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
-    """Write the settings of a URDF; return the arm of this URDF, with angles rounded by the tolerance of ``arm``."""
+    """Write `settings` next to the URDF `path`; return the arm that is loaded from both files.
+
+    Angles of the URDF are rounded with the same tolerance as the angles of ``arm``.
+    """
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
 
@@ -66,8 +69,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Other arms are simulated along prescribed paths. This is not possible with position servos and passive joints, so
-    # such arms keep the protocol of their settings.
+    # Arms with position servos or passive joints cannot be simulated along prescribed paths, as all other arms are.
+    # They keep the protocol of their settings.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
@@ -92,8 +95,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
 def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[str, object]]:
     """Return {name of a joint: settings} with random friction and armature.
 
-    Coulomb friction is a random fraction of the typical rigid-body torque of the joint, at most half the effort limit.
-    Armature is a random fraction of the mean diagonal entry of M.
+    Coulomb friction is a random fraction of the typical rigid-body torque of the joint or, if this is smaller, of half
+    the effort limit. Armature is a random fraction of the mean of the joint's diagonal entry of M.
 
     Args:
         arm: Nominal arm, whose gear ratios and servo gains are kept.
@@ -106,7 +109,7 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
     dynamics = arm_dynamics(bodies.chain, bodies.settings)
     inertia = np.einsum("tii->i", dynamics.mass_matrix(q)) / len(q)
     speed = np.array([min(joint.velocity or np.inf, SPEEDS[joint.joint_type]) for joint in joints])
-    # The typical rigid-body torque is the RMS of gravity torque plus inertia torque. Both are assumed to be
+    # The typical rigid-body torque is the RMS of gravity torque plus inertia torque. The two torques are assumed to be
     # uncorrelated, so their mean squares are added.
     torque = np.hypot(
         np.sqrt(np.square(dynamics.gravity(q)).mean(axis=0)), AS_BUILT.acceleration * speed * inertia
@@ -136,9 +139,10 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
 def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     """Return the URDF without friction, visuals and collisions, and with perturbed inertials.
 
-    Per link, mass and inertia about the centre of mass are scaled by independent factors exp(error N(0, 1)); the centre
-    of mass is shifted by error N(0, 1) times the body's radius of gyration, along each axis of the link frame. An
-    inertia tensor that no body can have is replaced by a physically consistent one.
+    Per link, the mass and the ratio of the inertia about the centre of mass to the mass are scaled by independent
+    factors exp(error N(0, 1)); the centre of mass is shifted by error N(0, 1) times the body's radius of gyration,
+    along each axis of the link frame. An inertia tensor that no body can have is replaced by a physically consistent
+    one.
 
     Args:
         robot: URDF or xacro file, which was read before.
@@ -153,7 +157,7 @@ def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
 
 
 def urdf_without(robot: Path, *tags: str) -> etree._Element:
-    """Return the root element of a URDF or xacro file, without comments and without elements of these tags."""
+    """Return the root element of a URDF or xacro file, without comments and without the elements named in `tags`."""
     root = read_document(robot).root
     etree.strip_tags(root, etree.Comment)
     for element in list(root.iter(*tags)):

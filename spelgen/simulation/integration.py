@@ -25,7 +25,7 @@ def rollout(
 ) -> np.ndarray:
     """Return the states (q, qd) of a simulated motion at times t, (T, 2n) [rad, rad/s; m, m/s].
 
-    Method: LSODA (Petzold, SIAM J. Sci. Stat. Comput. 4, 1983), restarted at each change of tau. It switches to an
+    Method: LSODA (Petzold, SIAM J. Sci. Stat. Comput. 4, 1983), restarted at each change of tau. LSODA switches to an
     implicit method for stiff friction, so a joint that stops within microseconds does not force short steps. Raises
     RunError if the integration fails.
 
@@ -41,7 +41,7 @@ def rollout(
     states = np.empty((t.size, 2 * n))
     states[0] = initial
     # LSODA is a multistep method: it extrapolates from past derivatives, which are invalid after a jump of tau.
-    # Therefore it is restarted at each jump.
+    # Therefore LSODA is restarted at each jump.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
         torque = tau[first]

@@ -95,7 +95,7 @@ def prescribed(
         motions = paths(arm, settings, sample_times(protocol))
     logs = []
     for number, motion in enumerate(motions):
-        # Each motion has its own generator, so that its noise does not depend on the other motions.
+        # Each motion has its own random generator, so that its noise does not depend on the other motions.
         rng = np.random.default_rng([protocol.seed, number])
         torque = dynamics.inverse_dynamics(motion.q, motion.qd, motion.qdd)
         torque = torque + friction_along(friction, arm, motion, protocol.presliding)
@@ -127,6 +127,8 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
         return friction(motion.qd)
     scale = np.array([1.0 if kind == "revolute" else 0.1 for kind in arm.joint_types])
     elements = np.geomspace(presliding / AS_BUILT.presliding_span, presliding, AS_BUILT.elements)
-    breakaway = scale[:, None] * elements  # (n, K) [rad, m], for K friction elements per joint
-    deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))  # (T, n, K) [rad, m]
+    # breakaway: displacements (n, K) [rad, m] of K friction elements per joint
+    breakaway = scale[:, None] * elements
+    # deflection: (T, n, K) [rad, m] of the K elements of each joint
+    deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))
     return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))

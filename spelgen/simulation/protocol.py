@@ -46,12 +46,12 @@ class SimulatedLogs(list[Trajectory]):
 
 
 def sample_times(simulation: SimulationSettings) -> np.ndarray:
-    """Return the times of the samples of one trajectory, (T,) [s]."""
+    """Return the times of the samples of one simulated trajectory, (T,) [s], which start at 0."""
     return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
 
 
 def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = None) -> DriveFriction:
-    """Return the friction of the drives.
+    """Return the friction model of the drives of a simulated arm.
 
     The friction of a joint is specified by its settings or, if the settings have none, by <dynamics> in the URDF.
 
@@ -66,7 +66,7 @@ def make_friction(arm: Chain, settings: Settings, speeds: np.ndarray | None = No
 
 
 def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest initial positions, (n,) each [rad, m].
+    """Return the lowest and the highest initial position of each joint in simulated trajectories, (n,) each [rad, m].
 
     Raises ArmError if neither the settings nor the URDF specify a range for a joint.
     """
@@ -84,10 +84,10 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
 
 
 def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
-    """Return the desired motion of each trajectory, as `settings.tracking` specifies.
+    """Return the desired motion of each trajectory, (T, n) each: random motions of the kind in `settings.tracking`.
 
-    The first motions are the same for any number of trajectories. Raises SettingsError if sines exceed a joint's range,
-    or if a joint has no range.
+    The motions are exciting trajectories or sines. The first motions are the same for any number of trajectories.
+    Raises SettingsError if sines exceed a joint's range, or if a joint has no range.
 
     Args:
         arm: The arm.
@@ -95,7 +95,8 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
         t: Times (T,) [s].
     """
     count = settings.simulation.trajectories
-    # Each trajectory has its own generator, so that the first trajectories do not depend on their number.
+    # Each trajectory has its own random generator, so that the first trajectories are the same for any number of
+    # trajectories.
     randoms = np.random.default_rng(settings.simulation.seed).spawn(count)
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
@@ -135,7 +136,7 @@ def sines(
 
 
 def _amplitude(arm: Chain, settings: Settings, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the amplitudes of the sines, (n,) [rad, m].
+    """Return the amplitudes of the sines along which the joints of a simulated arm move, (n,) [rad, m].
 
     low, high: ranges of the joints, (n,) each [rad, m]. Raises SettingsError if the amplitude in the settings is larger
     than half the range of a joint.

@@ -1,4 +1,4 @@
-"""Simulated logs of an arm under position servos: commands of sines, holds and steps, and encoder positions."""
+"""Simulated logs of an arm under position servos: commands that are sums of sines and steps, and encoder positions."""
 
 import numpy as np
 
@@ -32,7 +32,8 @@ def servo_motions(arm: Chain, settings: Settings, progress: Progress) -> Simulat
     t = sample_times(protocol)
     resolution = 2 * np.pi / TUNING.encoder_counts
     is_revolute = np.array([x.joint_type == "revolute" for x in arm.coordinates])
-    encoder = np.where(is_revolute, resolution, resolution / 10)  # (n,) [rad, m]
+    # encoder: step of each joint's encoder, (n,) [rad, m]
+    encoder = np.where(is_revolute, resolution, resolution / 10)
     logs = []
     for number, random in enumerate(np.random.default_rng(protocol.seed).spawn(protocol.trajectories)):
         u = middle + width * _commands(random, t, len(middle))
@@ -76,8 +77,8 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
-    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). Its
-    # unknown half is added to the mass matrix.
+    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). The
+    # half with the velocity after the step is unknown: it is added to the mass matrix.
     damping = np.diag(h / 2 * (kd + friction.viscous))
     impulses = -h * np.stack([friction.forward, friction.backward])
     q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)
@@ -96,13 +97,12 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
 def _after_dry_friction(
     qd: np.ndarray, inverse: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray:
-    """Return the velocity (n,) after the impulses of dry friction.
+    """Return the velocity (n,) [rad/s, m/s] after the impulses of dry friction.
 
     Args:
-        qd: Velocity (n,) without dry friction.
-        inverse: Inverse of the mass matrix, (n, n).
-        lower: Lower bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
-        upper: Upper bounds of the impulses, given by Coulomb friction, (n,) [Nm s, N s].
+        qd: Velocity (n,) without dry friction [rad/s, m/s].
+        inverse: Inverse of M + h D / 2, (n, n), with the step length h and the damping coefficients D.
+        lower, upper: Bounds of the impulses, (n,) [Nm s, N s]: the step length h times Coulomb friction.
     """
     impulse = np.zeros_like(qd)
     for _ in range(TUNING.friction_sweeps):

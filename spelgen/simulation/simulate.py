@@ -55,7 +55,8 @@ def random_inputs(
         is_driven = joint.actuated and not coordinate.passive
         torques.append(np.array(joint.inputs or protocol.inputs) if is_driven else np.zeros(1))
     t = sample_times(protocol)
-    # Each trajectory has its own generator, so that the first trajectories do not depend on their number.
+    # Each trajectory has its own random generator, so that the first trajectories are the same for any number of
+    # trajectories.
     split, *randoms = np.random.default_rng(protocol.seed).spawn(protocol.trajectories + 1)
     trajectories = []
     for number, random in enumerate(randoms):

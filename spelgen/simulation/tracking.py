@@ -91,14 +91,14 @@ def record(
 ) -> Recording:
     """Return the recording of a controlled motion along a path. The arm starts at rest, in equilibrium with gravity.
 
-    The controller reads the encoders at each tick of its clock, and its torques are constant between ticks. It is a PID
-    controller per joint or, for `tracking.control: computed-torque`, inverse-dynamics control with the true parameters
-    of the arm (Siciliano et al., Robotics, 2009, 8.5.2):
+    The controller reads the encoders at each tick of its clock, and its torques are constant between ticks. The
+    controller is a PID controller per joint or, for `tracking.control: computed-torque`, inverse-dynamics control with
+    the true parameters of the arm (Siciliano et al., Robotics, 2009, 8.5.2):
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    with the position error e = q* - q. For a joint that viscous friction makes slower than omega, a stiffness
-    viscous * omega is added.
+    with the position error e = q* - q. At a joint with viscous > M_jj omega, where friction would slow the decay of e
+    down, the torque viscous omega e is added.
 
     Args:
         dynamics: The arm, with friction.
@@ -111,7 +111,7 @@ def record(
     """
     tracking, n = settings.tracking, path.q.shape[1]
     tick, samples = 1.0 / tracking.control_rate, _samples_of_a_tick(settings)
-    # Without the integral term the characteristic polynomial of the position loop is s^2 + 2 omega s + omega^2. Its
+    # Without the integral term the characteristic polynomial of the position loop is s^2 + 2 omega s + omega^2. The
     # double pole -omega gives no overshoot.
     proportional, derivative = inertia * omega**2, 2 * inertia * omega
     integral_gain = TUNING.integral_gain * inertia * omega**3
@@ -164,7 +164,7 @@ def _samples_of_a_tick(settings: Settings) -> int:
     count = round(sample_rate / control_rate)
     if count < 1 or abs(count * control_rate - sample_rate) > 1e-9 * sample_rate:
         raise SettingsError(
-            f"{control_rate:g} Hz beside samples at {sample_rate:g} Hz", element="tracking.control_rate",
+            f"{control_rate:g} Hz with samples at {sample_rate:g} Hz", element="tracking.control_rate",
             expected="a rate of which simulation.sample_rate is a multiple",
         )  # fmt: skip
     return count

@@ -16,8 +16,8 @@ class SimulationTuning:
     # [1] Largest number of integrator steps while the torque is constant. An integration that needs more is stopped
     # with an error.
     most_steps: int = 100_000
-    # [1] Factor of both tolerances in the protocol "tracking". Integration errors of about 1e-11 rad are then still far
-    # below the resolution of the encoders.
+    # [1] Factor of both tolerances of the integration in the protocol "tracking". Integration errors of about 1e-11 rad
+    # are then still far below the resolution of the encoders.
     seen_loosening: float = 100.0
     # [1] Default fraction of a joint's position range and speed limit that a simulated motion uses.
     used_range: float = 0.7
@@ -31,7 +31,7 @@ class SimulationTuning:
 
     # [s] Largest integrator step of an arm under position servos.
     servo_step: float = 1e-3
-    # [1] Gauss-Seidel iterations over the joints for the impulses of dry friction.
+    # [1] Number of Gauss-Seidel iterations over the joints for the impulses of dry friction.
     friction_sweeps: int = 4
     # [1] Counts of an encoder per revolution: 12 bits.
     encoder_counts: int = 4096
@@ -41,11 +41,11 @@ class SimulationTuning:
     servo_lag: float = 0.05
     # [rad, m] Largest amplitude of a command about the middle of a joint's range.
     command_amplitude: float = 0.6
-    # [s] Time between jumps of the commands.
+    # [s] Time between jumps of the commanded positions.
     command_interval: float = 2.0
-    # [Hz] Lowest frequency of the commands' sines.
+    # [Hz] Lowest frequency of the sines in the commanded positions.
     min_command_frequency: float = 0.05
-    # [Hz] Highest frequency of the commands' sines: servos of hobby arms track no faster motion.
+    # [Hz] Highest frequency of the sines in the commanded positions: servos of hobby arms track no faster motion.
     max_command_frequency: float = 1.2
 
 
@@ -69,7 +69,8 @@ class AsBuiltTuning:
     viscous: tuple[float, float] = (0.3, 1.0)
     # [1] Armature, divided by the mean diagonal entry of M.
     armature: tuple[float, float] = (0.02, 0.2)
-    # [rad/s] Typical acceleration divided by typical speed, for the typical rigid-body torque.
+    # [1/s] Typical acceleration of a joint divided by its typical speed. The typical rigid-body torque contains the
+    # inertia torque at this acceleration.
     acceleration: float = 2.0
     # [1] Number of random positions at which torques and M are computed to scale friction and armature.
     positions: int = 50
@@ -77,7 +78,7 @@ class AsBuiltTuning:
     range_fraction: float = 0.7
     # [rad] Largest break-away displacement of the friction elements of a joint.
     presliding: float = 0.03
-    # [1] Largest break-away displacement of a joint, divided by the smallest one.
+    # [1] Largest break-away displacement divided by the smallest one, of the friction elements of a joint.
     presliding_span: float = 150.0
     # [1] Number of friction elements per joint.
     elements: int = 5
@@ -85,9 +86,9 @@ class AsBuiltTuning:
     torque_noise: float = 0.02
     # [rad, m] Resolution of the encoders: 19 bits per revolution.
     resolution: float = 1.2e-5
-    # [s] Duration of a recording.
+    # [s] Duration of a simulated recording.
     duration: float = 15.0
-    # [Hz] Sample rate of a recording.
+    # [Hz] Sample rate of a simulated recording.
     sample_rate: float = 200.0
 
 

@@ -1,1 +1,1 @@
-"""Derive the structure of an arm: zero, constant and varying entries of M and V, and minimal functions for M."""
+"""Structure of an arm, derived exactly: zero, constant and varying entries of M, joints of V, minimal form of M."""

@@ -1,9 +1,10 @@
-"""Base inertial parameters of an arm in exact arithmetic: the fewest combinations that determine M and V.
+"""Base inertial parameters of an arm in exact arithmetic: the smallest set of combinations that determine M and V.
 
-Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body. The coefficients, with one
-row for each entry, are the energy regressor. Its rows are computed at random rational configurations; their reduced row
-echelon form gives the base parameters. Gautier and Khalil, *Direct calculation of minimum set of inertial parameters of
-serial robots*, IEEE Trans. Robotics and Automation 6(3), 1990, derive the same parameters by symbolic rules.
+Each entry of M(q), and V(q) - V(q0), is linear in the ten inertial parameters of each body; q0 is a fixed
+configuration. The coefficients, with a row for each entry of M and for V, are the energy regressor. Its rows are
+computed at random rational configurations; their reduced row echelon form gives the base parameters. Gautier and
+Khalil, *Direct calculation of minimum set of inertial parameters of serial robots*, IEEE Trans. Robotics and Automation
+6(3), 1990, derive the same parameters by symbolic rules.
 """
 
 import random
@@ -24,12 +25,15 @@ from spelgen.structure.sampling import regressor_rows
 
 @dataclass(frozen=True)
 class BaseParameter:
-    """A linear combination of inertial parameters that can be identified from the motion.
+    """A base parameter: a linear combination of inertial parameters that can be identified from the motion.
 
-    ``index`` and ``name`` are the index and the name of the first inertial parameter of the combination; the name has
-    the suffix R if the combination has other parameters too. ``weights`` are pairs (index, coefficient); parameter i of
-    a body, in the order of ``INERTIAL_PARAMETERS``, has the index 10 body + i. ``value`` is computed from the inertials
-    of the URDF; it is None if one of these bodies has no inertial.
+    Parameter i of a body, in the order of ``INERTIAL_PARAMETERS``, has the index 10 body + i.
+
+    Attributes:
+        name: name of the first inertial parameter of the combination, with the suffix R if there are others.
+        index: index of the first inertial parameter.
+        weights: pairs (index, coefficient) of the inertial parameters; the first coefficient is 1.
+        value: value for the inertials of the URDF; None if a body of the combination has no inertial.
     """
 
     name: str
@@ -40,12 +44,12 @@ class BaseParameter:
 
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
-    """Return the rank of the inverse-dynamics regressor, which is the number of base parameters."""
-    points = 7  # Seven random positions determine the rank for most arms of up to seven joints.
+    """Return the number of base parameters, which is the rank of the energy regressor over random positions."""
+    points = 7  # Seven random positions determine the rank for most arms of at most seven joints.
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)
-        # If two more points do not raise the rank, it is the final rank, with negligible probability of an error.
+        # If two more positions do not raise the rank, it is the final rank, with negligible probability of an error.
         if field.rank(rows[: len(rows) * points // (points + 2)]) == rank:
             return rank
         points *= 2
@@ -61,7 +65,8 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
     for row in _reduced_rows(arm, order):
         pairs = zip(order, row, strict=True)
         weights = tuple((index, Fraction(int(x.p), int(x.q))) for index, x in pairs if x)
-        # The first nonzero element of a row is its pivot, and equal to 1: the first parameter has the coefficient 1.
+        # The first nonzero element of a row of the echelon form is its pivot, which is 1: it is the coefficient of the
+        # first inertial parameter of the combination.
         first, _ = weights[0]
         name = base_name(parameter_name(first), len(weights))
         result.append(BaseParameter(name, first, weights, _value(arm, weights)))
@@ -69,7 +74,10 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
 
 
 def _value(arm: Chain, weights: Sequence[tuple[int, Fraction]]) -> Fraction | None:
-    """Return the value of a base parameter for the inertials of the URDF; None if one of its bodies has no inertial."""
+    """Return the value of a base parameter for the inertials of the URDF; None if one of its bodies has no inertial.
+
+    weights: pairs (index of an inertial parameter, coefficient).
+    """
     total = Fraction(0)
     for index, coefficient in weights:
         inertia = arm.bodies[index // 10].inertia
@@ -85,7 +93,7 @@ def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
     order: column k of the result is the inertial parameter with the index order[k].
     """
     generator = random.Random(0)
-    # A constant added to V has no effect on the motion: the value of V at the first configuration is subtracted.
+    # A constant in V has no effect on the motion: the row of V at the first configuration is subtracted from others.
     reference = _rows(arm, generator)[-1]
     basis: list[list[fmpq]] = []
     while len(basis) < base_parameter_count(arm):
@@ -97,21 +105,21 @@ def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
 
 
 def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
-    """Return the coefficients of the inertial parameters in the entries of M, and in V, at a random configuration.
+    """Return the energy regressor at a random configuration: (n(n+1)/2 + 1, 10 B) for n joints and B bodies.
 
-    The result has m = n(n+1)/2 + 1 rows for n joints, and 10 B columns for B bodies. Its elements are rational numbers
-    of FLINT (fmpq).
+    A row has the coefficients of the inertial parameters in an entry of M; the last row, in V. The elements are
+    rational numbers of FLINT (fmpq).
     """
     parameters = 10 * len(arm.bodies)
     positions = []
     for _ in arm.coordinates:
         t, value = (fmpq(generator.randrange(1, 1000), generator.randrange(1, 1000)) for _ in range(2))
-        # t is the tangent of half the angle: cosine and sine are rational.
+        # t is the rational tangent of half the joint angle, so that its cosine and sine are rational.
         norm = 1 + t * t
         positions.append(Position((1 - t * t) / norm, 2 * t / norm, value))
     units = list(np.eye(parameters, dtype=int).astype(object))
     elements = coefficients(arm, positions, units, rational)
-    # For an entry that is always zero the recursion returns the integer 0, which is expanded to a row of zeros.
+    # For an entry of M that is always zero the recursion returns the integer 0, which is expanded to a row of zeros.
     return np.stack([np.broadcast_to(element, parameters) for element in elements])
 
 

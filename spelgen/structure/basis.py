@@ -1,10 +1,11 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-U is the span of all changes M(q) - M(q'), and W the span of all M(q). A linear functional of M is a weighted sum of the
-entries of M. It depends only on the joints in a set J if and only if it vanishes on all changes of M caused by joints
-outside J. The functionals f_j are selected greedily: sets of joints close to the tip first, small sets before large
-ones, single entries of M before sums of entries. The sets of linearly independent functionals form a matroid, for which
-the greedy selection is optimal.
+A_k and B_j are constant matrices, c_k constants and f_j functions of q. U is the span of all changes M(q) - M(q'), and
+W the span of all M(q). A linear functional of M is a weighted sum of the entries of M. It depends only on the joints in
+a set J if and only if it vanishes on all changes of M caused by joints outside J. The functions f_j are functionals
+of M. They are selected greedily: sets of joints close to the tip first, small sets before large ones, single entries of
+M before sums of entries. The sets of linearly independent functionals form a matroid, for which the greedy selection is
+optimal.
 """
 
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from spelgen.structure import field
 from spelgen.structure.sampling import Spans
 
 Weights = tuple[tuple[int, int, Fraction], ...]
-"""The nonzero elements (row, column, value) of the lower triangle of a symmetric matrix; indices are 0-based."""
+"""A sparse symmetric matrix: nonzero elements (row, column, value) of its lower triangle; indices are 0-based."""
 
 
 def row_of(weights: Weights, n: int) -> np.ndarray:
@@ -33,10 +34,13 @@ def row_of(weights: Weights, n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Term:
-    """A term f(q) B of M: f is an unknown function of the positions of ``joints``, or a constant without ``joints``.
+    """A term f(q) B of M: a scalar f times a constant symmetric matrix B.
 
-    ``basis``: the matrix B. ``functional``: coefficients with which f is computed from M: f is the sum over the lower
-    triangle of coefficient times entry of M.
+    Attributes:
+        joints: coordinates that the function f depends on; empty if f is a constant.
+        functional: coefficients with which f is computed from M: f is the sum over the lower triangle of coefficient
+            times entry of M.
+        basis: the matrix B.
     """
 
     joints: tuple[int, ...]
@@ -47,8 +51,10 @@ class Term:
 class _Functional(NamedTuple):
     """A weighted sum of the entries of M that depends on the positions of ``joints`` only.
 
-    The coefficients of the entries, (n(n+1)/2,), are available in two forms: ``weights`` has elements of the prime
-    field, ``values`` the same numbers in double precision.
+    Attributes:
+        joints: coordinates, in increasing order.
+        weights: coefficients of the entries of the lower triangle, (n(n+1)/2,), as elements of the prime field.
+        values: the same coefficients in double precision.
     """
 
     joints: tuple[int, ...]
@@ -57,7 +63,10 @@ class _Functional(NamedTuple):
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
-    """Return the varying terms (outputs) and the constant terms of the minimal exact form of M."""
+    """Return the minimal exact form of M: its varying terms f_j(q) B_j (outputs), and its constant terms c_k A_k.
+
+    spans: samples of M and of its changes.
+    """
     functionals = list(_functionals(spans))
     entries = len(spans.keys)
     weights = np.array([r.weights for r in functionals], dtype=np.uint64).reshape(-1, entries)
@@ -72,12 +81,12 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The constant terms are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
+    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
     # `constant_values`, (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    # The entry of M at each pivot of the row reduction defines a constant. Row reduction places pivots in the first
-    # possible columns: the entries that depend on the fewest joints come first.
+    # The entry of M at each pivot of the row reduction defines a constant c_k. Row reduction places pivots in the first
+    # possible columns, so the entries of M are sorted: entries that depend on the smallest number of joints are first.
     order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -86,7 +95,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     solutions = _solved(constant_values[:, bound], constant_values)
     constants = []
     for pivot, row, row_values in zip(bound, rows, solutions, strict=True):
-        # The constant is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
+        # The constant c_k is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
         # entry.
         exact, approximate = _single(spans, pivot)
         for j, output in enumerate(functionals):
@@ -101,14 +110,14 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield linear functionals of M that are linearly independent and together determine every change of M."""
+    """Yield the functions f_j: linearly independent functionals of M that together determine every change of M."""
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
         outside = spans.outside(joints)
         kernel = field.null_space(outside)[:, np.argsort(spans.order)]
         bound = [spans.order[pivot] for pivot in field.pivots(outside)]
-        # `missing`: number of functionals of these joints that are linearly independent of the chosen ones.
+        # `missing`: number of functionals that depend on `joints` only and are independent of the chosen functionals.
         on_changes = field.product(kernel, spans.varying.T)
         missing = field.rank(np.concatenate([chosen, on_changes])) - len(chosen)
         candidates = _candidates(spans, joints, kernel, bound, tried)
@@ -116,9 +125,9 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
             # Each row of `rows` is a functional, represented by its values for a basis of U, the span of all changes of
-            # M. Functionals that differ by a constant are thus equal.
+            # M. Functionals that differ by a constant have equal rows.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
-            # The pivot columns of the transposed matrix are the rows that are linearly independent of earlier rows.
+            # The pivot columns of the transpose of `rows` are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
             for index in independent[len(chosen) :]:
                 yield _Functional(tuple(sorted(joints)), *pairs[index - len(chosen)])
@@ -127,8 +136,12 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of the joints on which M depends: sets close to the tip first, small sets before large ones."""
-    # An arm of more than eight joints has too many subsets: only sets of consecutive joints are tried.
+    """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
+
+    The selection is described in the docstring of the module. Sets close to the tip are first, small sets before large
+    ones.
+    """
+    # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
@@ -141,16 +154,19 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield functionals that depend on ``joints`` only: single entries of M, then the sparsest sums of entries.
+    """Yield two lists of candidates for f_j that depend on ``joints`` only: single entries of M, then sums of entries.
+
+    A candidate is a linear functional of M: its coefficients in the prime field and in double precision, (entries,)
+    each. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of m functionals that do not change with the positions of all other joints, (m, entries).
-        bound: indices of the entries of M at the pivots of the echelon basis of the changes of M with these other
-            joints. Each row of `kernel` is 1 at one entry that is not in `bound`, and 0 at all others not in `bound`.
-        tried: indices of the entries that were candidates for a set of joints before; they are skipped. This function
-            adds its candidates.
+        kernel: basis of the m functionals that vanish on all changes of M caused by other joints, (m, entries).
+        bound: indices of the entries of M at the pivots of an echelon basis of these changes. Outside of `bound`, a row
+            of `kernel` has a single nonzero element, which is 1.
+        tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
+            entries of this call are added.
     """
     singles = []
     for index in reversed(range(len(spans.keys))):
@@ -163,7 +179,7 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # `entry` is the only entry outside `bound` at which the row is not zero; the row is 1 there.
+        # `entry` is the only entry of M outside `bound` at which the row of `kernel` is not zero; it is 1 there.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -173,7 +189,10 @@ def _candidates(
 
 
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the functional that is one entry of M, (entries,), in the field and in double precision."""
+    """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
+
+    They are elements of the prime field, and the same in double precision.
+    """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1
     return weights, weights.astype(float)
@@ -182,30 +201,32 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # With the triangular factor of the QR decomposition of [A, B], the normal equations and the solution are the same,
-    # but there are far fewer rows.
+    # [A, B] is replaced by the triangular factor of its QR decomposition: the normal equations and the solution are the
+    # same, but there are far fewer rows.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a lower triangle as fractions, with their rows and columns.
+    """Return the nonzero elements of a lower triangle, with their rows and columns, as rational numbers.
 
-    exact, values: the same vector (entries,) in the prime field and in double precision.
+    exact, values: the elements of the lower triangle, (entries,), in the prime field and in double precision.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
 
 
 def _fraction(element: int, value: float) -> Fraction:
-    """Return the rational number that an element of the prime field represents.
+    """Return the rational number that an element of the prime field represents (rational reconstruction).
 
-    value: the same number in double precision. Rational reconstruction succeeds if numerator and denominator are below
-    2^30 (von zur Gathen and Gerhard, *Modern Computer Algebra*, section 5.10). Geometry with irrational lengths gives
-    longer fractions; ``value`` is then returned, which is as accurate as the URDF.
+    It succeeds if numerator and denominator are below 2^30 (von zur Gathen and Gerhard, *Modern Computer Algebra*,
+    section 5.10). Geometry with irrational lengths gives longer fractions; ``value`` is then returned, which is as
+    accurate as the URDF.
+
+    element: element of the prime field. value: the same number in double precision.
     """
     # Extended Euclidean algorithm for (PRIME, element), stopped as soon as the remainder is at most 2^30. Each
-    # remainder is a numerator with numerator = denominator * element modulo PRIME.
+    # remainder is a possible numerator, with numerator = denominator * element modulo PRIME.
     previous, current = (field.PRIME, 0), (element, 1)
     while current[0] > 2**30:
         quotient = previous[0] // current[0]
@@ -214,8 +235,8 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # A fraction with this numerator is equal to any element modulo PRIME. It is the number only if it is also close
-        # to `value`; otherwise the number has no short fraction.
+        # Such a fraction exists for any element modulo PRIME. It is the represented number only if it is also close to
+        # `value`; otherwise the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

@@ -1,9 +1,10 @@
 """Entries of M, and V, as exact polynomials in the sines, cosines and positions of the joints.
 
-The recursion of ``structure.recursion`` runs once and records its operations (lazy evaluation). The operations of an
-entry are then executed with one inertial parameter set to 1 and all others to 0, which gives the polynomial that is the
-coefficient of this parameter. Only requested entries are expanded, memory is limited to the polynomials of one
-parameter, and an expansion is stopped before it exceeds its budget of multiplications.
+The recursion of ``structure.recursion`` for M and V runs once and records its operations (lazy evaluation). The
+operations of an entry are then executed with one inertial parameter set to 1 and all others to 0: the result is the
+polynomial that is the coefficient of this inertial parameter in the entry. Only requested entries are expanded, memory
+is limited to the polynomials of one inertial parameter, and an expansion is stopped before it exceeds its budget of
+multiplications.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ from spelgen.structure.base_parameters import rational
 from spelgen.structure.recursion import Position, energies
 
 Value: TypeAlias = fmpq_mpoly | fmpq | int
-"""A polynomial, or a number."""
+"""The value of a recorded operation: a polynomial, or a number."""
 
 
 class Deferred:
-    """A recorded operation of the recursion, or a leaf of the expression (a constant or an inertial parameter)."""
+    """A recorded operation of the recursion for M and V: a node of an expression tree.
+
+    Attributes:
+        action: ``add`` or ``multiply``; or, for a leaf, ``constant`` or ``parameter`` (an inertial parameter).
+        operands: operands of the operation; the value of a constant; the index of an inertial parameter.
+    """
 
     __slots__ = ("action", "operands")
 
@@ -30,7 +36,7 @@ class Deferred:
         self.operands = operands
 
     def __add__(self, operand: Deferred | int) -> Deferred:
-        # Zeros are common: a sum with zero is not recorded, so that it takes no time later.
+        # Zeros are frequent: a sum with zero is not recorded, so that its execution takes no time.
         if isinstance(operand, int) and operand == 0:
             return self
         return Deferred("add", self, operand)
@@ -57,14 +63,22 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """An expansion needs more multiplications of terms than its budget has."""
+    """Error: the polynomial of an entry needs more multiplications of polynomial terms than the budget allows."""
 
 
 class Expansion:
-    """The recorded operations of the recursion for M and V of ``arm``, which give polynomials in s1, c1, q1, s2, ...
+    """M and V of ``arm`` as recorded operations, from which polynomials in s1, c1, q1, s2, ... are computed.
 
     s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
-    budget: number of multiplications of polynomial terms that all expansions together may use; 2e6 take about 2 s.
+
+    Args:
+        arm: the arm.
+        budget: number of multiplications of polynomial terms that all calls of ``polynomial`` together may use; 2e6
+            take about 2 s.
+
+    Attributes:
+        energies: recorded operations of the entries of M, and of V.
+        context: polynomial ring of FLINT.
     """
 
     def __init__(self, arm: Chain, budget: int = 2_000_000):
@@ -84,16 +98,22 @@ class Expansion:
         )
 
     def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
-        """Return the coefficient, a polynomial, of an inertial parameter in an entry of M or in V.
+        """Return the coefficient of an inertial parameter in an entry of M or in V, as a polynomial.
 
-        element: the recorded expression of the entry. parameter: the index of the inertial parameter, 10 body + i.
-        Raises TooLarge if the budget does not suffice.
+        The variables of the polynomial are cosines, sines and lengths that depend on the joint positions.
+
+        Args:
+            element: the entry as a tree of recorded operations, from ``energies``.
+            parameter: index of the inertial parameter, 10 body + i.
+
+        Raises:
+            TooLarge: more multiplications are needed than this object permits.
         """
-        # The keys are the id() of recorded operations, so that a subexpression that occurs twice is computed once.
+        # The keys of `values` are the id() of recorded operations: a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}
         for index, leaf in enumerate(self._parameters):
             values[id(leaf)] = int(index == parameter)
-        # A stack replaces recursion: the operations of a long arm are nested deeper than the recursion limit of Python.
+        # A stack replaces recursion: recorded operations of long arms are nested deeper than Python's recursion limit.
         stack = [element]
         while stack:
             node = stack[-1]
@@ -114,8 +134,9 @@ class Expansion:
             return x
         if action == "add":
             return x + y
-        # The cost is the number of products of two terms: FLINT computes all of them before it collects like terms. An
-        # integer is the value of an inertial parameter, and a product with 0 costs nothing.
+        # The cost of a multiplication is the number of products of two polynomial terms: FLINT computes all of them
+        # before it collects like terms. A factor that is an integer is the value of an inertial parameter, 0 or 1: a
+        # product with 0 costs nothing.
         cost = 1
         for factor in (x, y):
             if isinstance(factor, fmpq_mpoly):

@@ -1,11 +1,12 @@
-"""Initial values and scales of the outputs and parameters of a model, from the inertial parameters of the URDF.
+"""Nominal values of an arm, from the inertials of the URDF: initial values and scales of a model's functions.
 
-These values affect the training of a model, not its structure. If the inertials of a URDF are absent or physically
-inconsistent, default bodies of 1 kg are used.
+Nominal values are means and standard deviations of M, V and torques over random positions. They affect the training of
+a model, not its structure. If the inertials of a URDF are absent or physically inconsistent, default bodies of 1 kg are
+used.
 
-Ten parameters (m, h, I) of a body are physically consistent, that is, belong to a distribution of mass, if and only if
-its pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is positive definite (Wensing, Kim and Slotine, IEEE
-RA-L 3:60, 2018).
+The ten inertial parameters of a body are mass m, first moment h and inertia I. They are physically consistent, that is,
+belong to a distribution of mass, if and only if the pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is
+positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 """
 
 from collections.abc import Sequence
@@ -23,16 +24,21 @@ from spelgen.structure.structure import Structure
 
 @dataclass(frozen=True)
 class Nominal:
-    """Means and standard deviations of the terms of M, of V and of torques, for the bodies of the URDF.
+    """Typical values of M, V and torques of an arm, from which a model gets its initial values and scales.
 
-    They are computed over random positions in the joint ranges, and rounded to six digits for reproducibility across
-    machines.
+    They are computed over random positions in the joint ranges, for the bodies of the URDF or default bodies, and
+    rounded to six digits for reproducibility across machines.
 
-    ``output_means`` and ``output_scales`` have one value per output of the structure, ``constants`` and
-    ``constant_scales`` one per constant; all other tuples have one value per coordinate. ``potential_scale``: standard
-    deviation of V [J]. ``joint_torque``: typical torque [Nm, N], sqrt(g^2 + a^2) with the root mean squares g of the
-    gravity torque and a of the torque for unit acceleration. ``mass_sensitivities`` and ``potential_sensitivities``:
-    change of M and of V with a coordinate, divided by the largest such change of all coordinates.
+    Attributes:
+        output_means: mean of each varying term of M (output of the structure).
+        output_scales: standard deviation of each varying term, with a lower bound.
+        constants: value of each constant of M.
+        constant_scales: magnitude of each constant, with a lower bound.
+        potential_scale: standard deviation of V [J].
+        joint_torque: typical torque of each coordinate [Nm, N]: sqrt(g^2 + a^2) with the root mean squares g of the
+            gravity torque and a of the torque for unit acceleration.
+        mass_sensitivities: change of M with each coordinate, divided by the largest such change of all coordinates.
+        potential_sensitivities: change of V with each coordinate, divided by the largest such change.
     """
 
     output_means: tuple[float, ...]
@@ -46,12 +52,12 @@ class Nominal:
     min_eigenvalue: float
     """Smallest generalised eigenvalue of M(q) relative to the mean of M, over random positions."""
     from_urdf: bool
-    """Whether the inertials of the URDF are usable."""
+    """True if the values are computed from the inertials of the URDF; False: from default bodies."""
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return the nominal values of ``arm`` for the outputs and constants of its ``structure``."""
-    # The seed is fixed, because the nominal values are part of the emitted module, which must be reproducible.
+    """Return typical values of M, V and torques of ``arm``, for the terms of M in its ``structure``."""
+    # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
     q = np.stack([rng.uniform(lower, upper, 512) for lower, upper in ranges], axis=-1)
@@ -62,17 +68,18 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
     means = mass.mean(axis=0)
     rows, columns = np.tril_indices(len(ranges))
     diagonal = rows == columns
-    # The typical magnitude of an entry is its bound: |M_ij| <= sqrt(M_ii M_jj), because M is positive definite.
+    # The typical magnitude of an entry of M is its bound: |M_ij| <= sqrt(M_ii M_jj), because M is positive definite.
     typical = np.sqrt(means[diagonal][rows] * means[diagonal][columns])
     output_rows = _functionals(structure.outputs, len(ranges))
     constant_rows = _functionals(structure.constants, len(ranges))
     outputs = mass @ output_rows.T
     constants = constant_rows @ means
-    # Lower bounds of the scales: an output that is almost constant for the inertials of the URDF may vary for the true
-    # ones, and the scale is a divisor.
+    # Scales have lower bounds, since they are divisors, and a term of M that is almost constant (or zero) for the
+    # inertials of the URDF may vary for the true inertials.
     output_floor = 0.05 * (np.abs(output_rows) @ typical)
     constant_floor = 0.05 * (np.abs(constant_rows) @ typical)
-    # Friction is scaled by the torque that a joint's drive needs for gravity and for unit acceleration.
+    # `torque` and `inertial` are the torques that a joint's drive needs for gravity and for unit acceleration; friction
+    # is scaled by them.
     torque = _gravity_torque(arm, q, inertias)
     inertial = np.sqrt((mass[:, diagonal] ** 2).mean(axis=0))
     return Nominal(
@@ -80,7 +87,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
         output_scales=_rounded(np.maximum(outputs.std(axis=0), output_floor), zero_below=0.0),
         constants=_rounded(constants),
         constant_scales=_rounded(np.maximum(np.abs(constants), constant_floor), zero_below=0.0),
-        # V is determined up to a constant, so that its scale is its standard deviation and not its magnitude.
+        # V is determined up to a constant: its scale is its standard deviation, not its magnitude.
         potential_scale=_round(max(float(potential.std()), 1e-3)),
         joint_torque=_rounded(np.hypot(torque, inertial)),
         mass_sensitivities=_sensitivities(_mass_changes(arm, q, inertias, mass, typical)),
@@ -91,7 +98,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return, for each of m terms, the coefficients of its linear functional of M, (m, n(n+1)/2).
+    """Return the coefficients with which the functions of m terms are computed from M, (m, n(n+1)/2).
 
     The columns are the entries of the lower triangle of M, row after row.
     """
@@ -100,7 +107,7 @@ def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
 
 
 def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
-    """Whether, with the inertials of the URDF, every joint moves a mass and M is positive definite.
+    """Return True if, with the inertials of the URDF, every joint moves a mass and M is positive definite.
 
     M is tested at S positions q, (S, n) [rad, m].
     """
@@ -112,29 +119,32 @@ def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return the ten inertial parameters of each body as floats; see ``exact_inertias``."""
+    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body."""
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
 def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
-    """Return the ten inertial parameters of each body: exact from the URDF, or default bodies of 1 kg."""
+    """Return the ten inertial parameters (m, h, I) of each body about the origin of its joint frame.
+
+    from_urdf: True: exact values of the URDF; False: default bodies of 1 kg.
+    """
     if from_urdf:
         return [body.inertia or () for body in arm.bodies]
     return [_default_inertia(arm, index) for index in range(len(arm.bodies))]
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return mass, first moment and inertia (m, h, I), about the origin of the body's joint, of a sphere of 1 kg.
+    """Return the ten inertial parameters (m, h, I) of a default body: a sphere of 1 kg, with 0.1 m radius of gyration.
 
-    The centre of the sphere is half-way to the next joint. For the last body, or if the next joint is closer than
-    0.2 m, the centre is at (0.1, 0, 0.1) m in the frame of the body's joint.
+    They are about the origin of the body's joint frame. The centre of the sphere is half-way to the next joint. For the
+    last body, or if the next joint is closer than 0.2 m, the centre is at (0.1, 0, 0.1) m in the joint frame.
     """
-    gyration = 0.1  # [m] radius of gyration
+    gyration = 0.1  # [m] radius of gyration of a default body
     center = np.zeros(3)
     for body in reversed(arm.bodies):
         if body.parent == index:
             center = np.array(body.translation, dtype=float) / 2
-    # A centre of mass on the joint's axis would cause neither gravity torque nor coupling between joints.
+    # A centre of mass close to the joint axis would cause neither gravity torque nor coupling between joints.
     if np.linalg.norm(center) < gyration:
         center = np.array([gyration, 0.0, gyration])
     tensor = (gyration**2 + center @ center) * np.eye(3) - np.outer(center, center)
@@ -142,7 +152,7 @@ def _default_inertia(arm: Chain, index: int) -> list[float]:
 
 
 def _min_eigenvalue(mass: np.ndarray) -> float:
-    """Return the smallest generalised eigenvalue of S samples of M relative to their mean.
+    """Return the smallest generalised eigenvalue of S samples of M relative to the mean of the samples.
 
     The result is 0 if the mean is not positive definite. mass: lower triangles of M, (S, n(n+1)/2).
     """
@@ -161,7 +171,7 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
-    # [rad, m] Step of the central differences. Their relative error of 1e-8 is small enough for scales.
+    # [rad, m] Step of the central differences for dV/dq. Its relative error of 1e-8 is small enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
@@ -175,12 +185,12 @@ def _mass_changes(
 ) -> np.ndarray:
     """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
 
-    In each sample, the coordinate is replaced by its value in the preceding sample. Each change of an entry is divided
-    by the typical magnitude of the entry, so that it has no unit. The mean is over samples and entries.
+    In each sample, the coordinate is replaced by its value in the preceding sample. The change of an entry of M is
+    divided by the typical magnitude of the entry, so that it has no unit. The mean is over samples and entries.
 
     Args:
         arm: the arm.
-        q: S sampled positions, (S, n) [rad, m].
+        q: S random positions, (S, n) [rad, m].
         inertias: ten inertial parameters of each body.
         mass: lower triangles of M at q, (S, n(n+1)/2).
         typical: magnitudes of the entries of M, (n(n+1)/2,), by which the changes are divided.
@@ -194,9 +204,9 @@ def _mass_changes(
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return magnitudes (n,) divided by the largest magnitude, and at least 0.02.
+    """Return the magnitudes of all coordinates, (n,), divided by the largest magnitude, and at least 0.02.
 
-    They scale the inputs of networks; the lower bound keeps every joint as an input.
+    The results are factors of the inputs of networks; with the lower bound, every joint is an input.
     """
     if magnitudes.max() <= 0:
         return (1.0,) * len(magnitudes)
@@ -204,12 +214,12 @@ def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
 
 
 def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> tuple[float, ...]:
-    """Return values (n,), each rounded by ``_round``."""
+    """Return the values, (n,), each rounded to ``digits`` significant digits by ``_round``."""
     return tuple(_round(value, digits, zero_below) for value in values.tolist())
 
 
 def _round(value: float, digits: int = 6, zero_below: float = 1e-12) -> float:
-    """Return a value rounded to ``digits`` significant digits, so that it is equal on every machine.
+    """Return a value rounded to ``digits`` significant digits, so that results are equal on all machines.
 
     Magnitudes up to ``zero_below`` become 0. Scales are rounded with ``zero_below`` = 0, because scales are divisors:
     they must not become 0, even for an arm of 1e-12 kg.
@@ -229,7 +239,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
-    # I = tr(S) 1 - S is the inertia tensor for second moments of mass S. Solved for S, it is S = tr(I)/2 1 - I.
+    # The inertia tensor is I = tr(S) 1 - S for second moments of mass S. Solved for S, this is S = tr(I)/2 1 - I.
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]
@@ -237,7 +247,10 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def parameters_of(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias (..., 4, 4); see `pseudo_inertia`."""
+    """Return the inertial parameters (m, h, I), (..., 10), of pseudo-inertias, (..., 4, 4).
+
+    It is the inverse of `pseudo_inertia`.
+    """
     second_moment = pseudo[..., :3, :3]
     tensor = _trace(second_moment) * np.eye(3) - second_moment
     mass, first_moment = pseudo[..., 3, 3:], pseudo[..., :3, 3]
@@ -245,23 +258,25 @@ def parameters_of(pseudo: np.ndarray) -> np.ndarray:
 
 
 def _trace(matrices: np.ndarray) -> np.ndarray:
-    """Return traces (..., 1, 1) of (..., 3, 3)."""
+    """Return the traces, (..., 1, 1), of matrices, (..., 3, 3)."""
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1)[..., None, None])
 
 
 def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return the Cholesky factor of a consistent pseudo-inertia, and whether the parameters are consistent.
+    """Return the Cholesky factor of a body's pseudo-inertia J, made physically consistent if necessary.
 
     Args:
-        parameters: mass, first moment and inertia (m, h, I) of a body, (10,) [kg, kg m, kg m2].
+        parameters: mass, first moment and inertia (m, h, I) of a body, (10,) [kg, kg m, kg m^2].
 
     Returns:
-        C (4, 4) with C C^T = J. If the parameters are inconsistent, the smallest eigenvalues of J are raised.
+        Lower triangular C, (4, 4), with C C^T = J, and True if the parameters are consistent. If they are inconsistent,
+        the smallest eigenvalues of J are raised before the factorisation.
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] Smallest eigenvalue of an inconsistent J after its correction, divided by the largest eigenvalue. The test of
-    # consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is consistent.
+    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one.
+    # The test of consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is
+    # consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

@@ -2,9 +2,9 @@
 
 The recursion (Featherstone, *Rigid Body Dynamics Algorithms*, 2008, ch. 6) consists of additions, negations and
 multiplications. The same code therefore computes with floating-point numbers (``nominal``), elements of a prime field
-(``sampling``) and polynomials (``expansion``). M and V are linear in the ten inertial parameters of each body: m,
-h = m c, and I about the origin of the frame of the body's joint. A joint rotates about, or translates along, the z axis
-of its frame.
+(``sampling``) and polynomials (``expansion``). M and V are linear in the ten inertial parameters of each body: mass m,
+first moment h = m c with the centre of mass c, and inertia I about the origin of the frame of the body's joint. A joint
+rotates about, or translates along, the z axis of its frame.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,7 @@ Element = Any
 """A number of the recursion: any object that supports +, - and * with such objects and with integers."""
 
 Number = Callable[[Fraction], Element]
-"""Conversion of the exact constants of an arm to the numbers of the recursion."""
+"""Function that converts the exact (rational) constants of an arm to the numbers of the recursion."""
 
 Vector = tuple[Element, ...]
 
@@ -28,7 +28,7 @@ TENSOR = tuple(combinations_with_replacement(range(3), 2))
 
 
 class Position(NamedTuple):
-    """The position of a coordinate q: cosine and sine of q / d, and q itself.
+    """The position of a coordinate q, as the recursion uses it: cosine and sine of q / d, and q itself.
 
     The integer d is 1 without mimic joints. With mimic joints, their angles are integer multiples of q / d plus a
     constant, so that their cosines and sines are polynomials in cos(q / d) and sin(q / d) (see ``base_denominators``).
@@ -47,9 +47,12 @@ class Energies(NamedTuple):
 
 
 class _Inertia(NamedTuple):
-    """Inertia of a rigid set of bodies: mass, first moment of mass, and inertia tensor about the origin of a frame.
+    """Inertia of one or several rigidly connected bodies, about the origin of a frame.
 
-    ``tensor`` has six components in the order of ``TENSOR``.
+    Attributes:
+        mass: mass.
+        moment: first moment of mass, (3,).
+        tensor: inertia tensor, (6,), in the order of ``TENSOR``.
     """
 
     mass: Element
@@ -58,9 +61,10 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """The pose of a joint's frame in its parent body, or the motion of a joint.
+    """A rotation and a translation: of a joint frame in the frame of the parent body, or due to a joint's position.
 
-    rotation: rows of the matrix. The elements 0, 1 and -1 of rotation and translation are Python integers.
+    rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, so that
+    products with them are recognized and not computed.
     """
 
     rotation: tuple[Vector, ...]
@@ -68,7 +72,7 @@ class _Pose(NamedTuple):
 
 
 _Wrench = tuple[Vector, Vector]
-"""A force, and its moment about the origin of the frame."""
+"""A wrench: a force, and its moment about the origin of the frame."""
 
 
 def triangle(n: int) -> list[tuple[int, int]]:
@@ -79,17 +83,17 @@ def triangle(n: int) -> list[tuple[int, int]]:
 def energies(
     arm: Chain, positions: Sequence[Position], inertias: Sequence[Sequence[Element]], number: Number
 ) -> Energies:
-    """Return the mass matrix and the potential energy of ``arm``.
+    """Return the mass matrix M and the potential energy V of ``arm``.
+
+    V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
 
     Args:
         arm: the arm.
         positions: position of each coordinate.
-        inertias: ten inertial parameters of each body.
+        inertias: ten inertial parameters (m, h, I) of each body, in the order of ``Body.inertia``.
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
-
-    V is zero for a mass at the origin of the root link and increases against ``arm.gravity``.
     """
-    motions = _motions(arm, positions, number)
+    transforms = _joint_transforms(arm, positions, number)
     poses = [
         _Pose(tuple(_vector(row, number) for row in body.rotation), _vector(body.translation, number))
         for body in arm.bodies
@@ -100,23 +104,24 @@ def energies(
     # Parents precede children in `arm.bodies`. In reverse order, all children are added to the composite inertia of a
     # body before its column of M is computed.
     for index, body in reversed(list(enumerate(arm.bodies))):
-        for ancestor, entry in _column(arm, poses, motions, index, composites[index]):
+        for ancestor, entry in _column(arm, poses, transforms, index, composites[index]):
             first, second = body.coordinate, ancestor.coordinate
             # The velocity of a mimic joint is `multiplier` times the velocity of its leader.
             multiplier = body.multiplier * ancestor.multiplier
             if multiplier != 1:
                 entry = number(multiplier) * entry
-            # Two different bodies i, j of one coordinate contribute twice to its diagonal entry: by (i, j) and (j, i).
+            # Two different bodies i, j that move with the same coordinate contribute twice to its diagonal entry of M:
+            # by (i, j) and (j, i).
             if first == second and body is not ancestor:
                 entry = entry + entry
             key = max(first, second), min(first, second)
             mass[key] = mass[key] + entry
-        moved = _posed_inertia(poses[index], _moved_inertia(motions[index], composites[index]))
+        moved = _posed_inertia(poses[index], _inertia_at_zero(transforms[index], composites[index]))
         if body.parent < 0:
             total = _sum(total, moved)
         else:
             composites[body.parent] = _sum(composites[body.parent], moved)
-    # V = -g . sum_b m_b c_b: the first moment of the composite inertia at the root is this sum.
+    # V = -g . sum_b m_b c_b. The sum is the first moment of the composite inertia of all bodies at the root.
     gravity = _vector(arm.gravity, number)
     return Energies(mass, -_dot(gravity, total.moment))
 
@@ -124,20 +129,29 @@ def energies(
 def coefficients(
     arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
-    """Return the coefficients of the inertial parameters in the entries of M, row after row, and then in V.
+    """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
 
-    units: the 10 B unit vectors, (10 B,) each, one for each inertial parameter of B bodies. The elements of the ring
-    are vectors (10 B,), so that an element is a row of coefficients.
+    The recursion computes with vectors of 10 B numbers in place of numbers: since M and V are linear in the inertial
+    parameters, an entry for unit vectors as inertial parameters is its row of coefficients.
+
+    Args:
+        arm: the arm.
+        positions: position of each coordinate.
+        units: the 10 B unit vectors, (10 B,) each, in place of the inertial parameters.
+        number: conversion of the exact constants of the arm to the numbers of the recursion.
+
+    Returns:
+        n(n+1)/2 + 1 vectors, (10 B,) each: the entries of the lower triangle of M, row after row, then V.
     """
     inertias = [units[10 * body : 10 * body + 10] for body in range(len(arm.bodies))]
     result = energies(arm, positions, inertias, number)
     return [*result.mass.values(), result.potential]
 
 
-def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
-    """Return the rotation about z, or translation along z, of the joint of each body at these positions."""
+def _joint_transforms(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
+    """Return the transform of each body in its joint's frame due to ``positions``: rotation about z or translation."""
     bases = base_denominators(arm)
-    motions = []
+    transforms = []
     for body in arm.bodies:
         position = positions[body.coordinate]
         if body.joint_type == "prismatic":
@@ -146,20 +160,20 @@ def _motions(arm: Chain, positions: Sequence[Position], number: Number) -> list[
                 slide = number(body.multiplier) * slide
             if body.offset:
                 slide = slide + number(Fraction(str(body.offset)))
-            motions.append(_Pose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (0, 0, slide)))
+            transforms.append(_Pose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (0, 0, slide)))
         else:
             factor = int(body.multiplier * bases[body.coordinate])
             c, s = _multiple_angle(position.cos, position.sin, factor)
             if body.offset:
                 c0, s0 = map(number, circle_point(body.offset))
                 c, s = c0 * c - s0 * s, s0 * c + c0 * s
-            motions.append(_Pose(((c, -s, 0), (s, c, 0), (0, 0, 1)), (0, 0, 0)))
-    return motions
+            transforms.append(_Pose(((c, -s, 0), (s, c, 0), (0, 0, 1)), (0, 0, 0)))
+    return transforms
 
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
     """Return rational cosine and sine of an angle [rad] with cos^2 + sin^2 = 1 exactly and an error of 1e-13."""
-    # Multiples of a right angle are rounded to -1, 0 and 1: tan(angle / 2) has a pole at pi.
+    # At multiples of a right angle, cosine and sine are rounded to -1, 0 or 1: tan(angle / 2) has a pole at pi.
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)
@@ -167,10 +181,10 @@ def circle_point(angle: float) -> tuple[Fraction, Fraction]:
 
 
 def base_denominators(arm: Chain) -> list[int]:
-    """Return the smallest integer d of each coordinate q such that its joint angles are multiples of q / d.
+    """Return for each coordinate q the smallest integer d, so that joint angles are integer multiples of q / d.
 
     The angle of each revolute joint that q moves, including mimic joints, is an integer multiple of q / d plus a
-    constant.
+    constant: its cosine and sine are polynomials in cos(q / d) and sin(q / d).
     """
     denominators = [1] * len(arm.coordinates)
     for body in arm.bodies:
@@ -183,11 +197,11 @@ def base_denominators(arm: Chain) -> list[int]:
 def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Element]:
     """Return cosine and sine of ``factor`` times an angle with the cosine ``c`` and the sine ``s``."""
     result = (1, 0)
-    # The angle is doubled for each bit of `factor`, and increased by one angle for each bit that is 1. This takes fewer
-    # products than repeated addition: factors are as large as 20.
+    # The angle of `result` is doubled for each bit of `factor`, and increased by the given angle for each bit that is
+    # 1. This takes fewer products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # (x + i y)^2 has twice the angle of x + i y.
+        # The complex number (x + i y)^2 has twice the angle of x + i y.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -198,18 +212,24 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 
 
 def _column(
-    arm: Chain, poses: Sequence[_Pose], motions: Sequence[_Pose], index: int, inertia: _Inertia
+    arm: Chain, poses: Sequence[_Pose], transforms: Sequence[_Pose], index: int, inertia: _Inertia
 ) -> Iterator[tuple[Body, Element]]:
-    """Yield (ancestor, entry) for a body itself, and then for each of its ancestors.
+    """Yield (ancestor, entry of M) for a body itself, and then for each of its ancestors.
 
-    The entry is the element of the mass matrix in the row of the body's joint and the column of the ancestor's joint.
-    Mimic joints count as independent joints here. index: of the body in `arm.bodies`. inertia: composite inertia of the
-    body and all its descendants.
+    The entry is in the row of the body's joint and the column of the ancestor's joint. M is the mass matrix of all
+    joints, before mimic joints are eliminated.
+
+    Args:
+        arm: the arm.
+        poses: pose of each joint frame in the frame of the parent body.
+        transforms: transform of each body in its joint's frame due to the joint's position.
+        index: index of the body in `arm.bodies`.
+        inertia: composite inertia of the body and all its descendants.
     """
     body = arm.bodies[index]
-    # `wrench` (force, moment) gives the composite body a unit acceleration about or along its z axis: (z x h, I z) if
-    # revolute, (m z, h x z) if prismatic. Its component along the joint axis of an ancestor is the entry of M
-    # (Featherstone, table 6.2).
+    # `wrench` (force, moment) gives the composite body a unit acceleration about or along the z axis of its joint:
+    # (z x h, I z) if revolute, (m z, h x z) if prismatic. The component of the wrench along the joint axis of an
+    # ancestor is the entry of M (Featherstone, table 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
     wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
     if body.joint_type == "prismatic":
@@ -219,7 +239,7 @@ def _column(
         yield body, moment[2] if body.joint_type == "revolute" else force[2]
         if body.parent < 0:
             return
-        wrench = _posed_wrench(poses[index], _posed_wrench(motions[index], wrench))
+        wrench = _posed_wrench(poses[index], _posed_wrench(transforms[index], wrench))
         index, body = body.parent, arm.bodies[body.parent]
 
 
@@ -228,19 +248,21 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
     return _Inertia(a.mass + b.mass, moment, tuple(x + y for x, y in zip(a.tensor, b.tensor, strict=True)))
 
 
-def _moved_inertia(motion: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return an inertia in the joint's frame at q = 0, from the inertia in the frame that moves with the joint.
+def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
+    """Return the inertia of a body about the axes of its joint's frame at q = 0, which does not move with the body.
 
-    motion: rotation about z, or translation along z, of the joint at its current position.
+    inertia: inertia of the body in the frame that moves with it. transform: rotation about z, or translation along z,
+    from the moving frame to the frame at q = 0.
     """
-    s, c, _ = motion.rotation[1]
-    if isinstance(c, int):  # the motion is a translation, whose rotation consists of integers
-        return _translated(motion.translation, inertia)
+    s, c, _ = transform.rotation[1]
+    # The rotation of a prismatic joint is the identity, which consists of integers.
+    if isinstance(c, int):
+        return _translated(transform.translation, inertia)
     hx, hy, hz = inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
-    # sin^2 is replaced by 1 - cos^2 here: otherwise polynomials would contain both and need a reduction.
+    # sin^2 is replaced by 1 - cos^2: otherwise the polynomials would contain both squares, and need a reduction.
     cc, cs, difference = c * c, c * s, xx - yy
-    # R I R^T for a rotation about z. Ixx + Iyy is invariant, so the second diagonal entry needs no products.
+    # The tensor becomes R I R^T for a rotation R about z. Ixx + Iyy is invariant, so Iyy needs no products.
     turned_xx = yy + cc * difference - 2 * (cs * xy)
     turned_xy = cs * difference + 2 * (cc * xy) - xy
     tensor = (turned_xx, turned_xy, c * xz - s * yz, xx + yy - turned_xx, s * xz + c * yz, zz)
@@ -273,7 +295,8 @@ def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
     (x, y, z), mass, (hx, hy, hz) = offset, inertia.mass, inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     moment = (hx + x * mass, hy + y * mass, hz + z * mass)
-    # The inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with k = 2 h + m p (see the docstring).
+    # With the mass m and first moment h, the inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with
+    # p = `offset` and k = 2 h + m p.
     dx, dy, dz = (p * (old + new) for p, old, new in zip(offset, inertia.moment, moment, strict=True))
     xy = xy - x * hy - y * hx - x * y * mass
     xz = xz - x * hz - z * hx - x * z * mass
@@ -282,7 +305,7 @@ def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
 
 
 def _vector(values: Sequence[Fraction], number: Number) -> Vector:
-    # 0, 1 and -1 remain integers, which need no multiplication.
+    # The elements 0, 1 and -1 of a vector remain integers, with which products are skipped.
     return tuple(int(x) if x in (0, 1, -1) else number(x) for x in values)
 
 

@@ -1,8 +1,8 @@
-"""Samples of M and V at random positions, and the spans of M and of its changes that determine the structure.
+"""Samples of M and V at random positions, and the spans of M and of its changes, from which the structure is derived.
 
-Samples are elements of the prime field, or floating-point numbers. They form 1 + n blocks of equal size. Block 0 has
-random positions; the positions of block 1 + k differ from these in coordinate k only (k from 0). An entry of M that
-differs between block 0 and block 1 + k depends on coordinate k.
+Samples are elements of the prime field of ``field``, or floating-point numbers. They form 1 + n blocks of equal size
+for n coordinates. Block 0 has random positions; the positions of block 1 + k differ from block 0 in coordinate k only
+(k from 0). An entry of M that differs between block 0 and block 1 + k depends on coordinate k.
 """
 
 from collections.abc import Sequence
@@ -23,26 +23,32 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    assume: ``kinematics``: each sample has other random inertial parameters. ``inertials``: all samples have the
-    inertial parameters of the URDF.
+    Index 0 of the first axis has random positions; the positions of index 1 + k differ from index 0 in coordinate k
+    only (see the module's docstring).
+
+    Args:
+        arm: the arm, with n coordinates.
+        assume: ``kinematics``: each sample has other random inertial parameters. ``inertials``: all samples have the
+            inertial parameters of the URDF.
+        samples: number of samples per block.
     """
     rng = np.random.default_rng(0)
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Revolute joints use the cosine and sine, prismatic joints the value. The value is a further random number,
-        # independent of the angle, since sines and cosines are algebraically independent of the angle.
+        # Revolute joints use the cosine and sine of q, prismatic joints the value of q. The value is an independent
+        # random number, since a cosine and a sine in the prime field have no angle.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
         positions.append(Position(*moved))
     if assume == "kinematics":
-        # Random inertial parameters make ranks and zeros valid for all values of the parameters, except for special
-        # values (of probability 0).
+        # With random inertial parameters, ranks and zeros of the samples are valid for all values of the parameters,
+        # except for special values (of probability 0).
         inertias: list[Ten] = [list(map(Residues, random_residues(rng, (10, samples)))) for _ in arm.bodies]
     else:
         inertias = [list(map(residue, body.inertia or (Fraction(0),) * 10)) for body in arm.bodies]
-    # The elements of the recursion are arrays, so that one pass computes all samples.
+    # The recursion computes with arrays in place of numbers, so that one pass computes all samples.
     result = energies(arm, positions, inertias, residue)
     shape = (1 + n, samples)
     entries = [_residue_values(entry, shape) for entry in result.mass.values()]
@@ -50,11 +56,13 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
 
 
 def regressor_rows(arm: Chain, points: int) -> np.ndarray:
-    """Return m rows of the energy regressor at each of ``points`` random positions, in the prime field.
+    """Return the energy regressor at random positions, in the prime field, (m points, 10 B) for B bodies.
 
-    The result is (m points, 10 B) for B bodies, with m = n(n+1)/2 + 1 rows for the entries of M(q) and V(q) - V(q0).
-    The entries are linear in the inertial parameters and determine the torque: the rank of the rows is the number of
-    base parameters (Gautier and Khalil 1990).
+    There are m = n(n+1)/2 + 1 rows per position: the coefficients of the inertial parameters in the entries of M(q) and
+    in V(q) - V(q0), with q0 the first position. M and V are linear in the inertial parameters and determine the torque:
+    the rank of the rows is the number of base parameters (Gautier and Khalil 1990).
+
+    points: number of random positions.
     """
     rng = np.random.default_rng(1)
     parameters = 10 * len(arm.bodies)
@@ -67,13 +75,17 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
     units = list(map(Residues, np.eye(parameters, dtype=np.uint64)))
     elements = coefficients(arm, positions, units, residue)
     rows = np.stack([_residue_values(element, (points, parameters)) for element in elements], axis=1)
-    # V is determined up to a constant: its value at the first point is subtracted.
+    # V is determined up to a constant: its row at the first position is subtracted from all its rows.
     rows[:, -1] = difference(rows[:, -1], rows[0, -1])
     return rows.reshape(-1, parameters)
 
 
 def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
-    """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2); arguments as ``field_samples``."""
+    """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2).
+
+    The first axis and the arguments arm, assume and samples are as for ``field_samples``. seed: seed of the random
+    positions and inertial parameters.
+    """
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
     q = [_one_moved(rng.uniform(-3.0, 3.0, 2 * samples), index, 1 + n) for index in range(n)]
@@ -85,15 +97,15 @@ def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np
 
 
 def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower triangles of M and the potential energy.
+    """Return the lower triangle of M and the potential energy V at positions q, in double precision.
 
     Args:
         arm: the arm, with n coordinates.
-        q: positions (..., n) [rad, m], real or complex.
-        inertias: ten inertial parameters of each body, numbers or arrays (...,).
+        q: positions, (..., n) [rad, m], real, or complex for complex-step derivatives.
+        inertias: ten inertial parameters of each body, numbers or arrays, (...,) each.
 
     Returns:
-        M (..., n(n+1)/2), V (...,) [J].
+        Lower triangles of M, row after row, (..., n(n+1)/2), and V, (...,) [J].
     """
     positions = []
     for index, base in enumerate(base_denominators(arm)):
@@ -109,8 +121,8 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
     """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: (2 S,). All blocks get the first S values except block ``index`` + 1, which gets the last S values: only in
-    that block, this coordinate differs from block 0.
+    values: 2 S random values, (2 S,). Block ``index`` + 1 gets the last S values, all other blocks get the first S
+    values: the coordinate differs from block 0 in block ``index`` + 1 only.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -119,17 +131,17 @@ def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
 
 
 def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a batch of field elements, or an integer, broadcast to an array of this shape."""
+    """Return a batch of field elements, or an integer, as an array of field elements, broadcast to ``shape``."""
     if isinstance(element, Residues):
         return np.broadcast_to(element.values, shape)
     return np.full(shape, element % PRIME, dtype=np.uint64)
 
 
 class Spans:
-    """Spans of M and of its changes in the prime field.
+    """Linear spans of M and of its changes, in the prime field, from which the structure of an arm is derived.
 
-    A row has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_k the span of the changes of
-    M if only coordinate k moves, and U the sum of all T_k. A basis has one row per dimension of the spanned space.
+    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_k the span
+    of the changes of M if only coordinate k moves, and U the sum of all T_k. A basis has a row per dimension.
 
     Attributes:
         n: Number of coordinates.
@@ -147,32 +159,37 @@ class Spans:
     def __init__(self, arm: Chain, assume: Assume):
         self.n = len(arm.coordinates)
         self.keys = triangle(self.n)
-        # A span has at most as many dimensions as M has entries; four more samples make a deficient rank less likely.
+        # A span has at most as many dimensions as M has entries; with four more samples than entries, a rank that is
+        # too small by chance is less likely.
         count = len(self.keys) + 4
         mass, potential = field_samples(arm, assume, count)
         self.mass = mass[0]
         self.potential_changes = (potential[1:] != potential[0]).any(axis=1).tolist()
         changes = [difference(block, mass[0]) for block in mass[1:]]
-        depends = np.array([change.any(axis=0) for change in changes])  # (n, entries)
+        # `depends`, (n, entries): True if an entry of M varies with a coordinate.
+        depends = np.array([change.any(axis=0) for change in changes])
         self.entry_joints = [frozenset(np.flatnonzero(column).tolist()) for column in depends.T]
         self.order = sorted(range(len(self.keys)), key=lambda index: (-len(self.entry_joints[index]), index))
         self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]
         self.varying = field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
         self.floats = float_samples(arm, assume, 2 * count)
-        # Echelon bases, for each joint, of the changes of M caused by joints nearer the root, and nearer the tip, which
-        # `outside` needs for many sets of joints.
+        # For each joint, echelon bases of the changes of M caused by joints nearer the root, and nearer the tip, are
+        # stored, since `outside` needs them for many sets of joints.
         self._nearer_root = _sums(self.change_bases)
         self._nearer_tip = _sums(self.change_bases[::-1])[::-1]
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
-        """Return rows (2 S joints, entries) that span the changes of M caused by ``joints``, in double precision."""
+        """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
+
+        Joints are in increasing order; each has as many samples as ``floats`` has positions, 2 S.
+        """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return an echelon basis of the changes of M caused by all joints except ``joints``, (dimension, entries).
 
-        The entries of M are in the order ``order``.
+        The columns are the entries of M in the order of the attribute ``order``.
         """
         first, last = min(joints), max(joints)
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
@@ -180,7 +197,7 @@ class Spans:
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return a list of echelon bases, (dimension, entries) each; element k spans the sum of ``bases[:k]``."""
+    """Return echelon bases of cumulative sums of spaces, (dimension, entries) each: element k for ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

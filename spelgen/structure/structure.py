@@ -1,10 +1,11 @@
-"""Structure of an arm: zero, constant and varying entries of M and V, the joints they depend on, and a minimal form.
+"""Structure of an arm: zero, constant and varying entries of M, the joints that M and V depend on, minimal form of M.
 
-M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. Let T_k be the span of the changes M(q) - M(q') when only joint k moves, U the
-sum of all T_k, and W the span of M. The minimal number of functions f_j is dim U, and the minimal number of constants
-c_k is dim W - dim U. A linear functional of M depends only on the joints in J if and only if it vanishes on T_k for
-every k outside J; this test selects the functionals that define the f_j. All tests are ranks or zeros of samples in a
-prime field (``field``): exact with an error probability of about 1e-16, without tolerances.
+The minimal form is M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions f_j and constant matrices A_k
+and B_j. Let T_k be the span of the changes M(q) - M(q') when only joint k moves, U the sum of all T_k, and W the span
+of M. The minimal number of functions f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear
+functional of M depends only on the joints in a set J if and only if it vanishes on T_k for every k outside J; this test
+selects the functionals that define the f_j. All tests are ranks or zeros of samples in a prime field (``field``): exact
+with an error probability of about 1e-16, without tolerances.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from spelgen.urdf.robot import Assume
 
 
 class MassEntry(NamedTuple):
-    """An entry of the mass matrix, with 0-based row and column, and the coordinates that it depends on."""
+    """An entry of the mass matrix: row and column (from 0), kind, and the coordinates that it depends on (from 0)."""
 
     row: int
     column: int
@@ -31,10 +32,16 @@ class MassEntry(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Structure:
-    """Structure of M and V of an arm.
+    """Structure of the mass matrix M and the potential energy V of an arm.
 
-    It is valid for all values of the inertial parameters (``assume`` is ``kinematics``), or for the values in the URDF
-    (``inertials``). ``outputs`` and ``constants`` are the varying and the constant terms of M.
+    Attributes:
+        assume: ``kinematics``: the structure is valid for all values of the inertial parameters. ``inertials``: it is
+            valid for the values of the URDF.
+        joints: names of the coordinates.
+        entries: entries of the lower triangle of M.
+        outputs: varying terms f_j(q) B_j of the minimal form of M.
+        constants: constant terms c_k A_k of the minimal form of M.
+        base_parameter_count: number of base inertial parameters.
     """
 
     assume: Assume
@@ -58,9 +65,9 @@ class Structure:
         return sum(not output.joints or min(output.joints) >= first for output in self.outputs)
 
 
-@lru_cache(maxsize=16)  # cached, because one arm is used with several settings or logs
+@lru_cache(maxsize=16)  # The structure is cached, because an arm is used with several settings or logs.
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
-    """Return the structure of ``arm``.
+    """Return the structure of M and V of ``arm``: zero, constant and varying entries, minimal form of M, joints of V.
 
     assume: ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for
     the values in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
@@ -71,7 +78,7 @@ def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
-    # The entries and terms follow from ranks and zeros of the samples in `spans`.
+    # Entries and terms of M are derived from ranks and zeros of the samples in `spans`.
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(

@@ -22,7 +22,7 @@ _OTHER_FORMATS = {
     "COLLADA": ("a COLLADA mesh", "name the URDF that uses it"),
     "html": ("a web page", "download the file itself: 'Raw' on the page of a repository"),
 }
-# {first bytes of a file in lower case: (kind of file, remedy)}
+# Common files that are no XML: {first bytes of the file in lower case: (kind of file, advice to the user)}
 _NOT_XML = {
     b"version https://git-lfs": ("a pointer of Git LFS", "run 'git lfs pull' first"),
     b"<!doctype html": _OTHER_FORMATS["html"],
@@ -52,7 +52,7 @@ def urdf_bytes(path: Path) -> bytes:
 
 
 def read_document(path: Path) -> UrdfDocument:
-    """Return the parsed file. XML entities are never expanded, and parsing opens no other file.
+    """Return the XML document of a URDF or xacro file. XML entities are not expanded, and parsing opens no other file.
 
     A ``*.xacro`` file is a program. It is executed before parsing and may open other files (see ``xacro_input``).
 
@@ -83,7 +83,7 @@ def is_xacro(path: Path) -> bool:
 
 
 def _expanded(path: Path) -> tuple[bytes, tuple[str, ...]]:
-    """Return the bytes of a file or of its expansion, and the warnings of xacro."""
+    """Return the bytes of a URDF file, or of the URDF that a ``*.xacro`` file expands to, and the warnings of xacro."""
     data = read_bytes(path, UrdfError, "a URDF file", MAX_BYTES, "keep meshes in files of their own")
     _refuse_damage(path, data)
     if not is_xacro(path):
@@ -115,9 +115,10 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     if data.lstrip().startswith(b"<?xml") and not data.startswith(b"<?xml"):
         raise UrdfError(
             "text or blank lines before the XML declaration", file=path, line=_line_of(data, data.index(b"<?xml")),
-            expected="<?xml ...?> at the very start of the file", do="delete what stands before it",
+            expected="<?xml ...?> at the very start of the file", do="delete the text before it",
         )  # fmt: skip
-    # These declarations are refused before parsing: an entity could expand to gigabytes, or read another file.
+    # DOCTYPE and ENTITY declarations are refused before parsing: an entity could expand to gigabytes, or read another
+    # file.
     for declaration in (b"<!DOCTYPE", b"<!ENTITY"):
         if declaration in data:
             raise _doctype_error(path, _line_of(data, data.index(declaration)))

@@ -15,14 +15,14 @@ JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 
 
 def read_name(notes: Notes, xml: etree._Element) -> str | None:
-    """Return the name of an element; if it has none, add an error to ``notes`` and return None."""
+    """Return the name of an element; if it has none, add an error to ``notes``, the defects, and return None."""
     return Element(notes, xml, f"<{xml.tag}>").name()
 
 
 def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
     """Return the link of a <link> element; if it has no name, add an error to ``notes`` and return None.
 
-    Of several <inertial> elements the first is used, with a warning.
+    notes: list of the defects of the file. Of several <inertial> elements the first is used, with a warning.
     """
     name = read_name(notes, xml)
     if name is None:
@@ -39,7 +39,8 @@ def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
 
 def _read_inertial(inertial: Element) -> Inertial | None:
     mass_element = inertial.child("mass")
-    # Origin and tensor are read before the mass is checked: if it is absent, their defects are reported, too.
+    # Origin and tensor are read before the mass is checked, so that their defects are reported also if the mass is
+    # absent.
     com, rpy = _read_origin(inertial)
     tensor = _read_tensor(inertial)
     if mass_element.xml is None:
@@ -80,7 +81,7 @@ def _read_tensor(inertial: Element) -> Tensor:
 def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     """Return the joint of a <joint> element.
 
-    If its name, type, parent or child is unusable, add errors to ``notes`` and return None.
+    If its name, type, parent or child is unusable, add errors to ``notes``, the list of defects, and return None.
     """
     name = read_name(notes, xml)
     if name is None:
@@ -109,7 +110,7 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
-    # Two parents or two children are an error, because the links would not form a tree.
+    # A joint with two parents or two children is an error, because the links would not form a tree.
     ends = [] if joint.xml is None else joint.xml.findall(tag)
     link: str | None = ends[0].get("link") if len(ends) == 1 else None
     if not link:
@@ -120,7 +121,8 @@ def _read_end(joint: Element, tag: str) -> str | None:
 
 def _read_origin(parent: Element) -> tuple[Vector, Vector]:
     origin = parent.child("origin")
-    # Newer URDFs may have quaternions: a rotation that is not read would be a wrong geometry without a message.
+    # An attribute of <origin> other than xyz and rpy, such as the quaternion of newer URDFs, is an error: ignoring it
+    # would give a wrong geometry without a message.
     for key in set(origin.xml.attrib if origin.xml is not None else ()) - {"xyz", "rpy"}:
         origin.error(f"the attribute {key!r}", "xyz [m] and rpy [rad]", "convert the rotation to rpy", key)
     return origin.triple("xyz"), origin.triple("rpy")
@@ -128,8 +130,8 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 
 def _read_axis(joint: Element, kind: str | None) -> Vector:
     axis, error_count = joint.child("axis"), len(joint.notes.errors)
-    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default axis.
-    # An axis of length zero is an error, because it cannot be normalised.
+    xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default of the joint axis.
+    # A joint axis of length zero is an error, because it cannot be normalised.
     if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
         joint.notes.error(axis.line, joint.where, f"the axis {axis.text('xyz')!r}", "a direction", do)
@@ -155,13 +157,13 @@ def _read_mimic(mimic: Element) -> Mimic | None:
     if not leader:
         mimic.error("no joint", 'joint="..." naming the joint to follow')
         return None
-    # An absent multiplier is 1. A multiplier of 0 is kept: it locks the joint at its offset.
+    # An absent multiplier of a mimic joint is 1. A multiplier of 0 is kept: it locks the joint at its offset.
     multiplier = mimic.number("multiplier")
     if multiplier is None:
         multiplier = 1.0
     offset = mimic.number("offset") or 0.0
-    # A tiny multiplier is an error like a huge one: its inverse, too, must be within the bound of all numbers in a
-    # URDF.
+    # A tiny multiplier of a mimic joint is an error like a huge one: its inverse, too, must be within the bound of all
+    # numbers in a URDF.
     if multiplier and abs(multiplier) < 1 / MAX_MAGNITUDE:
         expected = f"0, or {1 / MAX_MAGNITUDE:g} at least"
         mimic.error(repr(mimic.text("multiplier")), expected, key="multiplier")
@@ -181,7 +183,8 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
     """
     name = xml.get("name") or ""
     where = f"transmission {name!r}"
-    # Errors become warnings, because most logs contain joint torques, for which no transmission is needed.
+    # Errors in a transmission become warnings, because most logs contain joint torques, for which no transmission is
+    # needed.
     optional = Notes(notes.path)
     driven = []
     for element in xml.findall("joint"):
@@ -198,7 +201,7 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
         reduction = Element(optional, element, where).number_in_text("mechanicalReduction")
         actuators.append((element.get("name") or "", reduction))
     notes.add_as_warnings(optional)
-    # The type is an element in ROS 1, and an attribute in the files of some exporters.
+    # The type of a transmission is an element in ROS 1, and an attribute in the files of some exporters.
     kind = (xml.findtext("type") or xml.get("type") or "").strip()
     errors = tuple(optional.errors)
     return Transmission(name, kind, tuple(driven), tuple(actuators), xml.sourceline, errors)

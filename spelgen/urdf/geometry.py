@@ -73,7 +73,7 @@ def link_shapes(
 
     Args:
         urdf: Path of the URDF; its folder and all parent folders are searched for meshes.
-        element: Name of the elements to read.
+        element: Elements to read, "visual" or "collision".
         links: Names of the links whose shapes are returned.
         faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
     """
@@ -116,9 +116,9 @@ def mesh_file(urdf: Path, name: str) -> Path:
 def _shape(link: str, element: etree._Element) -> LinkShape:
     """Return the shape of a <visual> or <collision> element, read by yourdfpy. Raises ValueError if it is invalid.
 
-    link: name of the link. A mesh has no triangles yet; see `_meshes`.
+    link: name of the link. The triangles of a mesh are not read here, but later for all meshes by `_meshes`.
     """
-    import yourdfpy  # The import is here, because yourdfpy imports trimesh, which takes long.
+    import yourdfpy  # yourdfpy is imported here, because it imports trimesh, which takes long.
 
     # Each shape is parsed as a URDF of its own, so that an invalid shape does not affect the others.
     root = etree.Element("robot", name=link)
@@ -141,7 +141,7 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
             scale, file_name = geometry.mesh.scale, geometry.mesh.filename
             size = 1.0 if scale is None else scale
         numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
-    except Exception as error:  # Absent or malformed attributes raise many types of errors.
+    except Exception as error:  # yourdfpy raises errors of many types, so all are caught.
         raise ValueError("a shape that is not valid") from error
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")
@@ -151,13 +151,13 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
     """Return {(file, scale): mesh} of the shapes that are meshes; a mesh that cannot be read is omitted.
 
-    faces: largest number of triangles of all meshes together.
+    faces: limit of the number of triangles of all meshes together; meshes above their share are simplified.
     """
     paths: dict[tuple[str, tuple[float, ...]], str] = {}
     for shape in shapes:
         with suppress(FileNotFoundError):
             paths[shape.file, shape.size] = str(mesh_file(urdf, shape.file))
-    # Without meshes no process is started, because a start takes seconds.
+    # The process that reads meshes is started only if there are meshes, because its start takes seconds.
     if not paths:
         return {}
     # The list of meshes is passed as ASCII JSON on stdin and not as arguments, because the locale limits the characters

@@ -8,11 +8,11 @@ import numpy as np
 from spelgen.errors import Diagnostic
 from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
 
-# [1] Smallest reported violation, relative to the largest principal moment: printed tensors are rounded, which causes
-# smaller violations.
+# [1] An inertia tensor is reported if its smallest principal moment is negative, or if the moments violate the triangle
+# inequality, by more than this fraction of the largest moment: printed tensors are rounded.
 _ROUNDING = 1e-6
 
-_LARGEST_LENGTH = 20.0  # [m] larger lengths are probably in millimetres
+_LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
 
@@ -21,7 +21,7 @@ Finding = tuple[str, str, int, str]
 
 
 def lint(robot: Robot) -> list[Diagnostic]:
-    """Return the diagnostics of inertials, joints, rigid groups of links, and limits, in no particular order."""
+    """Return warnings about inertials, joints and links of a robot, and a remark on absent limits, in any order."""
     findings = [
         finding
         for link in robot.links
@@ -45,7 +45,8 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
         if inertial.mass > 0:
             yield "zero-inertia", where, line, "the inertia tensor is zero: a point mass"
         return
-    # The identity matrix passes the tests of consistency, but it is the default of templates and no real inertia.
+    # The identity matrix is a physically consistent inertia tensor, but it is the default of templates and no real
+    # inertia.
     if tensor == (1.0, 0.0, 0.0, 1.0, 0.0, 1.0):
         yield "placeholder-inertial", where, line, "the tensor is the unit matrix: a placeholder"
     farthest = max(map(abs, inertial.com))
@@ -79,7 +80,7 @@ def _lint_placeholders(inertials: Sequence[Inertial]) -> Iterator[Finding]:
             lines.setdefault(inertial.tensor, []).append(inertial.line)
     total = sum(map(len, lines.values()))
     repeated = max(lines.values(), key=len, default=[])
-    # Two equal tensors are no evidence, because two links may have the same shape.
+    # Two equal tensors are no evidence of a copy, because two links may have the same shape.
     if len(repeated) > total / 2 and len(repeated) >= 3:
         message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
         yield "placeholder-inertial", "robot", repeated[0], message
@@ -94,7 +95,8 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     length = float(np.linalg.norm(joint.axis))
     if abs(length - 1) > 1e-3:
         yield "non-unit-axis", f"{where} axis", line, f"its length is {length:.6g}: normalised"
-    # Swapped limits are not corrected, because one of the numbers may be wrong instead.
+    # A lower limit above the upper limit is reported and not corrected: the limits may be swapped, or one of the
+    # numbers may be wrong.
     if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         yield "lower-above-upper", f"{where} limit", line, message
@@ -115,9 +117,9 @@ def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
 
 
 def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
-    """Yield one diagnostic with the moving joints that have no limit of position, velocity or effort, if there are any.
+    """Yield one remark that lists the moving joints without a limit of position, velocity or effort, if there are any.
 
-    A joint without a limit counts as unlimited.
+    Continuous joints need no limit of position.
     """
     lacking = {
         "position": [x.name for x in joints if x.type != "continuous" and None in (x.lower, x.upper)],
@@ -126,7 +128,7 @@ def _unlimited(joints: Sequence[UrdfJoint]) -> Iterator[Diagnostic]:
     }
     texts = []
     for limit, names in lacking.items():
-        # Most URDFs specify a limit for all joints or for none: "all joints" is shorter than the names.
+        # Most URDFs specify a limit for all joints or for none: the words "all joints" are then shorter than all names.
         which = "all joints" if len(names) == len(joints) else ", ".join(names)
         if names:
             texts.append(f"{limit} of {which}")
@@ -144,8 +146,8 @@ def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]
         yield "missing-inertial", "robot", 1, "no link has an <inertial>: masses and inertias are unknown"
         return
     for joint in moving:
-        # Groups are tested and not links: single links without mass are common, but M is singular if a whole rigid
-        # group has no mass.
+        # The mass of rigid groups is tested and not the mass of links: single links without mass are common, but M is
+        # singular if a whole rigid group has no mass.
         group = [joint.child]
         for name in group:
             group += [below.child for below in robot.joints_below[name] if below.type == "fixed"]
@@ -153,9 +155,9 @@ def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]
         where, line = f"link {joint.child!r}", robot.link[joint.child].line
         if not inertials:
             message = (
-                f"joint {joint.name!r} moves it, but neither it nor what is fixed to it has an <inertial>"
+                f"joint {joint.name!r} moves it, but neither it nor a link fixed to it has an <inertial>"
             )
             yield "missing-inertial", where, line, message
         elif not any(inertial.mass for inertial in inertials):
-            message = f"joint {joint.name!r} moves it, but it and what is fixed to it have no mass"
+            message = f"joint {joint.name!r} moves it, but it and the links fixed to it have no mass"
             yield "massless-moving-link", where, line, message

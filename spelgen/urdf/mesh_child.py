@@ -49,11 +49,12 @@ def main(faces: int, meshes: list[tuple[str, list[float]]], output: IO[bytes]) -
         meshes: Path, and scale factors along x, y and z, of each mesh.
         output: Binary file to which the arrays are written as an NPZ archive.
     """
-    with suppress(ImportError):  # The module `resource` does not exist on Windows.
+    with suppress(ImportError):  # On Windows there is no module `resource`, and the process has no limits.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (2**30,) * 2)
-        # [s] Processor time. Most of it is spent on imports and on the simplification of fine meshes.
+        # [s] Largest processor time of this process, most of which is spent on imports and on the simplification of
+        # fine meshes.
         resource.setrlimit(resource.RLIMIT_CPU, (30,) * 2)
     arrays: dict[str, np.ndarray] = {}
     for index, (path, scale) in enumerate(meshes):
@@ -82,9 +83,9 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     # tear the surface.
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.apply_scale(scale)
-    # The area is tested too, because it overflows for vertices that are too far away.
+    # The area of the mesh is tested too, because it overflows for vertices that are too far away.
     is_finite = np.isfinite(mesh.vertices).all() and mesh.area < np.inf
-    # The number of triangles is bounded, because an archive may expand to any size.
+    # The number of triangles of a mesh is bounded, because an archive may expand to any size.
     if not is_finite or not 0 < len(mesh.faces) <= 2_000_000:
         raise ValueError(f"{path}: no triangles, too many triangles, or corners that are no numbers")
     if len(mesh.faces) > faces:

@@ -29,7 +29,7 @@ def read_urdf(path: Path) -> Robot:
     """
     document = read_document(path)
     notes = Notes(document.path)
-    # Without this remark, users would look up the line numbers in the xacro file.
+    # A remark states that lines refer to the expanded document: otherwise users would look them up in the xacro file.
     if document.path != path:
         message = f"expanded by xacro: lines are those of the document that `xacro {path.name}` prints"
         notes.diagnostics.append(Diagnostic("info", "expanded-xacro", "robot", None, message))
@@ -98,7 +98,7 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
 
 
 def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
-    """Return the elements that are not None. Two links or two joints with the same name are an error in ``notes``."""
+    """Return the links or joints that could be read (not None); add an error to ``notes`` if two have the same name."""
     by_name: dict[str, Part] = {}
     for element in elements:
         if element is None:
@@ -132,7 +132,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
 
 
 def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
-    """Report leaders that do not exist or do not move, and cycles of mimic joints."""
+    """Report mimic joints whose leader does not exist or does not move, and cycles of mimic joints."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.mimic is None:
@@ -146,11 +146,11 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
         elif not leader.moves:
             got = f"the {leader.type} joint {leader.name!r}"
             notes.error(joint.line, where, got, "a revolute, continuous or prismatic joint to follow")
-        elif _is_circle(joint, by_name):
+        elif _is_in_cycle(joint, by_name):
             notes.error(joint.line, where, "a circle of mimic joints", "a leader that moves by itself")
 
 
-def _is_circle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
+def _is_in_cycle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
     """Whether ``joint`` is part of a cycle of mimic joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint

@@ -97,7 +97,7 @@ class Transmission(NamedTuple):
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the driven joints."""
+        """Names of the joints that the transmission drives."""
         return [name for name, _, _ in self.joints]
 
 
@@ -137,7 +137,7 @@ class Robot:
     @cached_property
     def joints_below(self) -> dict[str, tuple[UrdfJoint, ...]]:
         """{name of a link: the joints whose parent it is}, for all links."""
-        # Links without such joints have an empty entry, so that no caller needs a default.
+        # Links without child joints have an empty entry, so that no caller needs a default.
         below: dict[str, tuple[UrdfJoint, ...]] = {link.name: () for link in self.links}
         for joint in self.joints:
             below[joint.parent] += (joint,)
@@ -147,7 +147,8 @@ class Robot:
     def joints_from_root(self) -> tuple[UrdfJoint, ...]:
         """All joints, parents before their children, depth first in the order of the file."""
         ordered: list[UrdfJoint] = []
-        # A stack in place of recursion, because the depth of the tree may exceed the recursion limit of Python.
+        # Joints are visited with a stack and not by recursion, because the depth of the tree may exceed the recursion
+        # limit of Python.
         pending = list(reversed(self.joints_below[self.root]))
         while pending:
             joint = pending.pop()

@@ -29,7 +29,7 @@ _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 @dataclass
 class Notes:
-    """Errors and diagnostics of one file. `read_urdf` raises all errors together after reading."""
+    """Errors and diagnostics of one URDF file. `read_urdf` collects them, and raises all errors together at the end."""
 
     path: Path
     errors: list[UrdfError] = field(default_factory=list)
@@ -47,7 +47,7 @@ class Notes:
         self.diagnostics.append(Diagnostic("warning", code, where, line, message))
 
     def add_as_warnings(self, optional: Notes) -> None:
-        """Add the notes on optional elements, such as limits of fixed joints, with errors as warnings.
+        """Add the notes on optional elements, such as limits of fixed joints; their errors are added as warnings.
 
         The warnings state that the value is treated as absent.
         """
@@ -77,7 +77,7 @@ class Element:
         return 0 if self.xml is None else int(self.xml.sourceline)
 
     def error(self, got: str, expected: str | None = None, do: str | None = None, key: str = "") -> None:
-        """Add an error about the element, or about one of its attributes."""
+        """Add an error about the element or, if ``key`` is given, its attribute; other arguments as for `UrdfError`."""
         self.notes.error(self.line, f"{self.where} {key}".rstrip(), got, expected, do)
 
     def child(self, tag: str) -> Element:
@@ -93,7 +93,7 @@ class Element:
 
     def text(self, key: str) -> str | None:
         """Return the text of an attribute; None if the attribute or the element is absent."""
-        # An absent element is no error here, so that callers need no branch for it.
+        # An absent element counts as an element without attributes, so that callers need no branch for it.
         text: str | None = None if self.xml is None else self.xml.get(key)
         return text
 
@@ -155,8 +155,8 @@ class Element:
         """
         if text is None or self._is_unexpanded(text, key):
             return []
-        # The text is checked before `float`, which accepts nan, inf, 1_000 and Arabic digits: other readers of URDF
-        # reject these.
+        # The text of a number is checked before `float`, which accepts nan, inf, 1_000 and Arabic digits: other readers
+        # of URDF reject these.
         words, longest = text.split(), 64
         expected = "one number" if count == 1 else "three numbers"
         if len(words) != count:
@@ -164,7 +164,7 @@ class Element:
             self.error(f"{len(words)} numbers ({excerpt!r})", expected, key=key)
             return []
         for word in words:
-            # A longer word is a sign of a damaged file: no exporter writes such long numbers.
+            # A number with too many characters is a sign of a damaged file: no exporter writes such numbers.
             if len(word) > longest:
                 self.error(f"a number of {len(word)} characters", f"at most {longest}", key=key)
                 return []

@@ -17,8 +17,8 @@ from pathlib import Path
 from spelgen.errors import UrdfError
 
 MAX_SECONDS = 8
-MEMORY = 2**30  # largest memory of the process [bytes]
-MISSING = 3  # exit code of the process if the package xacro is not installed
+MEMORY = 2**30  # largest memory of the process that runs xacro [bytes]
+MISSING = 3  # exit code of the process if it cannot import the package xacro
 _BY_HAND = "expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
 
 
@@ -28,9 +28,9 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
     Raises UrdfError if the package xacro is not installed or fails, runs for more than 8 s, or writes more than
     ``max_bytes``.
     """
-    # With -P, modules in the current folder cannot shadow the package.
+    # With the option -P of Python, modules in the current folder cannot shadow the package.
     command = [sys.executable, "-P", "-X", "utf8", "-m", "spelgen.urdf.xacro_input", str(path)]
-    # The output is a file and not a pipe, because output of any size would fill the memory of this process.
+    # xacro writes to a file: a pipe would be read into the memory of this process, and the output may be very large.
     with tempfile.TemporaryFile() as output:
         try:
             run = subprocess.run(
@@ -41,7 +41,7 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
             raise UrdfError(f"xacro still running after {MAX_SECONDS} s", file=path, do=_BY_HAND) from None
         lines = run.stderr.decode(errors="replace").splitlines()
         warnings = tuple(line.removeprefix("warning: ") for line in lines if line.startswith("warning: "))
-        # All messages before a failure are part of the error, because they often state its cause.
+        # All messages that xacro prints before a failure are part of the error, because they often state its cause.
         if run.returncode:
             raise _failure(path, run.returncode, [line for line in lines if not line.startswith("warning: ")])
         size = output.seek(0, 2)
@@ -57,7 +57,7 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
         return UrdfError("a xacro file, and no package to expand it", file=path, do=do)
     # The message of xacro is cut at 400 characters, because its length is not limited.
     reason = " ".join(" ".join(lines).split())[:400] or f"it ended with code {code}"
-    # It states some exceptions twice, the first time with their class.
+    # Xacro states some exceptions twice, the first time with their class: one statement is removed.
     reason = re.sub(r"^<class '[\w.]+'>: (.+) \1", r"\1", reason)
     return UrdfError(f"xacro cannot expand it ({reason})", file=path, do=f"correct it, or {_BY_HAND}")
 
@@ -66,6 +66,7 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
     """Replace xacro's function for $(find PACKAGE), so that packages are found without ROS.
 
     A package is searched in the folders above the file ``path`` and in their subfolders PACKAGE, and then by xacro.
+    functions: xacro's functions by name, of which ``_eval_find`` is replaced.
     """
     installed = functions["_eval_find"]
 
@@ -79,7 +80,9 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
                         return str(candidate)
         # A package without package.xml is recognised by the name of its folder.
         named = [folder for folder in path.parents if folder.name == package]
-        with suppress(Exception):  # ROS is not installed, or does not know the package
+        # The search of xacro raises errors of any type if ROS is absent or does not know the package: the error below
+        # replaces them.
+        with suppress(Exception):
             return str(named[0]) if named else installed(package)
         raise ValueError(
             f"the package {package!r} of $(find {package}) is neither above the file nor known to ROS"
@@ -90,7 +93,7 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
 
 def main(path: str) -> None:
     """Write the expanded URDF to stdout, with the line breaks of the command ``xacro FILE``."""
-    with suppress(ImportError):  # The module `resource` does not exist on Windows.
+    with suppress(ImportError):  # On Windows there is no module `resource`, and no limit of memory.
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))

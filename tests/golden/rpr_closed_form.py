@@ -3,7 +3,7 @@ r"""Port-Hamiltonian model of an arm with 3 joints, by `spelgen build`.
 Robot "rpr". 3 rigid bodies with trained inertial parameters, friction. V depends on joint 3.
 
     import torch
-    from rpr_spel import Model
+    from rpr_spel import Model  # if this file is rpr_spel.py
 
     model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
     q, qd, tau = torch.zeros(3, 100, 3, dtype=torch.float64)  # any batch, joints last

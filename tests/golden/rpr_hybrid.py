@@ -4,7 +4,7 @@ Robot "rpr". 3 rigid bodies with trained inertial parameters, friction, and resi
 zero until a fit selects them; in M: 3 learned functions of q and 2 constants. V depends on joint 3.
 
     import torch
-    from rpr_spel import Model
+    from rpr_spel import Model  # if this file is rpr_spel.py
 
     model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
     q, qd, tau = torch.zeros(3, 100, 3, dtype=torch.float64)  # any batch, joints last

@@ -5,7 +5,7 @@ terms are zero until a fit selects them; in M: 1 learned function of q and 2 con
 1,2.
 
     import torch
-    from two_link_spel import Model
+    from two_link_spel import Model  # if this file is two_link_spel.py
 
     model = Model()  # trained: model.load_state_dict(torch.load("run/model.pt"))
     q, qd, tau = torch.zeros(3, 100, 2, dtype=torch.float64)  # any batch, joints last

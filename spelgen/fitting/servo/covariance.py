@@ -15,17 +15,20 @@ from spelgen.identification.intervals import QUANTILE
 def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
     """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
 
-    The covariance of the fitted parameters is scaled such that 1.96 standard deviations are half of Student's 95 %
-    interval. Two covariances are added: of the deviations of the form of the friction model, and the prior covariance
-    of the directions of the bodies that are not fitted. If no kp is known, the standard deviation of a common factor of
-    all torques is at least the prior standard deviation of masses: effort limits may determine this factor in the logs,
-    but the limits in URDFs often differ from the limits of the motors.
+    The covariance of the k fitted parameters is converted to the K parameters, and scaled such that 1.96 standard
+    deviations are half the 95 % interval of Student's t. Two covariances are added: the errors of kd, armature and
+    friction due to an inexact form of the friction model (`ServoTuning.model_deviation`), and the prior covariance of
+    the directions of the body parameters that the fit does not change. If no kp is known, the standard deviation of a
+    common factor of all torques is at least the prior standard deviation of masses: effort limits may determine this
+    factor in the logs, but the limits in URDFs often differ from the limits of the motors.
+
+    The result also has the standard deviation of the delay, `delay_std` [s].
     """
     parameters, model = problem.parameters, problem.rollouts.model
     vector, directions = ParameterVector(model), parameters.directions
     (p, n), count = parameters.prior_mean.joints.shape, len(solution.covariance)
     units = torch.eye(count).double()
-    # derivatives of the model's parameters with respect to the fitted parameters, (k, K)
+    # `slopes` are the derivatives (k, K) of the K parameters of the model with respect to the k fitted parameters.
     slopes = {name: torch.zeros(count, x.numel()).double() for name, x in vector.initial.items()}
     of_joints = parameters.named(units[:, : p * n].view(count, p, n))
     slopes |= {name: x.reshape(count, -1) for name, x in of_joints.items()}
@@ -45,10 +48,13 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
 
 
 def _common_factor(vector: ParameterVector) -> Tensor:
-    """Return the derivative (K,) of the parameters with respect to the logarithm of a factor of all torques."""
+    """Return the derivative (K,) of the parameters with respect to the logarithm of a common factor of all torques.
+
+    Positions under servos do not depend on this factor of gains, masses, friction and torque offsets.
+    """
     logarithms = vector.mask("stiffness", "damping", "armature", "sizes", "effects").double()
     derivatives = vector.unflatten(logarithms)
-    derivatives[vector.bodies][:, -1] = 1.0  # logarithms of the masses
+    derivatives[vector.bodies][:, -1] = 1.0  # the last parameter of a body is the logarithm of its mass
     for name in vector.names("offset"):
         derivatives[name].copy_(vector.initial[name])
     return logarithms

@@ -1,4 +1,4 @@
-"""Selection of the joints that have a dead zone: the posterior maxima with and without one are compared.
+"""Selection of the joints that have a dead zone: fits with and without a dead zone are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
 joint's negative log posterior by more than significance^2 / 2. Load, delay and likelihood are fixed at their values in
@@ -23,9 +23,10 @@ from spelgen.runtime.friction_laws import FrictionLaws
 
 
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters with dead zones only at joints where a dead zone lowers the cost significantly.
+    """Fit each joint with and without a dead zone from x; return the better parameters of each joint.
 
-    The cost is the joint's negative log posterior. It must decrease by more than significance^2 / 2.
+    A dead zone is kept only if it lowers the joint's cost, its negative log posterior, by more than significance^2 / 2
+    (`ServoTuning.significance`).
     """
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
@@ -38,7 +39,10 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return the parameters without dead zones below `TUNING.min_dead_zone`, about the resolution of encoders."""
+    """Return parameters x, in which dead zones below `TUNING.min_dead_zone` are set to zero and no longer fitted.
+
+    The resolution of encoders is similar to this bound, so that smaller dead zones cannot be measured.
+    """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
     joints[row] *= active[row]
@@ -46,7 +50,7 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
 
 
 def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, Tensor]:
-    """Minimize the cost of each joint over its own parameters; return the parameters and the costs, (n,).
+    """Minimize the cost of each joint over its own parameters from x; return the parameters and the costs, (n,).
 
     The method is Levenberg-Marquardt. Each joint has its own damping and termination, since a joint with a poor initial
     guess would slow down all others otherwise. The rollouts of all joints form one batch.
@@ -66,7 +70,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # The fit of a joint ends if a step lowers the joint's cost only by little, or not at all with a damping >= 1.
+        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`, or after a step
+        # with a damping of at least 1 that does not lower it: with more damping, the decrease would be negligible.
         active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
@@ -78,11 +83,12 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 
 
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
-    """Return the parameters with a dead zone at every joint, and with all parameters marked as fitted (`active`).
+    """Return parameters x with a dead zone at every joint, as the initial guess of a fit of dead zones.
 
-    The static position error is (dry friction) / kp + half the dead zone. Half the dead zone is set to ``fraction``
-    times (dry friction) / kp, and Coulomb friction is reduced by the same fraction. The static error then remains about
-    the same, or exactly the same if Coulomb friction is the only dry friction.
+    All parameters are marked as fitted (`active`). The static position error is (dry friction) / kp + half the dead
+    zone. Half the dead zone is set to ``fraction`` times (dry friction) / kp, and Coulomb friction is reduced by the
+    same fraction. The static error then remains about the same, or exactly the same if Coulomb friction is the only dry
+    friction.
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model
@@ -96,7 +102,9 @@ def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) 
 
 
 def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Tensor:
-    """Return the magnitude of each joint's dry friction, (n,) [Nm, N], averaged with the weight |qd|.
+    """Return the magnitude of each joint's dry friction in motion, (n,) [Nm, N].
+
+    The magnitude is a mean over samples, weighted by |qd|.
 
     Args:
         friction: friction model.

@@ -2,8 +2,11 @@
 
 The initial guess is the linear least-squares solution for the command error u - q, the commanded minus the measured
 position. At a joint with a position servo,
-kp (u - q) = kd qd + M qdd + gravity + friction. The command error is therefore linear in the ratios of the parameters
-to kp. The gravity torque is computed with the URDF's masses: its coefficient is 1 / kp.
+
+    kp (u - q) = kd qd + M qdd + gravity + friction.
+
+The command error is therefore linear in the ratios of the parameters to kp. The gravity torque is computed with the
+URDF's masses: its coefficient is 1 / kp.
 """
 
 from functools import lru_cache
@@ -53,8 +56,8 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
         # Logs of positions determine only the sum of viscous friction and kd. The sum is fitted as kd, and viscous
-        # friction is negligible: exp(-6) times nominal friction. The Stribeck effect starts from exp(-2) times nominal
-        # friction.
+        # friction is set to a negligible value, exp(-6) times the nominal friction. The initial guess of the Stribeck
+        # effect is exp(-2) times the nominal friction.
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
@@ -72,9 +75,9 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             (-1 to 1), torque of the bodies, and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
-    # The driver gelsd is used, because torch's default driver chooses its pivots differently in each run.
+    # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
     residual = target - matrix @ solution
     unscaled = torch.linalg.pinv(matrix.mT @ matrix).diagonal(dim1=-2, dim2=-1)
@@ -92,8 +95,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # The result is cached: most evaluations of the residual have the same delay, since finite differences change one of
-    # the four unknowns at a time.
+    # The mean commands for a delay are cached: most evaluations of the residual have the same delay, since finite
+    # differences change one of the four unknowns at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m]."""
@@ -102,9 +105,11 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
-    # A bounded scalar search suffices: commands change little within the bounds, so the error has one minimum.
+    # A bounded scalar search suffices for the delay of the commands: commands change little within the bounds, so the
+    # error has one minimum.
     late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
-    # The unknowns x: log of the natural frequency [rad/s], log of the damping ratio, delay [s], offset [rad, m].
+    # The unknowns x of a joint's linear servo: log of the natural frequency [rad/s], log of the damping ratio, delay
+    # [s], offset [rad, m].
     initial = (np.log(TUNING.frequency), 0.0, TUNING.initial_delay, 0.0)
     bounds = ((-np.inf, -np.inf, 0.0, -np.inf), (np.inf, np.inf, TUNING.max_delay, np.inf))
     fits = []
@@ -112,7 +117,10 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         column = slice(joint, joint + 1)
 
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
-            """Return the position errors of one joint after the burn-in, as a vector, for its unknowns x (4,)."""
+            """Return the position errors [rad, m] of one joint after the burn-in, as a vector over all windows.
+
+            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo.
+            """
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(
                 q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])

@@ -1,4 +1,4 @@
-"""The objective servo: fit the position servos, friction and gravity load of an arm to commands and measured positions.
+"""Objective `servo`: fit an arm's position servos, friction and gravity load to commands and measured positions.
 
 The initial guess is the least-squares solution for the command error (`least_squares`). Three outer iterations then
 minimize the error of predicted windows (`problem`). At its start, each iteration fixes the scale of the errors, and the
@@ -36,16 +36,16 @@ from spelgen.fitting.tuning import TUNING as DAMPING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import require_commands, require_joints
 
-# The first iteration uses few windows and half the integration steps, the second few windows and all integration steps,
-# the third all windows.
+# Number of outer iterations of a servo fit: the first uses few windows and half the integration steps, the second few
+# windows and all integration steps, the third all windows.
 OUTER_ITERATIONS = 3
 
 
 class ServoObjective(Objective):
-    """The servo fit. It uses all logs, without validation, and can be resumed at the start of each outer iteration.
+    """Objective of a servo fit. The fit uses all logs, without validation, and can be resumed at each outer iteration.
 
-    A checkpoint contains the initial weights and the parameters at the start of each outer iteration. The load and the
-    scale of the errors are recomputed from them.
+    A checkpoint contains the initial weights of the model, and the fitted parameters at the start of each outer
+    iteration. The load of the bodies and the scale of the position errors are recomputed from these parameters.
     """
 
     name: ClassVar[str] = "servo"
@@ -53,7 +53,7 @@ class ServoObjective(Objective):
 
     def __init__(self, request: FitRequest) -> None:
         super().__init__(request)
-        self._iterates: list[ServoParameters] = []  # parameters at the start of each outer iteration
+        self._iterates: list[ServoParameters] = []  # fitted parameters at the start of each outer iteration
         self._steps = 0
 
     def prepare(self) -> PreparedLogs:
@@ -82,7 +82,7 @@ class ServoObjective(Objective):
         return []
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Resume at the start of the outer iteration that was interrupted."""
+        """Resume an interrupted fit at the start of the outer iteration in which it was interrupted."""
         self._since = time.monotonic() - checkpoint["seconds"]
         state = checkpoint["servo"]
         self.model.load_state_dict(state["start"])
@@ -105,7 +105,7 @@ class ServoObjective(Objective):
         return "finished"
 
     def _minimized(self, progress: TrainingProgress) -> ServoParameters:
-        """Minimize the cost of the current outer iteration; return the parameters."""
+        """Minimize the cost of the current outer iteration by Levenberg-Marquardt; return the fitted parameters."""
         problem, number = self._problem, len(self._iterates)
         show = partial(_show_progress, progress, number)
         # The damping is smaller in the second and third outer iteration, which start near the minimum.
@@ -148,8 +148,8 @@ class ServoObjective(Objective):
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        # The first iteration uses half the integration steps, which is accurate enough there; the others use all of
-        # them.
+        # The first outer iteration uses half the integration steps, which is accurate enough for it; the others use all
+        # of them.
         elif self._iterates:
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:

@@ -39,7 +39,7 @@ class ServoParameters:
     active: Tensor
 
     def after(self, step: Tensor) -> ServoParameters:
-        """Return the k parameters after a step (k,); the delay remains at least zero."""
+        """Return the k parameters of a servo fit after a step (k,); the delay remains at least zero."""
         joints, bodies, delay = step.split([self.joints.numel(), len(self.bodies), 1])
         return replace(
             self,
@@ -50,13 +50,15 @@ class ServoParameters:
 
     @property
     def flat(self) -> Tensor:
-        """All k parameters as one vector, (k,)."""
+        """All k parameters of a servo fit as one vector, (k,): joints, bodies, delay."""
         delay = torch.tensor([self.delay], dtype=torch.float64)
         return torch.cat([self.joints.flatten(), self.bodies, delay])
 
 
 class ParameterMap:
     """The map between `ServoParameters` and the tensors of a model, and the prior of the k = p n + r + 1 parameters.
+
+    There are p parameters for each of n joints, r coordinates of the body parameters, and the delay.
 
     Attributes:
         names: names of the p rows of `ServoParameters.joints`; a parameter with K values per joint has K rows of the
@@ -74,8 +76,8 @@ class ParameterMap:
     def __init__(self, model: ArmModel, q: Tensor) -> None:
         self._model, self._n = model, model.n
         tensors = dict(model.named_parameters()) | dict(model.named_buffers())
-        # friction.raw_viscous is absent: logs of positions determine only the sum of viscous friction and kd, which is
-        # fitted as kd.
+        # The parameter friction.raw_viscous is not fitted: logs of positions determine only the sum of viscous friction
+        # and kd, which is fitted as kd.
         rows = [
             *(parameters_of_kind(model, group) for group in ("stiffness", "damping", "armature", "offset")),
             (COULOMB, "friction.raw_stribeck", STRIBECK_VELOCITY),
@@ -97,7 +99,7 @@ class ParameterMap:
         self.prior_mean = ServoParameters(joints, bodies, float(model.servo.delay), active)
 
     def row(self, name: str) -> int:
-        """Return the index of the row of `ServoParameters.joints` with this name; of several rows, the first."""
+        """Return the index of the row of `ServoParameters.joints` for a parameter name; of several rows, the first."""
         return self.names.index(name)
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:
@@ -105,14 +107,15 @@ class ParameterMap:
 
         The tensors are (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint.
         """
-        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)  # (P, 1, n, K) per parameter
+        # columns: (P, 1, n, K) for each parameter
+        columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
             named[name] = column.reshape(*column.shape[:2], *tensor.shape)
         return named
 
     def write(self, x: ServoParameters) -> None:
-        """Set the parameters of the model to x."""
+        """Set the parameters of the model to the values of `ServoParameters` x."""
         with torch.no_grad():
             for name, rows in self.named(x.joints.unsqueeze(0)).items():
                 self.tensors[name].copy_(rows[0, 0])

@@ -22,8 +22,10 @@ SERVO_UNITS = {
     "static error": "{0.position}",
     "offset/kp": "{0.position}",
 }
-"""Unit of each quantity of position servos. lag: kd/kp plus the delay of the commands; static error: coulomb/kp plus
-half the dead zone, which is `dead zone`."""
+"""Unit of each quantity of position servos.
+
+lag: kd/kp plus the delay of the commands. dead zone: half its width. static error: coulomb/kp plus half the dead zone.
+"""
 SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
 """Sums of two quantities that logs of servos may determine better than either of the two."""
 
@@ -37,15 +39,16 @@ class ServoPosterior(Posterior):
 
     @property
     def scale_joint(self) -> str | None:
-        """Name of the joint whose kp divides the base parameters; None if a kp is known.
+        """Name of the joint to whose kp the base parameters are given as ratios; None if a kp is known.
 
-        The ratios to kp of this joint have the smallest errors (median of the relative standard deviations).
+        Of all joints, this joint gives ratios with the smallest median of the relative standard deviations. If a kp is
+        known, the base parameters themselves are determined, and no ratios are needed.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters, or of their ratios to kp of `scale_joint`."""
+        """95 % intervals of the base parameters or, if no kp is known, of their ratios to kp of `scale_joint`."""
         if self._scale_index is None:
             return super().base_parameters
         values, roots = self._ratios(self._scale_index)
@@ -54,7 +57,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters, for the title of a table."""
+        """Units of the base parameters for the title of a table; for ratios to a kp, with the name of its joint."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 
@@ -62,8 +65,8 @@ class ServoPosterior(Posterior):
     def unidentifiable(self) -> tuple[str, ...]:
         """Names of the quantities that logs determine only in combinations, or not at all.
 
-        The quantities are masses and first moments, pairs of quantities whose sum has a smaller error than either of
-        them (`SUMS`), and a common factor if no kp is known.
+        Masses and first moments are tested, and pairs of quantities (`SUMS`): a pair is listed if its sum has a smaller
+        error than either quantity. If no kp is known, the common factor of all torques and inertias is listed, too.
         """
         pairs, delays = [], (self.delay,) * self.model.n
         for name, (first, second) in SUMS.items():
@@ -78,7 +81,10 @@ class ServoPosterior(Posterior):
         return (*super().unidentifiable, *pairs, *common)
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the quantities of the servos, and the function that returns their values, (8, n)."""
+        """Return the quantities of the servos that have intervals, and the function that returns their values.
+
+        The quantities are the keys of `SERVO_UNITS`. The function returns (8, n) for a model.
+        """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
             DriveQuantity(name, unit, name != "offset/kp", joints) for name, unit in SERVO_UNITS.items()
@@ -97,7 +103,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of `scale_joint`."""
+        """Index of `scale_joint`, to whose kp the base parameters are given as ratios; None if a kp is known."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))
@@ -105,11 +111,11 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m], with a square root of its covariance."""
+        """kp of all servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance."""
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return the ratios of the base parameters to kp of a joint, (r,), with a square root of their covariance."""
+        """Return the r base parameters / kp of a joint, (r,), with a square root (r, k) of their covariance."""
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

@@ -28,8 +28,8 @@ from spelgen.fitting.servo.tuning import TUNING
 class Likelihood:
     """Student-t likelihood of the position errors (W, K', n) of n joints: W windows, K' samples after the burn-in.
 
-    scale: (n,), scale of the errors [rad, m]. samples_per_error: (n,), number of correlated samples that count as one
-    independent error.
+    scale: (n,), scale of the errors [rad, m]: the standard deviation of the Gaussian that approximates the likelihood
+    for small errors. samples_per_error: (n,), number of correlated samples that count as one independent error.
     """
 
     scale: Tensor
@@ -58,12 +58,18 @@ class Likelihood:
         return cls(scale, (of_sums / of_samples.clamp(min=1e-300)).clamp(1.0, float(size)))
 
     def costs(self, errors: Tensor) -> Tensor:
-        """Return the negative log likelihood per joint, (n,), of errors (W, K', n)."""
+        """Return the negative log likelihood of each joint's position errors, (n,), up to a constant.
+
+        errors: (W, K', n) [rad, m].
+        """
         costs = 2 * torch.log1p((errors / self.scale).square() / 4) / self.samples_per_error
         return costs.sum(dim=(0, 1))
 
     def weights(self, errors: Tensor) -> Tensor:
-        """Return the weights (W, K', n) for which weighted least squares has the same gradient as `costs`."""
+        """Return the weights w (W, K', n) for which the cost w error^2 / 2 has the same gradient as `costs`.
+
+        The gradient is with respect to the errors (W, K', n) [rad, m], with constant w.
+        """
         robust = 1 / (1 + (errors / self.scale).square() / 4)
         return robust / self.scale**2 / self.samples_per_error
 
@@ -83,16 +89,19 @@ class ServoProblem:
 
     @classmethod
     def of(cls, rollouts: ServoRollouts, noise: Tensor, errors: Tensor) -> ServoProblem:
-        """Return the problem for rollouts, with the likelihood estimated from errors (W, K', n) [rad, m]."""
+        """Return the problem whose residual is computed by `rollouts`, with a likelihood estimated from `errors`.
+
+        noise: (n,) [rad, m], see the class. errors: (W, K', n), position errors [rad, m].
+        """
         max_samples = max(1, round(TUNING.correlation_time * rollouts.windows.rate))
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
 
     def reweighted(self, x: ServoParameters) -> ServoProblem:
-        """Return the same problem with the likelihood estimated from the errors at parameters x."""
+        """Return the problem with the likelihood re-estimated from the position errors at parameters x."""
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
-        """Return the same problem with other integration and finite-difference steps.
+        """Return the problem with other integration steps and other finite-difference steps.
 
         steps: number of integration steps per sample interval. difference_step: step of the finite differences.
         """
@@ -103,26 +112,30 @@ class ServoProblem:
 
     @property
     def parameters(self) -> ParameterMap:
-        """The map of the parameters to the model, and their prior."""
+        """Map from the fitted parameters to the model, with the prior of the parameters."""
         return self.rollouts.parameters
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:
-        """Return each joint's part of the cost, (n,), from errors (W, K', n): likelihood and prior of the joint."""
+        """Return the negative log posterior of each joint, (n,), as a function of the joint's p parameters in x.
+
+        It is the negative log likelihood of the joint's errors plus the negative log prior of the p parameters. The
+        prior of shared parameters is not included. errors: position errors at x, (W, K', n) [rad, m].
+        """
         prior = self._prior(x)[: x.joints.numel()].view_as(x.joints)
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
     def cost(self, x: ServoParameters, errors: Tensor) -> float:
-        """Return the cost for errors (W, K', n); infinite if a rollout diverged."""
+        """Return the negative log posterior at x for errors (W, K', n) [rad, m]; infinite if a rollout diverged."""
         if not errors.isfinite().all():
             return float("inf")
         return float(self.likelihood.costs(errors).sum() + self._prior(x).sum())
 
     def _prior(self, x: ServoParameters) -> Tensor:
-        """Return the summands (x - m)^2 P / 2 of the negative log prior, one per parameter, (k,)."""
+        """Return the negative log prior of each of the k parameters, (k,): (x - mean)^2 * precision / 2."""
         return self.parameters.precision(x) * (x.flat - self.parameters.prior_mean.flat).square() / 2
 
     def candidates(self, x: ServoParameters, step: Tensor) -> Iterable[ServoParameters]:

@@ -31,9 +31,10 @@ RATIOS = {
     "static_error": ("static error", "rad, m"),
     "dead_zone": ("half dead zone", "rad, m"),
 }
-"""Label and unit of each ratio to kp.
+"""Label and unit of each ratio of a parameter to kp.
 
-lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone."""
+lag: kd / kp plus the delay. dry: mean dry friction in motion / kp. static_error: dry plus half the dead zone.
+"""
 ABOUT = (
     "divided by kp, with half a 95 % interval. kp itself is scaled by the URDF's masses, unless it is known. kd is the "
     "sum of kd and viscous friction, which such logs do not distinguish. lag: the sum of kd/kp and the delay, one "
@@ -75,7 +76,7 @@ class ServoSolution:
 
     @property
     def quantile(self) -> float:
-        """Half the width of a 95 % interval, divided by the standard deviation."""
+        """Half the width of a 95 % interval divided by the standard deviation, from Student's t."""
         # With few blocks, the quantile of Student's t distribution is larger than the Gaussian's 1.96.
         return float(stdtrit(max(1, len(self.blocks.curvature) - 1), 0.975))
 
@@ -103,8 +104,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The step is an estimate of the integration error. It is added to the covariance as an error of one standard
-    # deviation.
+    # The last solver step estimates the integration error of x. It counts as an error of one standard deviation, so its
+    # outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -119,9 +120,10 @@ def _sums(terms: Tensor, numbers: Tensor) -> Tensor:
 def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) -> Tensor:
     """Return a mask (m,) of m parameters, True for parameters that the logs distinguish from all other parameters.
 
-    A parameter is distinguished if an upper bound of its variance inflation factor is below
-    `ServoTuning.variance_inflation`. Example: dead zone and dry friction of a joint without gravity load are not
-    distinguished, since the derivatives of the errors with respect to both are proportional.
+    A parameter is distinguished if its variance inflation factor is below `ServoTuning.variance_inflation`: the
+    posterior variance of the parameter, divided by its variance if all other parameters were known. Example: dead zone
+    and dry friction of a joint without gravity load are not distinguished, since the derivatives of the errors with
+    respect to both are proportional.
 
     Args:
         blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).
@@ -157,9 +159,9 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each.
+    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each, for the current parameters of the model.
 
-    The deviations are the standard deviations of the logarithms of the ratios.
+    The deviations are the standard deviations of the logarithms of the ratios, from the covariance of ``solution``.
     """
     rollouts, parameters = problem.rollouts, problem.parameters
     tensors = {name: x.detach().clone().requires_grad_() for name, x in parameters.tensors.items()}
@@ -185,11 +187,11 @@ def ratios_with_deviations(
 
 
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
-    """Return the content for config.json: delay [s], RMS errors [rad, m], and per joint kp and the ratios to kp.
+    """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    The intervals are 95 % intervals. The key "determined" is True if the upper end of the interval is below
-    `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the logs must also distinguish one
-    from the other (see `identifiable`).
+    The ratios are kd / kp, armature / kp and friction / kp, each with its 95 % interval. The key
+    "determined" of a ratio is True if the upper end of its interval is below `ServoTuning.max_factor` times the ratio.
+    For dry friction and the dead zone, the logs must also distinguish one from the other (see `identifiable`).
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -213,7 +215,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
-            # The logarithm is limited to 50, so that exp does not overflow.
+            # The half width of the interval of the logarithm is limited to 50, so that exp does not overflow.
             factor = math.exp(min(half, 50.0))
             # The static error, a sum of dry friction and dead zone, may be determined even if its two terms are not.
             determined = factor < TUNING.max_factor and (distinct[joint] or ratio not in ("dry", "dead_zone"))
@@ -247,7 +249,8 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not named, since dry friction of the same joint is then undetermined and named.
+                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
+                # undetermined and in the list.
                 if column != "dead_zone":
                     undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))

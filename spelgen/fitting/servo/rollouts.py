@@ -47,7 +47,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts whose load is computed along the measured motion with the model's present parameters."""
+        """Return the rollouts from the measured states of `windows`; x0 are the model's current parameters."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -55,13 +55,13 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts whose load is computed for parameters x along ``motion``; set the model to x."""
+        """Return the rollouts with ``motion`` as the fixed motion and x as x0; the model's parameters are set to x."""
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
@@ -74,13 +74,15 @@ class ServoRollouts:
         return self.windows.motion(q[0], qd[0])
 
     def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return the derivatives of the residual with respect to joint parameters and to shared parameters.
+        """Return the derivatives of the `residual` (W, K', n) at x with respect to joint and to shared parameters.
 
         Returns:
             (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that no joint fits.
-            (r + 1, W, K', n), with respect to the r coordinates of the bodies and to the delay.
+            (r + 1, W, K', n), with respect to the r coordinates of the body parameters and to the delay, which all
+                joints share.
         """
-        rows = x.active.any(dim=1).nonzero().squeeze(-1)  # parameters that are fitted at one joint or more
+        # rows: indices of the parameters that are fitted at one joint or more
+        rows = x.active.any(dim=1).nonzero().squeeze(-1)
         p, r, step = len(rows), len(x.bodies), self.difference_step
         # The batch has p + r + 2 rollouts: one at x, and one with each of p joint parameters, r body coordinates and
         # the delay changed.
@@ -106,7 +108,7 @@ class ServoRollouts:
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return q and qd of the rollouts with parameters x, (1, W, K, n) each."""
+        """Return the predicted positions [rad, m] and velocities [rad/s, m/s] for x, (1, W, K, n) each."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
@@ -114,8 +116,8 @@ class ServoRollouts:
         """Return predicted q and qd, (P, W, K, n) each, for P sets of parameters and W windows of K samples.
 
         Args:
-            joints: (P, p, n), joint parameters.
-            bodies: (P, r), body coordinates.
+            joints: (P, p, n), values of `ServoParameters.joints`.
+            bodies: (P, r), values of `ServoParameters.bodies`.
             commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """
         tensors = {name: tensor.detach() for name, tensor in self.parameters.named(joints).items()}
@@ -135,7 +137,7 @@ class ServoRollouts:
 
         Args:
             drives: servos and friction of the P sets.
-            armature: (P, 1, n).
+            armature: (P, 1, n) [kg m^2, kg].
             added: (P, W, K-1, n) [Nm, N], change of the load due to changed body parameters.
             commands: (P, W, K-1, S, n) [rad, m], commands at the S integration steps of each sample interval.
         """

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class ServoTuning:
     """Constants of fits of position servos, grouped by the file that uses them."""
 
-    # Windows that a fit predicts (`servo.windows`).
+    # Constants of the windows that a fit predicts (`servo.windows`).
 
     # [s] Length of a window. Shorter windows hardly show the effects of gravity and friction; in longer windows,
     # predictions with a wrong delay diverge.
@@ -20,10 +20,10 @@ class ServoTuning:
     # [1] Largest number of windows, evenly spread over the logs. 200 windows of 4 s with 1 s of burn-in contain ten
     # minutes of motion.
     count: int = 200
-    # [1] Number of samples whose load is computed at once; it limits the memory.
+    # [1] Number of samples for which the load of the bodies is computed at once; it limits the memory.
     batch: int = 2**13
 
-    # Standard deviations of the Gaussian prior, about the initial parameters (`servo.parameters`).
+    # Constants of the Gaussian prior about the initial parameters (`servo.parameters`).
 
     # [1] Prior standard deviation of the logarithms of a joint's gains, armature and friction; exp(2) is a factor of
     # seven.
@@ -41,18 +41,18 @@ class ServoTuning:
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
     body_directions: int = 6
-    # [1] Smallest effect of a fitted direction on gravity, relative to the largest effect.
+    # [1] Smallest effect of a fitted direction of the body parameters on gravity, relative to the largest effect.
     min_effect: float = 1e-3
-    # [1] Prior standard deviation of a parameter that is not fitted. It is practically zero, so the parameter is
-    # constant.
+    # [1] Prior standard deviation of a parameter that is not fitted. The deviation is practically zero, so the
+    # parameter is constant.
     fixed: float = 1e-9
 
-    # Cost and its derivatives (`servo.problem`, `servo.rollouts`).
+    # Constants of the cost of a fit and of its derivatives (`servo.problem`, `servo.rollouts`).
 
     # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
     correlation_time: float = 0.5
-    # [1] Finite-difference step of the parameters. It must be far above the rounding errors of rollouts, which lose
-    # about half the digits of double precision.
+    # [1] Finite-difference step of the parameters. The step must be far above the rounding errors of rollouts, which
+    # lose about half the digits of double precision.
     difference_step: float = 1e-4
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
@@ -60,11 +60,11 @@ class ServoTuning:
     # [1] Number of samples from which the directions of the body parameters are computed.
     gravity_samples: int = 2000
 
-    # Convergence (`servo.objective`).
+    # Constants of the outer iterations and their convergence (`servo.objective`).
 
     # [1] Largest number of windows in an outer iteration, except for the last, which uses all windows.
     sparse_windows: int = 32
-    # [1] Largest number of steps of an outer iteration.
+    # [1] Largest number of Levenberg-Marquardt steps of an outer iteration.
     steps: int = 12
     # [1] Largest number of steps of the last outer iteration, on all windows: it starts near the minimum, which was
     # found on few windows.
@@ -74,42 +74,44 @@ class ServoTuning:
     # [1] An outer iteration also ends if a step decreases the cost by less than this fraction of the cost.
     # `min_decrease` is too small for the high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
-    # [1] Damping of the first step of the second and third outer iteration. With 1e-3, the few steps would end with an
-    # error of kd of 0.3 %.
+    # [1] Levenberg-Marquardt damping of the first step of the second and third outer iteration. With 1e-3, the few
+    # steps would end with an error of kd of 0.3 %.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the derivatives from which the covariance is computed. With a shorter step, the
     # derivatives of a joint that is about to slip would be too large and its intervals too narrow.
     last_difference_step: float = 1e-3
 
-    # Selection of the joints that have a dead zone (`servo.laws`).
+    # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
     # [1] Half the initial dead zone, as a fraction of the static error.
     dead_zone_fraction: float = 0.25
-    # [1] Largest number of steps of the fit of a single joint.
+    # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
+    # with a dead zone and the fit without.
     joint_steps: int = 6
     # [1] Smallest significance of a selected dead zone, in standard deviations.
     significance: float = 4.0
     # [rad, m] Smallest value of half a dead zone; for comparison, the step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
-    # Intervals and identifiability of the fitted parameters (`servo.report`).
+    # Constants of the intervals and the identifiability of the fitted parameters (`servo.report`).
 
     # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
     # halves of one motion are not independent.
     min_logs: int = 3
-    # [1] Smallest number of blocks if there are fewer logs than `min_logs`; the logs are then divided into segments.
+    # [1] If there are fewer logs than `min_logs`, the logs are divided into at least this number of blocks in total.
     min_blocks: int = 6
     # [1] Variance inflation factor above which a parameter is not distinguished from others; on SO-101 arms, the factor
     # is below 30 or above 90.
     variance_inflation: float = 50.0
     # [1] Standard deviation of the logarithms of the ratios to kp that is due to errors of the friction model, measured
-    # by `benchmarks/servo_recovery.py`. It is added to the standard deviation of the fit (root of the sum of squares).
+    # by `benchmarks/servo_recovery.py`. This deviation is added to the standard deviation of the fit (root of the sum
+    # of squares).
     model_deviation: float = 0.015
     # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
     # not determined.
     max_factor: float = 1.25
 
-    # Initial guess and baseline (`servo.least_squares`).
+    # Constants of the initial guess of a fit, and of the baseline of linear servos (`servo.least_squares`).
 
     # [1] Smallest t value of the coefficient of gravity, 1 / kp, for which kp is computed from this coefficient. The
     # threshold is large, since neighbouring windows are correlated.

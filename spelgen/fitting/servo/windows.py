@@ -59,17 +59,17 @@ class ServoWindows:
 
     @property
     def rate(self) -> float:
-        """Mean sample rate [Hz]."""
+        """Mean sample rate of the windows [Hz]."""
         return float(1 / self.dt.mean())
 
     def subsampled(self, count: int) -> ServoWindows:
-        """Return at most ``count`` windows, evenly spread, with half as many integration steps."""
+        """Return at most ``count`` windows, evenly spread over all windows, with half as many integration steps."""
         selection = slice(None, None, -(-len(self.q) // count))
         q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
         return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
 
     def blocks(self, min_logs: int, min_blocks: int) -> Tensor:
-        """Return the block number of each window, (W,). Errors in different blocks are assumed to be independent.
+        """Return the block number of each window, (W,), for a jackknife over blocks with independent errors.
 
         With at least ``min_logs`` logs, each log is one block. Fewer logs are divided into equal segments, each of
         which is one block; the total number of blocks is at least ``min_blocks`` if there are enough windows.
@@ -84,7 +84,7 @@ class ServoWindows:
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
-        """Return measured positions, velocities and accelerations at the midpoints between samples.
+        """Return measured positions, velocities and accelerations at the K-1 midpoints between samples.
 
         Without arguments, velocities and accelerations are smoothed derivatives of the measured positions. With a
         predicted motion q, qd (W, K, n), they are the derivatives of the predicted motion plus smoothed derivatives of
@@ -164,7 +164,7 @@ class BodyLoad(NamedTuple):
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
-    """Return the load of the model's bodies along a motion of W windows of K samples, (W, K-1, n)."""
+    """Return the load of the model's bodies along a motion of W windows of K samples, at their K-1 midpoints."""
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature

@@ -65,15 +65,15 @@ class TorqueSolution:
     Attributes:
         rms_residual: root mean square torque residual, (n,) [Nm, N].
         steps: number of accepted steps of the Levenberg-Marquardt solver.
-        cost: final cost.
+        cost: final cost, the negative log posterior up to a constant.
         prior: prior with the estimated standard deviations.
         covariance: covariance of the K parameters x, (K, K).
         torque_std: root mean square torque error of held-out blocks, (n,) [Nm, N].
-        compensated: joints whose drives compensate friction, (n,).
+        compensated: mask (n,), True for joints whose drives compensate friction.
         correlation_time: correlation time of the torque errors, (n,) [s].
         held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
         selected_terms: the selected residual terms.
-        comparison: comparison with ridge regression; None for an adapted fit.
+        comparison: comparison with ridge regression; None if `fit_torque` fitted only the group of parameters `adapt`.
     """
 
     rms_residual: np.ndarray
@@ -90,7 +90,7 @@ class TorqueSolution:
 
 
 class _StagedFit(NamedTuple):
-    """Estimate after all stages, its jackknife, and the selected residual terms.
+    """Result of one run of all stages of a torque fit: estimate, its jackknife, and the selected residual terms.
 
     held_out: (blocks,), sum over joints of the squared held-out residual divided by the variance of the torque.
     parameters: state_dict of the fitted model.
@@ -125,7 +125,8 @@ def fit_torque(
     if prior is None:
         prior = TUNING.priors[adapt] if adapt else GaussianPrior()
     if adapt is None:
-        # Gains and friction of an adapted model are not nominal but fitted, so they are not changed.
+        # With `adapt`, motor gains and friction of the model are results of an earlier fit and not nominal values, so
+        # they are not changed.
         subset = samples.subsampled(TUNING.initial_samples)
         set_initial_gains(model, subset, prior.gains)
         limit_friction(model, subset.columns)
@@ -136,7 +137,8 @@ def fit_torque(
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
-    error = fitted.jackknife.held_out.sum(dim=0) / samples.count  # mean squared, (n,) [Nm^2, N^2]
+    # mean squared held-out error, (n,) [Nm^2, N^2]
+    error = fitted.jackknife.held_out.sum(dim=0) / samples.count
     return TorqueSolution(
         rms_residual=((state.residual / samples.count).sqrt() / scale).numpy(),
         steps=state.steps,
@@ -155,7 +157,7 @@ def fit_torque(
 def _staged_fit(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, adapt: Adaptation | None
 ) -> _StagedFit:
-    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters."""
+    """Run all stages of a torque fit and the jackknife; the prior mean is the model's current parameters."""
     subset = samples.subsampled(TUNING.initial_samples)
     estimate, selected = _run_stages(TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt), samples)
     problem = estimate.problem
@@ -175,25 +177,33 @@ def _not_behind_regression(
 ) -> tuple[_StagedFit, RegressionComparison]:
     """Return ``fitted``, or a second fit if ridge regression predicts held-out torques significantly better.
 
-    The second fit has the result of the regression as its initial guess. It is returned only if its held-out error is
-    below the error of ``fitted``. The parameters of the returned fit are written to the model. initial: state_dict of
-    the model before the fit.
+    The second fit has the result of the regression as its initial guess. The second fit is returned only if its
+    held-out error is below the error of ``fitted``. The parameters of the returned fit are written to the model.
+    initial: state_dict of the model before the fit.
     """
     blocks = contiguous_blocks(samples)
     regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())
-    # The lower bound of the noise is added to both errors, so that smaller differences are not significant.
+    # The squared lower bound of the noise is added to the held-out errors of the fit and of the regression, so that
+    # smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
     other = torch.from_numpy(regression.held_out) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return True if the regression is significantly better than the fit (Student's t test, p = 0.01)."""
+        """Return True if the regression has a significantly smaller held-out error than `fit`.
+
+        The errors of the blocks are compared by a t test (p = 0.01).
+        """
         if len(blocks) == 1:
             return False
         standard_errors = float(stdtrit(len(blocks) - 1, 0.99))
         return significant_reduction(fit.held_out + negligible, other, standard_errors) is not None
 
     def nmse(held_out: torch.Tensor) -> float:
-        """Return the mean nMSE of all joints. held_out: (blocks,), sums of squared errors / variance."""
+        """Return the mean nMSE over the joints.
+
+        held_out: (blocks,), squared errors divided by the variance of the torque, summed over the samples and joints of
+        each block.
+        """
         return float(held_out.sum()) / samples.count / model.n
 
     best, replaced = fitted, None
@@ -210,7 +220,10 @@ def _not_behind_regression(
 def _run_stages(
     problem: TorqueProblem, samples: TorqueSamples
 ) -> tuple[TorqueEstimate, Sequence[SelectedTerm]]:
-    """Return the estimate after all stages, and the selected residual terms."""
+    """Return the estimate after all stages of a torque fit, and the selected residual terms.
+
+    A fit of only one group of parameters (`adapt`) has two stages: the initial fit and the final fit.
+    """
     if problem.adapt is not None:
         return refine(initial_fit(problem), samples), ()
     model = problem.jacobian.model
@@ -232,9 +245,10 @@ def _run_stages(
 
 
 def _max_samples(model: ArmModel) -> int:
-    """Return the largest number of samples of a fit.
+    """Return the largest number of samples of a fit; larger logs are subsampled.
 
-    It limits the memory of two regressors, of the torque and of the gravity torque, to `TUNING.regressor_bytes`.
+    This number limits the memory of two regressors, of the torque and of the gravity torque, to
+    `TUNING.regressor_bytes`.
     """
     numbers = 2 * model.n * model.inertial_parameters.numel()
     return max(TUNING.initial_samples, int(TUNING.regressor_bytes / (8 * numbers)))

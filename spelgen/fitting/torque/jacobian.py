@@ -31,11 +31,12 @@ class _RegressorBlock(NamedTuple):
     """T samples with all factors of the modelled torque that do not depend on the parameters x.
 
     Attributes:
-        speed, acceleration: speeds and accelerations of the drives, (T, n).
+        samples: the T samples.
+        speed, acceleration: speeds [rad/s, m/s] and accelerations [rad/s^2, m/s^2] of the drives, (T, n).
         regressor: regressor of the joint torque with respect to the inertial parameters of B bodies, (T, n, 10 B).
         load_regressor: regressor of the gravity torque on the drives, (T, n, 10 B).
         residual_torque: torque of the residual terms, (T, n) [Nm, N].
-        friction_factor: factor of the residual terms on friction, (T, n).
+        friction_factor: factor by which the residual terms multiply the friction torque, (T, n) [1].
     """
 
     samples: SampleBlock
@@ -48,7 +49,11 @@ class _RegressorBlock(NamedTuple):
 
 
 class ResidualSamples(NamedTuple):
-    """T samples with the torque residual of the model and the friction torque of its drives, all (T, n)."""
+    """T samples with the torque residual of the model and the friction torque of its drives, all (T, n).
+
+    q, qd, qdd: positions, velocities, accelerations [rad, m, s]. torque_residual: measured minus modelled joint torque
+    [Nm, N]. friction: friction torque of the drives [Nm, N].
+    """
 
     q: torch.Tensor
     qd: torch.Tensor
@@ -82,7 +87,7 @@ class TorqueJacobian:
         inputs = model.inputs
         self._gain_rows = inputs.gain_rows if isinstance(inputs, MotorInputs) else torch.zeros(0).long()
         self._motors = motors_of(model)
-        self._affects = self._motors != 0  # (n, n), entry (i, j): True if drive i acts on joint j
+        self._affects = self._motors != 0  # _affects: (n, n), entry (i, j): True if drive i acts on joint j
         self._affected = self._affected_joints()
         self._colours = _colour(self._affects.double().mT @ self._affects.double() > 0)
         # Regressors do not depend on x, so they are computed once. The samples are divided into blocks to limit the
@@ -111,17 +116,18 @@ class TorqueJacobian:
         return squared_residual
 
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
-        """Return initial gain / current gain per joint, (n,) [1]; 1 for fixed gains.
+        """Return initial / current motor gain per joint, (n,) [1]; 1 for fixed gains.
 
-        The measured joint torque is proportional to the current gain. Multiplied by this factor, it no longer depends
-        on the current gain.
+        The measured joint torque is proportional to the current gain. Multiplied by this factor, the measured joint
+        torque no longer depends on the current gain.
         """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return initial gain / current gain per joint, (..., n) [1], for autograd.
+        """Return the initial divided by the current motor gain of each joint, (..., n) [1]; 1 for fixed gains.
 
-        parameters: one set of parameters by name, or a batch (...) of sets.
+        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`:
+        {name: values}, or values of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
         # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
@@ -139,8 +145,9 @@ class TorqueJacobian:
         if self.terms:
             rows = self._projected(rows)
         curvature, descent = linearization.normal_equations(rows, noise, len(x))
-        # The products are computed with respect to theta and then transformed: this transforms matrices (K, K)
-        # instead of Jacobians (T, K).
+        # The products J^T W J and J^T W r are computed with respect to theta (x with inertial parameters in place of
+        # log-Cholesky parameters) and then transformed to x: this transforms matrices (K, K) instead of Jacobians (T,
+        # K).
         change = self.theta_jacobian(x)
         return change.mT @ curvature @ change, change.mT @ descent
 
@@ -157,8 +164,9 @@ class TorqueJacobian:
         for block in self._blocks:
             residual, parameter_columns, load_columns = self._compressed_jacobian(parameters, block)
             for joint, colour in enumerate(self._colours):
-                # Decompression: the compressed Jacobian contains one sum of the rows of all joints of a colour. The row
-                # of this joint is the part of the sum in the columns of the parameters that affect its torque.
+                # Decompression: a colour is a set of joints that share no drive. The compressed Jacobian contains one
+                # sum of the rows of all joints of a colour. The row of this joint is the part of the sum in the columns
+                # of the parameters that affect its torque.
                 affecting, drives = self._affected[:, joint], self._affects[:, joint]
                 loads = load_columns[colour][:, drives].unsqueeze(-1) * block.load_regressor[:, drives]
                 bodies = scale[joint] * block.regressor[:, joint] + loads.sum(dim=1)
@@ -180,7 +188,10 @@ class TorqueJacobian:
                 yield of_joint._replace(jacobian=jacobian, residual=residual)
 
     def theta_jacobian(self, x: torch.Tensor) -> torch.Tensor:
-        """Return d theta / d x, (K, K): block diagonal over bodies, identity for all other parameters."""
+        """Return d theta / d x at x (K,), (K, K): block diagonal over bodies, identity for all other parameters.
+
+        theta is x with inertial parameters in place of the bodies' log-Cholesky parameters.
+        """
         parameters = self.rigid.unflatten(x)
         # Ten copies of the bodies' parameters are used, so that one reverse pass computes the gradients of all ten
         # inertial parameters: copy k receives the gradient of inertial parameter k.
@@ -194,7 +205,7 @@ class TorqueJacobian:
         return change
 
     def residual_samples(self, x: torch.Tensor) -> ResidualSamples:
-        """Return all samples with the torque residual and the friction torque for parameters x (K,)."""
+        """Return all samples with the residual and the friction torque for parameters x (K,), see `ResidualSamples`."""
         parameters, blocks = self.rigid.unflatten(x), []
         with torch.no_grad():
             for block in self._blocks:
@@ -214,8 +225,9 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # The projection uses theta instead of x. The torque is linear in inertial parameters, so the projection is also
-        # valid for large torques.
+        # The projection is computed with respect to theta, which contains inertial parameters where x contains
+        # log-Cholesky parameters. The torque is linear in inertial parameters, so the projection is also valid for
+        # large torques.
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -223,11 +235,11 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the parameters (K,) after a step (K,) from x, along a line that is curved in x.
+        """Return the parameters (K,) after a step (K,) from x, along a curved line: a candidate of the solver.
 
         The line is straight in the inertial parameters and in the friction coefficients, since the torque is linear in
-        them. `step_in_inertial_parameters` updates the inertial parameters. Of a friction coefficient c, x contains log
-        c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
+        them. `step_in_inertial_parameters` updates the inertial parameters. x contains the logarithm of each friction
+        coefficient c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
@@ -248,7 +260,8 @@ class TorqueJacobian:
         model, q, qd, qdd = self.model, block.q, block.qd, block.qdd
         zero = torch.zeros_like(q)
         with torch.no_grad():
-            # Load-dependent friction depends on the gravity torque only, so accelerations are zero here.
+            # Load-dependent friction depends only on the gravity torque, whose regressor is the regressor at zero
+            # velocity and zero acceleration.
             gravity_regressor = regressor_of(model.chain, q, zero, zero)
             return _RegressorBlock(
                 samples=block,
@@ -263,7 +276,7 @@ class TorqueJacobian:
     def _affected_joints(self) -> torch.Tensor:
         """Return a mask (K', n), True if a parameter affects the torque of a joint.
 
-        The K' parameters are the entries of x that are not parameters of bodies.
+        The K' parameters are the entries of x that are not parameters of bodies: parameters of drives and friction.
         """
         masks = []
         for name, tensor in self.rigid.initial.items():
@@ -276,7 +289,7 @@ class TorqueJacobian:
         return torch.cat(masks)
 
     def _inertial_parameters(self, parameters: NamedTensors) -> torch.Tensor:
-        """Return the inertial parameters of all bodies (B, 10)."""
+        """Return the inertial parameters (..., B, 10) of B bodies for parameters {name: values}, or a batch of them."""
         theta: torch.Tensor = evaluate_with(self.model, parameters, lambda model: model.inertial_parameters)
         return theta
 
@@ -339,7 +352,10 @@ class TorqueJacobian:
 
 
 def _colour(coupled: torch.Tensor) -> list[int]:
-    """Return one colour per joint by the greedy algorithm; coupled joints differ. coupled: mask (n, n)."""
+    """Return one colour, an index, per joint by the greedy algorithm; coupled joints have different colours.
+
+    coupled: mask (n, n), True for pairs of joints that share a drive.
+    """
     colours: list[int] = []
     for row in coupled.tolist():
         used = {colour for colour, shared in zip(colours, row, strict=False) if shared}

@@ -68,7 +68,10 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return the weights (P,) of the term's current parameter; the weights of trends are zero."""
+        """Return the weights (P,) of the `JointFunction` that represent the term's current parameter in `terms`.
+
+        The weights of trends are zero: the weights of single entries suffice.
+        """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
         else:
@@ -76,18 +79,18 @@ class JointFunction:
         return F.pad(entries.detach(), (self.trends.shape[1], 0))
 
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
-        """Set the term's parameter to the values for weights (P,)."""
+        """Set the term's parameter in `terms` to the values that weights (P,) of the `JointFunction` represent."""
         count = self.trends.shape[1]
         # Trends have a separate prior in the fit but no parameter in the model, so they are added to the entries.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
-            # The model bounds the log factor by a tanh, which is inverted here.
+            # The model bounds the logarithm of a friction factor by a tanh, which is inverted here.
             entries = LARGEST * (entries.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT) / LARGEST).atanh()
         with torch.no_grad():
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] of the term for weights (P,) at the samples `rows`.
+        """Return the torque (T,) [Nm, N] of the residual term for weights (P,) at the samples `rows`.
 
         For a friction factor, this is the change of the friction torque by the factor.
         """
@@ -101,8 +104,14 @@ class JointFunction:
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return the torque (T,) that this term should have to explain a torque residual (T, n) best; noise: (n,)."""
-        # Weighted least squares over the joints, since the friction of a coupled drive acts on several joints.
+        """Return values (T,) [Nm, N] of this residual term's torque that explain the torque residual best.
+
+        At each sample, the value minimizes the sum over all joints of (residual - effect of the term)^2 / noise^2. The
+        term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque
+        noise [Nm, N].
+        """
+        # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on
+        # several joints.
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 
@@ -111,7 +120,8 @@ class JointFunction:
     ) -> BayesianRidge:
         """Return the Bayesian ridge fit of the weights to a target torque (T,) [Nm, N] at the samples `rows`.
 
-        The samples of one visit of a position count as one independent error (see ``visit_length``).
+        The number of samples that count as one independent error is ``correlation_length``, or ``visit_length`` if this
+        is larger: while the joint remains near a position, the error of a function of position remains constant.
         """
         samples = append_target(self.features[rows], target[rows])
         # The error of a function of position is constant during a visit of a position, however long the visit lasts.
@@ -122,8 +132,8 @@ class JointFunction:
 class ProjectedTerms(NamedTuple):
     """Position-dependent residual torques whose weights a fit eliminates by variable projection.
 
-    candidates: the residual terms. terms: {joint: linear terms}; their columns are the columns of all residual terms of
-    the joint, concatenated in the order of the candidates.
+    candidates: the residual terms; each acts on one joint, and a joint may have several. terms: {joint: `LinearTerms`
+    of the joint}, whose features are the columns of all residual terms of the joint, in the order of the candidates.
     """
 
     terms: dict[int, LinearTerms]
@@ -179,8 +189,8 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
-            # The weights of this torque will be eliminated. The torque in the model is set to zero, or it would count
-            # twice.
+            # The weights of a position-dependent torque will be eliminated. The torque in the model is set to zero, or
+            # it would count twice.
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))
@@ -208,7 +218,7 @@ def joint_functions(
     # The number of visits of a joint is 1 + path length / knot spacing of the splines.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
-    # At least two periods: width >= 2 * 2 pi / frequency.
+    # Ripple of a frequency needs a range of positions of at least two periods: width >= 2 * 2 pi / frequency.
     width = (samples.q.amax(dim=0) - samples.q.amin(dim=0)).unsqueeze(-1)
     ripple = ripple * (terms.frequencies * width >= 4 * torch.pi).repeat(1, 2)
     friction = splines * samples.friction.unsqueeze(-1)
@@ -245,6 +255,6 @@ def joint_functions(
 
 
 def rms_per_joint(torque_residual: torch.Tensor) -> torch.Tensor:
-    """Return the root mean square (n,) of a torque residual (T, n); it is positive even if the residual is zero."""
+    """Return the root mean square (n,) of a torque residual (T, n), used as noise; it is never zero."""
     rms = torque_residual.square().mean(dim=0).sqrt()
     return rms.clamp(min=1e-12 * float(rms.max()) + 1e-300)

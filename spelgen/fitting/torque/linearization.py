@@ -12,7 +12,10 @@ import torch.nn.functional as F
 class JointRows(NamedTuple):
     """Linearized torque residual of one joint: residual(theta + s) = residual - jacobian @ s[columns].
 
+    theta (K,) are the parameters of the model, with inertial parameters for the bodies (see `TorqueJacobian`).
+
     Attributes:
+        joint: index of the joint.
         columns: (C,), indices of the C entries of theta on which the torque of the joint depends.
         jacobian: (T, C), derivatives of the modelled torque with respect to these entries.
         residual: (T,) [Nm, N], torque residual at theta.
@@ -41,14 +44,18 @@ class LinearTerms:
 
     @cached_property
     def ridge(self) -> torch.Tensor:
-        """Matrix (F^T F + D)^-1 F^T, (P, T), which maps a torque residual (T,) to the weights (P,)."""
-        # The result is cached, so that the small matrix (P, P) is factorized once for all columns of the Jacobian.
+        """Matrix (F^T F + D)^-1 F^T, (P, T), which maps a torque residual (T,) to the weights (P,).
+
+        F (T, P) are the features, D is the diagonal matrix of the penalty.
+        """
+        # The ridge matrix is cached, so that the small matrix (P, P) is factorized once for all columns of the
+        # Jacobian.
         gram = self.features.mT @ self.features + self.penalty.diag()
         ridge: torch.Tensor = torch.linalg.solve(gram, self.features.mT)
         return ridge
 
     def weights(self, torque: torch.Tensor) -> torch.Tensor:
-        """Return the weights (P, ...) for a torque residual (T, ...) [Nm, N]."""
+        """Return the weights (P, ...) of the linear terms, the ridge solution for a torque residual (T, ...)."""
         return self.ridge @ torque
 
     def residual(self, torque: torch.Tensor) -> torch.Tensor:
@@ -67,8 +74,8 @@ NO_TERMS: Mapping[int, LinearTerms] = {}
 class RigidProjection(NamedTuple):
     """Projection of joint torques onto the rigid-body and friction model, per joint.
 
-    If a torque (T,) were added to a joint, a fit would change theta by posterior_gain @ jacobian^T @ torque to absorb
-    it.
+    If a torque (T,) were added to a joint, a fit would change the model's parameters theta by posterior_gain @
+    jacobian^T @ torque to absorb it.
 
     jacobian: one matrix (T, C) per joint, derivatives of its torque with respect to the C entries of theta that affect
     it (see `TorqueJacobian.joint_rows`). posterior_gain: one matrix (C, C) per joint, the posterior covariance of these
@@ -79,7 +86,11 @@ class RigidProjection(NamedTuple):
     posterior_gain: tuple[torch.Tensor, ...]
 
     def orthogonalize(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
-        """Return the part of P torques (T, P) on a joint that the rigid-body and friction model cannot absorb."""
+        """Return the residuals (T, P) of P torques on a joint, `torque` (T, P), after projection onto the model.
+
+        If such a torque were added to the measured torque, this would be the torque residual of a refit of the
+        rigid-body and friction parameters.
+        """
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))
 
@@ -94,15 +105,15 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # Eigenvalues of 1 - H are near zero if the segment determines many parameters: the lower bound limits the
-            # correction.
+            # Eigenvalues of 1 - H, with the hat matrix H, are near zero if the segment determines many parameters: the
+            # lower bound limits the correction.
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
 
 
 def concatenate_blocks(rows: Iterable[JointRows], joints: int) -> list[JointRows]:
-    """Return the rows of each joint, concatenated over the blocks of samples."""
+    """Return the Jacobian rows of each joint, concatenated over the blocks of samples, one `JointRows` per joint."""
     blocks: list[list[JointRows]] = [[] for _ in range(joints)]
     for block in rows:
         blocks[block.joint].append(block)
@@ -147,7 +158,8 @@ def least_squares_residual(
     """
     curvature, descent = normal_equations(rows, noise, len(free))
     inverse = torch.zeros_like(curvature)
-    # The pseudo-inverse is used, since there is no prior here and some inertial parameters affect no torque.
+    # The pseudo-inverse is used, since unconstrained least squares has no prior and some inertial parameters affect no
+    # torque.
     inverse[free[:, None] & free] = _pseudo_inverse(curvature[free][:, free]).flatten()
     step = inverse @ descent
     squared_residual, gamma = torch.zeros(2, len(noise)).double()
@@ -212,13 +224,13 @@ def bayesian_ridge(
         correlation_length: number of samples per independent error, by which the log likelihood is divided.
     """
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
-    member = F.one_hot(groups.long()).double()  # (P, G), 1 if the weight is in the group, otherwise 0
+    member = F.one_hot(groups.long()).double()  # member: (P, G), 1 if the weight is in the group, otherwise 0
     excited = gram.diagonal() > 0
     # `size` is the number k of weights of each group, `variance` is 1 / alpha.
     size, variance = member.sum(dim=0), square / count
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
-    # Weights of zero would be a fixed point. Therefore the initial precision of each group is the one with which the
-    # group explains 10 % of the variance of the target.
+    # Weights of zero would be a fixed point of the iteration. Therefore the initial precision of each group is the one
+    # with which the group explains 10 % of the variance of the target.
     lambda_ = 10 * feature_square * size / max(variance, 1e-300)
     n_iter, converged = 0, False
     while n_iter < 30 and not converged:
@@ -237,5 +249,5 @@ def bayesian_ridge(
 
 
 def append_target(features: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return P features (T, P) with the target (T,) as the last column, (T, P + 1)."""
+    """Return P features (T, P) with the target (T,) as the last column, (T, P + 1), for a Gram matrix of both."""
     return torch.cat([features, target.unsqueeze(-1)], dim=1)

@@ -1,4 +1,4 @@
-"""Fit of networks to torques by L-BFGS: of models that consist of networks, and of networks as residual terms."""
+"""Fits of networks to torques by L-BFGS: models that consist of networks, and residual terms that are networks."""
 
 import copy
 from collections.abc import Callable, Iterator
@@ -25,8 +25,9 @@ ADAPTED_PARTS: dict[Adaptation, tuple[str, ...]] = {
     "friction": ("friction.",),
     "unit": ("",),
 }
-"""Prefixes of the names of the weights that an adaptation fits."""
-BLOCK = 2**16  # Number of samples per block; gradients need all intermediate results of a block in memory.
+"""Prefixes of the names of the weights that a fit with the option `adapt` changes, per value of the option."""
+# Number of samples per block of the loss; its gradient needs all intermediate results of a block in memory.
+BLOCK = 2**16
 
 
 def fit_networks(
@@ -48,7 +49,8 @@ def fit_networks(
     """
     count, joints = samples.columns.tau.shape
     scale = samples.columns.tau.std(dim=0)
-    # Without this lower bound, the errors of a joint of constant torque would have an infinite weight.
+    # The standard deviation of the torque has a lower bound: otherwise the errors of a joint of constant torque would
+    # have an infinite weight.
     scale = torch.maximum(scale, 1e-2 * scale.amax())
 
     def summands() -> Iterator[torch.Tensor]:
@@ -113,7 +115,8 @@ def select_networks(
     with torch.no_grad():
         current = residual_torque(model, *subset[:3])
     subset = subset._replace(torque_residual=subset.torque_residual + current)
-    # The potential is first because it does not depend on accelerations, which are the noisiest signals.
+    # The network of the potential is fitted first, since it does not depend on accelerations, which are the noisiest
+    # signals.
     terms = model.residuals
     networks = {"residual_potential": list(terms.potential.parameters()) if terms.potential else []}
     networks["residual_mass"] = [terms.raw_constants, *(terms.mass.parameters() if terms.mass else ())]

@@ -1,4 +1,4 @@
-"""Objective torque: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
+"""Objective `torque`: fit inverse dynamics to the torques of all logs, then validate the model on windows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from spelgen.settings.fits import TorqueFit
 if TYPE_CHECKING:
     from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 
-SAMPLES = 5  # number of samples of a window for validation and loss scales
+SAMPLES = 5  # number of samples of a window, for validation and for the scales of the validation loss
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -47,7 +47,7 @@ FITTED = {
 class TorqueObjective(Objective):
     """Objective of a fit to torques.
 
-    `begin` runs the whole fit. It takes seconds to minutes, so no checkpoints are written during the fit.
+    `begin` runs the whole fit. A fit takes seconds to minutes, so no checkpoints are written during the fit.
     """
 
     name: ClassVar[str] = "torque"
@@ -72,7 +72,10 @@ class TorqueObjective(Objective):
         return self.data
 
     def begin(self) -> list[Diagnostic]:
-        """Fit the model. Raises LogError if no log is sampled densely enough for accelerations."""
+        """Fit the model and validate it; return diagnostics.
+
+        Raises LogError if no log is sampled densely enough for accelerations.
+        """
         model = self.model
         notes = [*self._coupling_notes, *self._delay.notes]
         samples = torque_samples(model, self.data)
@@ -92,7 +95,7 @@ class TorqueObjective(Objective):
         fit_notes, solution = fit_torques(model, samples, self.config, regularizer)
         self.results = {"notes": [note.message for note in fit_notes]}
         notes += fit_notes
-        # Residual terms that were not selected are zero. They are removed from the validated model to save time.
+        # Residual terms that were not selected are zero. These terms are removed from the validated model to save time.
         subset = replace(self.data, validation=thinned(self.data.validation, TUNING.validation_windows))
         validation = Validation(without_idle_residuals(model), subset, self.request.options.device)
         substeps = validation.substeps()
@@ -160,7 +163,7 @@ def couple_motors(model: ArmModel, coupling: Coupling, remaining: float) -> Diag
 
 
 def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
-    """Return the samples of training and validation logs; None if no log has motion at a sufficient rate."""
+    """Return the samples of training and validation logs; None if no log has motion at a sufficient sample rate."""
     decimation, reach = 1, bristle_reach(model)
     if isinstance(model, RigidBodyDynamics):
         decimation = TUNING.decimation
@@ -194,7 +197,7 @@ def fit_torques(
             penalty = lambda: config.urdf_weight * regularizer.loss(model)  # noqa: E731
         steps = fit_networks(model, samples, config.weight_decay, penalty, config.evaluations)
     message = (
-        f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, those of "
+        f"{FITTED.get(config.adapt or '', 'fitted')} to the torques of {samples.original_count} samples, "
         f"validation included, in {steps} steps"
     )
     return [Diagnostic("info", "torque-fit", "logs", None, message), *notes], solution

@@ -36,9 +36,9 @@ RIGID_GROUPS = (
 """Groups of parameters (see `ParameterInfo`) of bodies, drives and friction; all others are of residual terms, or of
 position servos."""
 SERVO_GROUPS = ("stiffness", "damping", "dead_zone", "delay")
-"""Groups of position servos, which fits to torques do not have."""
+"""Groups of the parameters of position servos, which models fitted to torques do not have."""
 DAY_GROUPS = ("sizes", "effects", "velocities", "load_dependence", "fractions", "offset")
-"""Groups that differ from day to day."""
+"""Groups of friction parameters and torque offsets, whose values differ from day to day."""
 NEGLIGIBLE = -30.0  # logarithm of a negligible friction coefficient, relative to nominal friction
 
 
@@ -51,7 +51,8 @@ class ParameterVector:
     def __init__(self, model: ArmModel) -> None:
         tensors = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         self.groups: dict[str, str] = {}
-        self._tensors: dict[str, torch.Tensor] = {}  # parameters and buffers that a fit may change
+        # the model's parameters and buffers that a fit may change
+        self._tensors: dict[str, torch.Tensor] = {}
         self.initial: dict[str, torch.Tensor] = {}
         for name, info in parameter_table(model).items():
             if info.kind in (*RIGID_GROUPS, *SERVO_GROUPS):
@@ -105,20 +106,22 @@ class ParameterVector:
 
 
 def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
-    """Return the joint torque that belongs to the logged torque, (T, n) [Nm, N]."""
+    """Return the measured joint torque, (T, n) [Nm, N]: the input matrix of the model times the logged torque."""
     with torch.no_grad():
         torque: torch.Tensor = samples.tau @ model.input_matrix(samples.q[:1])[0].mT
     return torque
 
 
 def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> None:
-    """Multiply trained motor gains by factors from the samples, where their initial values are far off.
+    """Correct initial values of trained motor gains that are wrong by a large factor.
 
-    Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. The rigid-body
-    torque of the initial parameters is regressed on the torque of the initial gain, per joint, together with friction
-    and an offset. Joints without a significant slope have the median slope of the others.
+    Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
+    measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
+    together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
+    without a significant coefficient have the median coefficient of the others.
 
-    deviation: prior standard deviation of the logarithm of a gain. Slopes within three deviations change nothing.
+    deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
+    coefficient exceeds three standard deviations.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
@@ -127,7 +130,8 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
         # The inverse dynamics are logged torques, here converted to joint torques by the initial gains.
         joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
         rigid = joint - model.friction_torque(q, qd)
-        # The columns of each trained joint, (joints, T, 4), of which the first is the rigid-body torque.
+        # columns: (joints, T, 4), the regressor of each joint whose gain is trained: rigid-body torque, velocity, sign
+        # of the velocity, and 1 for the offset.
         columns = torch.stack([rigid, qd, qd.sign(), torch.ones_like(qd)], dim=-1).transpose(0, 1)[
             inputs.gain_rows
         ]
@@ -177,7 +181,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
 
     The pseudo-inertia of a body is C S C^T with a constant matrix C and S = T T^T, where T is the upper triangular
     matrix `body_factor(raw)`. Let X be the first-order change of T by the step. The first-order change of S is then T
-    (T^-1 X + (T^-1 X)^T) T^T. It is added to S, or only a fraction of it, so that S remains positive definite.
+    (T^-1 X + (T^-1 X)^T) T^T. This change of S is added to S, or only a fraction of the change, so that S remains
+    positive definite.
 
     Args:
         raw: (B, 10) log-Cholesky parameters of B bodies.
@@ -193,7 +198,9 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    if not added.isfinite().all():  # after an overflow, the solver rejects the step because of its cost
+    # After an overflow, the fraction cannot be computed. The whole step is returned; the solver rejects it because of
+    # its cost.
+    if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
     fraction = (TUNING.body_step / (-min_eigenvalue).clamp(min=1e-12)).clamp(max=1.0)
@@ -208,7 +215,7 @@ def upper_cholesky(matrix: torch.Tensor) -> torch.Tensor:
 
 
 def log_cholesky_parameters(factor: torch.Tensor) -> torch.Tensor:
-    """Return the log-Cholesky parameters (B, 10) whose upper triangular matrices are `factor` (B, 4, 4).
+    """Return the log-Cholesky parameters (B, 10) of B bodies from the upper triangular factors (B, 4, 4) of the bodies.
 
     This function is the inverse of `body_factor`.
     """
@@ -226,7 +233,7 @@ SHARED = {
     "velocities": "shared_velocities",
     "fractions": "shared_fractions",
 }
-"""Options with the standard deviation common to all joints, by the option with the one of a single joint."""
+"""{option of `GaussianPrior`: option of the factor common to all joints}, both of them prior standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +260,7 @@ class ParameterPrior:
 
     @classmethod
     def of(cls, rigid: ParameterVector, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior whose mean is the vector of the model's current parameters."""
+        """Return the prior whose mean is the vector of the model's current parameters. widths: standard deviations."""
         body_widths = torch.full_like(rigid.initial[rigid.bodies][:, 0], widths.bodies)
         return cls(rigid, widths, widths, rigid.flatten(rigid.initial), body_widths)
 
@@ -267,7 +274,7 @@ class ParameterPrior:
 
     @cached_property
     def precision(self) -> torch.Tensor:
-        """Inverse of the prior covariance, (K, K)."""
+        """Inverse of the prior covariance of the K parameters, (K, K)."""
         covariance = prior_covariance(self.widths, self.rigid.initial, self.rigid.groups)
         bodies = self.rigid.mask("bodies")
         covariance[bodies, bodies] = self.body_widths.square().repeat_interleave(10)
@@ -280,7 +287,8 @@ def prior_covariance(
 ) -> torch.Tensor:
     """Return the prior covariance (K, K) of the flattened parameters.
 
-    parameters: {name: values}, K values in total. groups: {name: parameter group}.
+    parameters: {name: values}, K values in total. groups: {name: parameter group}. widths: prior standard deviations of
+    the groups, and of the factors common to all joints.
     """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
@@ -290,8 +298,10 @@ def prior_covariance(
         option = width_option(groups[name])
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
-            # The parameters of all joints have a common factor. Bristle fractions have one parameter per joint and
-            # bristle, (n, elements): each bristle has its own common factor.
+            # The parameters are logarithms, and their prior has a random factor that is common to all joints. The
+            # variance of its logarithm is added to all entries of the covariance matrix of these parameters. Bristle
+            # fractions have one parameter per joint and bristle, (n, bristles): there is a separate common factor for
+            # bristle 1 of all joints, bristle 2 of all joints, and so on.
             for of_joints in rows.view(len(x), -1).mT:
                 matrix[of_joints[:, None], of_joints] += deviations[SHARED[option]] ** 2
         if groups[name] in ("sizes", "effects"):
@@ -337,7 +347,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # one sum per body, (B,)
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), sum per body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

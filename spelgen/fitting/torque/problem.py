@@ -39,7 +39,7 @@ from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 State = SolverState[torch.Tensor]
-"""Parameters x (K,), and as residual the squared torque residual per joint (n,)."""
+"""State of the solver: parameters x (K,), and as `residual` the squared torque residual per joint, (n,) [Nm^2, N^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +59,18 @@ class NoiseEstimator:
     def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
-        # The standard deviation has a lower bound, which avoids divisions by zero at joints of constant torque.
+        # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
+        # torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
         return cls(jacobian.samples.count, correlation_length, torque_std)
 
     @property
     def errors(self) -> torch.Tensor:
-        """Number of independent errors per joint, (n,)."""
+        """Number of independent torque errors in all samples, per joint, (n,)."""
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of a model that predicts a constant torque."""
+        """Return the noise (n,) [Nm, N] of a model that predicts a constant torque: an upper bound of the noise."""
         return self.torque_std * self.correlation_length.sqrt()
 
     def estimate(
@@ -82,8 +83,8 @@ class NoiseEstimator:
             effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
                 the degrees of freedom of the residual by one independent error.
         """
-        # At least one independent error remains. Otherwise the difference could be negative, since `updated` assigns an
-        # equal share of the parameters to each joint.
+        # The degrees of freedom (independent errors minus parameters) are at least one. They could be negative
+        # otherwise, since `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
         rms = (squared_residual / self.count / fraction).sqrt()
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
@@ -91,7 +92,7 @@ class NoiseEstimator:
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
         """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
 
-        It is `annealing_fraction` times the noise that is estimated from the residual.
+        This noise is `annealing_fraction` times the noise that is estimated from the residual.
 
         squared_residual: (n,) sum over all samples [Nm^2, N^2].
         """
@@ -148,22 +149,23 @@ class TorqueProblem:
         return self.noise_estimator.correlation_length
 
     def with_least_squares_noise(self, x: torch.Tensor) -> TorqueProblem:
-        """Return the problem with the noise of unconstrained least squares, linearized at x (K,).
+        """Return the problem with the noise that is estimated from the residual of unconstrained least squares.
 
-        Noise estimated from the residual of a poor initial guess would be too large, and the fit would stop early. The
-        residual of unconstrained least squares is a lower bound of the noise: except for the linearization of friction,
-        no physically consistent x has a smaller residual.
+        The torque is linearized at x (K,) and fitted by least squares in the inertial, drive and friction parameters,
+        without a prior and without physical consistency of the bodies. If friction were linear in its parameters, no x
+        could have a smaller residual, so this noise is a lower bound. Noise estimated from the residual of a poor
+        initial guess would be too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
-        # Joints have common parameters, so the solution depends on the weights 1 / noise^2 of the joints, which depend
-        # on the solution. Two iterations suffice.
+        # The least-squares solution depends on the weights 1 / noise^2 of the joints, since joints have common
+        # parameters, and the weights depend on the solution. Two iterations suffice.
         for _ in range(2):
             noise = estimator.estimate(*least_squares_residual(rows, noise, self.free))
         return replace(self, noise=noise)
 
     def residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the sum of the squared torque residual over all samples, per joint, (n,) [Nm^2, N^2]."""
+        """Return the sum of the squared torque residual over all samples at x (K,), per joint, (n,) [Nm^2, N^2]."""
         return self.jacobian.squared_residual(x)
 
     def cost(self, x: torch.Tensor, residual: torch.Tensor) -> float:
@@ -176,9 +178,9 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) for the k free parameters."""
-        # The prior of common factors couples free and fixed parameters. Therefore all rows are computed first, and the
-        # free ones are selected afterwards.
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
+        # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
+        # computed first, and the rows and columns of the free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -190,8 +192,8 @@ class TorqueProblem:
         step: (k,), step of the k free parameters.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # x + step needs less time and is as good near the optimum. Far from the optimum, the curved step may have a
-        # lower cost.
+        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the curved step
+        # may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -222,15 +224,15 @@ class TorqueProblem:
         return covariance
 
     def updated(self, state: State, covariance: torch.Tensor) -> TorqueProblem:
-        """Return the problem with noise and prior widths re-estimated at a state.
+        """Return the problem with noise and prior widths re-estimated at a state of the solver.
 
         The noise depends on the effective number of parameters, gamma = tr(1 - covariance P), with the precision P of
         the prior (MacKay, 1992). Each joint is assigned an equal share of gamma. covariance: (K, K), posterior
         covariance.
         """
         free, joints = self.free, len(state.residual)
-        # gamma is computed for all joints together, since the torques of several joints determine a parameter of a
-        # body.
+        # The effective number of parameters, gamma, is computed for all joints together, since the torques of several
+        # joints determine a parameter of a body.
         gamma = float(free.sum() - (covariance * self.prior.precision)[free][:, free].sum())
         noise = self.noise_estimator.estimate(state.residual, gamma / joints)
         # The prior width of the bodies cannot be estimated if only one body, the load, is fitted.
@@ -251,7 +253,10 @@ class TorqueEstimate:
     covariance: torch.Tensor
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
-        """Return the estimate with the same x, but for other samples, residual terms or friction forms."""
+        """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
+
+        The squared residual is recomputed with the model's current choice of the friction state per joint.
+        """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
 
@@ -261,25 +266,28 @@ class TorqueEstimate:
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
-        """Return the estimate with the same x on segments of consecutive samples, and with the current covariance.
+        """Return this estimate, converted to segments of consecutive samples, with a recomputed covariance.
 
-        The problem of the estimate may have subsampled samples, whose correlation cannot be estimated. The noise is
-        converted to the sample interval of the segments.
+        The estimate may have been fitted to a subset of the samples with gaps, from which the correlation time of the
+        torque errors cannot be estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`.
+        The parameters x are unchanged; the noise is converted to the sample interval of the segments.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # The weight of an independent error, length / noise^2, must be the same for both sample intervals.
+        # noise^2 / (correlation length) is the mean squared residual (see `NoiseEstimator`), which does not depend on
+        # the sample interval.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
     def linearize(self) -> tuple[ResidualSamples, RigidProjection]:
-        """Return the torque residual, and the projection of joint torques onto the rigid-body and friction model.
+        """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
-        The covariance must be current (see `with_current_covariance`). With the covariance for a larger noise, the
-        projection would remove too much of a torque.
+        The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
+        posterior covariance of the parameters must be current (see `with_current_covariance`): with the covariance for
+        a larger noise, this part would be too large.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -333,8 +341,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the weight of the estimate, if the weight of the prior mean is 1: a ratio of numbers of independent
-    # errors.
+    # `weight` is the weight of the estimated correlation time, if the weight of its prior mean is 1: a ratio of numbers
+    # of independent errors.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

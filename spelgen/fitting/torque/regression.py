@@ -56,7 +56,10 @@ def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std
 def _regression(
     model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray, friction: FrictionModel
 ) -> Regression:
-    """Return the ridge regression for a friction model; other arguments: see `best_regression`."""
+    """Return the ridge regression of the joint torques on inertial parameters, armatures, friction and offsets.
+
+    friction: friction model, with or without a friction state. model, blocks, torque_std: see `best_regression`.
+    """
     motors, reach = motors_of(model).numpy(), bristle_reach(model).values
 
     def columns(x: SampleBlock) -> np.ndarray:
@@ -68,7 +71,7 @@ def _regression(
     def products(x: SampleBlock) -> np.ndarray:
         """Return the Gram matrix (K + 1, K + 1) of the K columns of the regressor and the torque.
 
-        Both are first divided by `torque_std` per joint.
+        Columns and torque are first divided by `torque_std` per joint.
         """
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
         rows = (rows / torque_std[:, None]).reshape(-1, rows.shape[2])
@@ -81,21 +84,22 @@ def _regression(
     grams, total = (gram / np.outer(scale, scale) for gram in (grams, total))
 
     def solution(gram: np.ndarray, penalty: float) -> np.ndarray:
-        """Return (..., K + 1): the weights of the K scaled columns, then -1 as the weight of the torque.
+        """Return the vector (w, -1), (..., K + 1), with the ridge solution w of the K scaled columns of the regressor.
 
-        The quadratic form of a Gram matrix with this vector is the squared residual.
+        gram: (..., K + 1, K + 1), G = A^T A of A = [scaled columns, torque]. A (w, -1) is the residual, so the squared
+        residual is (w, -1)^T G (w, -1).
         """
         normal = gram[..., :-1, :-1] + penalty * np.eye(len(length))
         weights = np.linalg.solve(normal, gram[..., :-1, -1:])[..., 0]
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the sum of the squared residual of each block after a fit to all other blocks, (blocks,)."""
+        """Return the sum of the squared residual of each block, (blocks,), after a ridge fit to all other blocks."""
         weights = solution(total - grams, penalty)
         return np.asarray(np.einsum("bk,bkl,bl->b", weights, grams, weights))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # weights of the unscaled columns
+    parameters = (solution(total, penalty) / scale)[:-1]  # parameters: weights of the unscaled columns
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 
@@ -110,8 +114,10 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     """
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
-        relative = torch.linalg.solve(model.bodies.factors, body)  # C^-1 J, with the pseudo-inertia J
-        relative = torch.linalg.solve(model.bodies.factors, relative.mT)  # C^-1 J C^-T
+        # The pseudo-inertia of a body is C S C^T with the constant factor C, and its log-Cholesky parameters are the
+        # Cholesky factor of S. Here, `relative` becomes C^-1 body, then S = C^-1 body C^-T.
+        relative = torch.linalg.solve(model.bodies.factors, body)
+        relative = torch.linalg.solve(model.bodies.factors, relative.mT)
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])
     torque = torch.from_numpy(regression.torque(samples.columns)) @ inputs.mT

@@ -53,7 +53,8 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         yield _warning(
             "friction-compensated",
             "the measured torque decreases with velocity, as if the drive compensated friction: "
-            f"{joints} Nm s/rad (N s/m) are added; check the torques' signs and what the controller subtracts",
+            f"{joints} Nm s/rad (N s/m) are added; check the signs of the torques, and whether the controller "
+            "subtracts friction",
         )
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
@@ -105,7 +106,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # The correction is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
+    # The correction of the nMSE is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 

@@ -39,10 +39,10 @@ class SampleBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorqueSamples:
-    """Concatenated samples of all trajectories.
+    """Concatenated samples of all trajectories of a fit.
 
     Attributes:
-        columns: the samples.
+        columns: the T samples.
         original_count: number of samples before decimation and subsampling.
         interval: time between successive samples [s].
         recordings: (T,), index of the recording to which each sample belongs.
@@ -84,7 +84,7 @@ class TorqueSamples:
         """Return at most `max_count` samples: evenly spaced segments of `seconds` [s] each, concatenated."""
         size = self.segment_length(seconds)
         number = max(1, min(self.count, max_count) // size)
-        # A segment may span two recordings. This is rare, and negligible for means over segments.
+        # A segment may span two recordings. Such segments are rare, and negligible for means over segments.
         starts = torch.linspace(0, self.count - size, number).long()
         rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
         columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)

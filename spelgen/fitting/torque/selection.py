@@ -65,7 +65,10 @@ def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
 
 
 def _gap(correlation_length: float) -> int:
-    """Return the number of samples between fitted and held-out samples."""
+    """Return the number of omitted samples between fitted and held-out samples: `SELECTION.gap` correlation lengths.
+
+    correlation_length: number of samples per independent error.
+    """
     return round(SELECTION.gap * correlation_length)
 
 
@@ -86,7 +89,7 @@ def select_functions(
     recordings: torch.Tensor,
     torque_std: torch.Tensor,
 ) -> list[SelectedTerm]:
-    """Return the selected terms: at most one per joint, the best accepted candidate.
+    """Select single-joint residual terms by cross-validation: at most one per joint, the best accepted candidate.
 
     Args:
         model: model with residual terms.
@@ -142,14 +145,14 @@ def _best(
     Args:
         candidates: residual terms of one joint.
         torque_residual: (T, n) [Nm, N].
-        noise: (n,) [Nm, N].
+        noise: (n,) standard deviations of the torque noise [Nm, N].
         correlation_length: number of samples per independent error.
         recordings: (T,), index of the recording of each sample.
         limits: result of `max_torques` for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
-    # The second test is on halves: of all divisions, they have the largest distance in time between fitted and held-out
-    # samples.
+    # The second test of a candidate, a fit to the first half and its error on the last half, uses halves, since of all
+    # divisions they have the largest distance in time between fitted and held-out samples.
     first, last = split_halves(len(torque_residual), correlation_length)
     best: list[SelectedTerm | None] = [None, None]
     for candidate in candidates:
@@ -180,7 +183,10 @@ def _best(
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the other term if its held-out error is clearly smaller (`preference_ratio`), otherwise the first one."""
+    """Return the better one of two candidates of a joint.
+
+    This is `other` if its held-out error is clearly smaller (`preference_ratio`), otherwise `first`.
+    """
     # Candidates are tested in the order splines, friction factor, ripple. At similar errors splines are preferred to
     # ripple: both fit the torque of a linear spring, but only splines extrapolate it.
     if first is None or 1 - other.error_reduction <= SELECTION.preference_ratio * (1 - first.error_reduction):
@@ -197,8 +203,8 @@ def _blocks(count: int) -> list[slice]:
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield two masks (T,) per fold: the held-out samples, and the fitted samples.
 
-    recordings: (T,), index of the recording of each sample. gap: number of unused samples at both ends of a held-out
-    block of a single recording.
+    Several recordings are held out whole. A single recording is divided into blocks, and the `gap` samples before and
+    after a held-out block are in neither mask. recordings: (T,), index of the recording of each sample.
     """
     # Whole recordings are held out if possible: they differ in day, load and motion, so their errors differ more than
     # the errors of blocks of one recording.
@@ -241,7 +247,7 @@ def block_squares(values: torch.Tensor) -> torch.Tensor:
 def significant_reduction(
     before: torch.Tensor, after: torch.Tensor, standard_errors: float = SELECTION.standard_errors
 ) -> float | None:
-    """Return the relative reduction of squared errors, or None if it is not significant.
+    """Return the relative reduction of squared errors by a residual term, or None if it is not significant.
 
     A t test is applied to g = (before - after) / (before + after) of all blocks. g is between -1 and 1, so that no
     single block dominates the variance, for example one with large torques or with extrapolation. A negligible number
@@ -253,7 +259,8 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # If a term halves the squared error of one block and doubles the squared error of another, their g add up to zero.
+    # If a term halves the squared error of one block and doubles the squared error of another, the relative reductions
+    # g of these blocks add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:

@@ -73,7 +73,10 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
 
 
 def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[TorqueProblem, State]:
-    """Fit from a state with the least-squares noise at this state (see `with_least_squares_noise`)."""
+    """Fit from a state with the least-squares noise at this state (see `TorqueProblem.with_least_squares_noise`).
+
+    Return the problem with this noise, and the last state of the solver.
+    """
     problem = problem.with_least_squares_noise(state.x)
     state = initial_state(problem, state.x, steps=state.steps)
     return problem, problem.minimize(state, TUNING.initial_steps).state
@@ -86,8 +89,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     velocity, which friction cannot explain. Criteria for a joint:
 
     - The residual is regressed on velocity. The slope is negative and significant.
-    - Before this, both are regressed on position: in a motion that does not return to its first position, the torque
-      of a spring is correlated with velocity.
+    - Before this, residual and velocity are regressed on position: in a motion that does not return to its first
+      position, the torque of a spring is correlated with velocity.
     - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds between
       torque and motion causes a smaller negative slope.
 
@@ -126,9 +129,9 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of both fits decide (see `_rejected`). If they favour bristles at most joints, but not at a single one,
-    its residual must also be smaller without bristles in most parts of the log: the likelihood ratio of a single joint
-    is unreliable, since the errors of a motion are correlated.
+    likelihoods of the fits with and without bristles decide (see `_rejected`). If their ratio over all joints favours
+    bristles, a joint has rate-only friction only if its torque residual is also smaller without bristles in most parts
+    of the log: the likelihood ratio of a single joint is unreliable, since the errors of a motion are correlated.
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
@@ -173,7 +176,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
     effects = torch.stack(
         [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
-    )  # (n, effects), indices of the coefficients in x
+    )  # effects: (n, effects), indices of the coefficients in x
     plain = _without(estimate, effects.flatten())
     # 2 is the penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
@@ -183,9 +186,12 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return a refit in which some friction coefficients are negligible. indices: their indices in x."""
+    """Return a refit of all parameters without some friction coefficients; indices: their indices in x (K,).
+
+    The initial values and the prior means of these coefficients, which are logarithms, become `NEGLIGIBLE`.
+    """
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
-    # The prior mean is changed, too: otherwise the prior would restore the coefficients.
+    # The prior mean of the removed coefficients is changed, too: otherwise the prior would restore the coefficients.
     mean[indices] = x[indices] = NEGLIGIBLE
     problem = replace(problem, prior=replace(problem.prior, mean=mean))
     state = replace(estimate.state, x=x, residual=problem.residual(x))
@@ -198,8 +204,8 @@ def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> tor
     Each likelihood is computed with the noise that maximizes it. Positive values favour `estimate`.
     """
     samples = estimate.problem.jacobian.samples
-    # With the noise that maximizes each likelihood, the ratio depends only on the squared residuals and on the number
-    # of independent errors.
+    # With the noise that maximizes each likelihood, the likelihood ratio depends only on the squared residuals and on
+    # the number of independent errors.
     errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
     return errors * (other.state.residual / estimate.state.residual).log()
 
@@ -213,7 +219,8 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
-    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]  # (n, elements), indices in x
+    # fractions: (n, elements), indices in x
+    fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]
     block = fractions.unsqueeze(-1), fractions.unsqueeze(-2)
     prior: torch.Tensor = torch.linalg.inv(estimate.problem.prior.precision)[block]
     return prior.logdet() - estimate.covariance[block].logdet()
@@ -237,7 +244,7 @@ def fit_residual_terms(
 
     Single-joint terms are selected first, in passes. After each pass, the rigid-body parameters are refitted, so that
     further terms are selected on a better residual. Networks act on several joints and are selected last, on the
-    residual of the model with the selected single-joint terms.
+    residual of the model with the selected single-joint terms. Return the new estimate and the selected terms.
     """
     model = estimate.problem.jacobian.model
     if samples is not estimate.problem.jacobian.samples:
@@ -254,8 +261,8 @@ def fit_residual_terms(
         estimate = _refit(estimate, samples, selected).with_current_covariance()
     residual_samples = estimate.problem.jacobian.residual_samples(estimate.state.x)
     selected += select_networks(model, residual_samples, float(correlation_length.max()))
-    # Friction factors and networks are not eliminated by variable projection. Their fits and the rigid-body fit are
-    # therefore alternated.
+    # Friction factors and networks are not eliminated by variable projection. The fits of these terms and the
+    # rigid-body fit are therefore alternated.
     for _ in range(TUNING.alternations if selected else 0):
         estimate = _refit(estimate.with_current_covariance(), samples, selected)
     return estimate, selected
@@ -264,7 +271,7 @@ def fit_residual_terms(
 def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
-    """Refit friction factors, then rigid-body parameters and position-dependent torques together."""
+    """Refit friction factors, then rigid-body parameters and position-dependent torques; return the new estimate."""
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)

@@ -27,10 +27,11 @@ class TorqueTuning:
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
     correlation_time: float = 0.2
-    # [s] Correlation time of torque errors in comparisons of friction models. It is shorter because the models differ
-    # only near reversals of velocity.
+    # [s] Correlation time of torque errors in comparisons of friction models. It is shorter than `correlation_time`,
+    # because friction models differ only near reversals of velocity.
     reversal_correlation_time: float = 0.1
-    # [1] Weight of `correlation_time` in the estimated correlation time, as a number of independent errors.
+    # [1] Weight of the prior mean `correlation_time` in the estimated correlation time, as a number of independent
+    # errors.
     correlation_weight: float = 30.0
     # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
@@ -57,7 +58,8 @@ class TorqueTuning:
     iteration_steps: int = 5
     # [1] Levenberg-Marquardt steps end early if a step lowers the cost by less than this fraction.
     min_relative_decrease: float = 1e-4
-    # [1] Number of alternations between the fits of rigid bodies and of residual terms.
+    # [1] Number of alternations between the fits of rigid bodies and of residual terms, after the selection of the
+    # terms.
     alternations: int = 3
     # [1] Number of evenly spaced samples in the stages before the selection of residual terms; the final fit uses all.
     initial_samples: int = 2**10
@@ -69,12 +71,14 @@ class TorqueTuning:
     residual_samples: int = 2**14
     # [1] Lower bound of the noise, as a fraction of the torque's standard deviation, for samples without noise.
     min_noise: float = 1e-4
-    # [1] Number of standard deviations by which the slope of a friction compensation must differ from zero.
+    # [1] Friction compensation of a drive is detected only if the slope of the torque residual over velocity differs
+    # from zero by this number of its standard deviations.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of a friction compensation, as a fraction of the torque's standard deviation.
-    # Delays of milliseconds have a similar but smaller effect.
+    # [1] Smallest standard deviation of the torque of a friction compensation, as a fraction of the torque's standard
+    # deviation. Delays of milliseconds have a similar but smaller effect.
     min_compensation: float = 0.05
-    # [1] Number of samples per block: a block and its derivatives need some 100 MB of memory for seven joints.
+    # [1] Number of samples per block in computations of the torque Jacobian: a block and its derivatives need some 100
+    # MB of memory for seven joints.
     block: int = 2**13
     # [B] Memory of the regressors, which limits the number of samples to 70,000 for six joints. Larger logs are
     # subsampled.
@@ -89,8 +93,8 @@ class TorqueTuning:
     undetermined_gain: float = 0.1
     # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
     unsupported: float = 0.5
-    # [1] The URDF is implausible if exp(prior standard deviation of the logarithms of its masses) exceeds this factor.
-    # The fit then tries friction compensation at all joints, and a warning is issued.
+    # [1] The masses of a URDF are implausible if exp(estimated prior standard deviation of the logarithms of the
+    # masses) exceeds this factor. The fit then tries friction compensation at all joints, and a warning is issued.
     wrong_urdf: float = 5.0
     # [1] A warning names joints whose RMS torque residual divided by the RMS inertial torque exceeds this value: their
     # predicted motion is unreliable.
@@ -121,7 +125,7 @@ class ResidualTuning:
     # freedom.
     standard_errors: float = 2.82
     # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
-    # `standard_errors`, since their motion may repeat the errors of the model.
+    # `standard_errors`, since the motion of few recordings may repeat the errors of the model.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
@@ -129,7 +133,7 @@ class ResidualTuning:
     # [1] Smallest standard deviation of a joint's gravity torque for which a spring at this joint is plausible, as a
     # fraction of the standard deviation of the joint's torque.
     min_load_fraction: float = 0.1
-    # [1] Smallest error reduction of a residual term.
+    # [1] Smallest relative reduction of the held-out squared torque residual by a residual term that is selected.
     min_reduction: float = 1e-3
     # [1] A candidate replaces the best previous candidate of a joint only if its held-out squared residual is below
     # this fraction of the previous one. The order of the candidates is splines, friction factor, ripple.
