@@ -214,7 +214,7 @@ def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
     clean = compared(problem)
     codes = " ".join(fault.code for fit in clean[:1] for fault in fit.hypothesis.faults)
     yield Row(*log, "clean", f"false: {codes}" if clean else "silent")
-    rng = np.random.default_rng([number, 1])
+    rng = np.random.default_rng([number, 1, *urdf.stem.encode()])
     for fault in range(faults):
         kind = KINDS[(fault + number * faults) % len(KINDS)]
         right = draw_fault(arm.chain, kind, rng)
