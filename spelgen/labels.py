@@ -120,11 +120,11 @@ def counted(count: int, noun: str) -> str:
 
 
 def share(fraction: float, reference: str = "") -> str:
-    """Return a fraction of ``reference`` as text, such as ``5 % of the motion`` or ``13.6 times the motion``."""
-    # A fraction above 1 is written as a factor, which is easier to understand than a percentage: 2.5 times the motion,
-    # not 250 %.
+    """Return a fraction of ``reference`` as text: ``5 %``, ``5 % of the motion``, ``13.6 times the motion``."""
+    # A fraction above 1 of a reference is written as a factor, which is easier to understand than a percentage: 2.5
+    # times the motion, not 250 %.
     if fraction > 1:
-        return f"{fraction:.3g} times {reference}".rstrip()
+        return f"{fraction:.3g} times {reference}" if reference else f"{100 * fraction:.0f} %"
     # Percentages close to 100 % have four digits, so that 99.96 % is not rounded to 100 %.
     digits = 4 if 0.99 <= fraction < 1 else 3
     percent = f"{100 * fraction:.{digits}g} %"

@@ -583,3 +583,12 @@ def test_rpy_is_roll_then_pitch_then_yaw_about_fixed_axes():
     roll, pitch, yaw = 0.3, -0.7, 1.1
     expected = rotation_about(z, yaw) @ rotation_about(y, pitch) @ rotation_about(x, roll)
     assert np.allclose(rotation_from_rpy((roll, pitch, yaw)), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(("axis", "warned"), [("0 0 1", True), ("0 1 0", False)])
+def test_an_opened_linkage_turns_in_one_plane_and_a_head_does_not(robot, axis, warned):
+    torso, pan = joint("lift", "base", "torso", "prismatic"), joint("pan", "torso", "neck")
+    arm = [joint("a1", "torso", "l1"), joint("a2", "l1", "l2", axis="1 0 0"), joint("a3", "l2", "l3")]
+    made = make_arm(robot(torso, pan, joint("tilt", "neck", "head", axis=axis), *arm))
+    assert names(made) == ["lift", "a1", "a2", "a3"]
+    assert ("dependent-joints" in [x.code for x in made.diagnostics]) == warned

@@ -125,7 +125,7 @@ def test_a_joint_that_is_logged_in_coarse_steps_is_not_assessed():
 def test_errors_above_the_whole_are_times_of_it():
     assert share(0.0123, "the motion") == "1.23 % of the motion"
     assert share(13.6, "the motion") == "13.6 times the motion"
-    assert (share(0.9964), share(1.0), share(2.0)) == ("99.64 %", "100 %", "2 times")
+    assert (share(0.9964), share(1.0), share(2.0)) == ("99.64 %", "100 %", "200 %")
 
 
 def test_recommended_recordings_follow_from_the_coverage_of_logs():

@@ -464,13 +464,11 @@ def test_the_ur10e_urdf_has_its_known_torque_error(shared):
     assert np.mean(list(found.nmse.values())) == pytest.approx(0.67, abs=0.005)
 
 
-def test_logs_that_never_move_have_no_torque_errors(robots):
-    t, still = np.arange(300) / 100, np.zeros((300, 2))
-    found = evaluate(
-        build(robots / "two_link.urdf", "phnode", width=4, depth=1), Trajectory(t, still, still, still)
-    )
-    assert found.torque == {}
-    assert found.horizons
+@pytest.mark.parametrize("samples", [2, 300])
+def test_logs_without_motion_are_refused(robots, samples):
+    t, noise = np.arange(samples) / 100, 1e-3 * np.random.default_rng(0).standard_normal((samples, 2))
+    with pytest.raises(LogError, match="no motion: all joints stay within"):
+        evaluate(build(robots / "two_link.urdf", "closed-form"), Trajectory(t, noise, noise, noise))
 
 
 def test_a_diverged_predictor_keeps_its_column():

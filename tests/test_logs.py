@@ -177,7 +177,8 @@ BAD = {
     "missing-column": (
         "t,q_a,qd_a,torque_a\n0,0,0,0\n",
         "{}: missing column tau_a: got only the columns t, q_a, qd_a, torque_a, "
-        "expected t, q_<joint>, qd_<joint>, tau_<joint>; rename the column 'torque_a' to 'tau_a'?",
+        "expected t, q_<joint>, qd_<joint>, tau_<joint>; rename the columns, or write their names under 'logs' in "
+        "the robot's YAML: `spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them",
     ),
     "repeated-column": (
         "t,q_a,q_a,qd_a,tau_a\n0,0,0,0,0\n",
@@ -194,9 +195,9 @@ BAD = {
     ),
     "time-back": (
         HEADER + "0,0,0,0\n0.1,1,0,0\n0.2,2,0,0\n0.05,3,0,0\n",
-        "{}:5: row 4, column t: got t = 0.05 s after 0.2 s (1 such steps, this is the first), "
+        "{}:5: row 4, column t: got t = 0.05 s after 0.2 s (1 such step, this is the first), "
         "expected increasing times; "
-        "sort the rows, drop repeats, or split recordings by a column 'trajectory'",
+        "number the recordings, in Python: log['trajectory'] = (log['t'].diff() < 0).cumsum()",
     ),
 }
 
@@ -610,3 +611,22 @@ def test_reversed_columns_are_cut_into_windows():
     q = np.sin(t[:, None] * [1.0, 1.7])[:, ::-1]
     windows = cut_windows([Trajectory(t, q, q, q, "x")], 5, measured=False)
     assert windows.q.shape == (116, 5, 2)
+
+
+@pytest.mark.parametrize("origin", [0.0, 1.7e9])
+def test_files_that_continue_each_other_are_one_recording(tmp_path, origin):
+    """A logger that starts a new file each second, with times of one clock, and two recordings of their own."""
+    t = np.arange(500) / 100
+    whole = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], t[:, None], "whole")
+    for k in range(5):
+        piece = whole[100 * k : 100 * k + 100]
+        values = np.column_stack([piece.t, piece.q, piece.qd, piece.tau]).tolist()
+        rows = [f"{origin + x:.4f},{q!r},{qd!r},{tau!r}\n" for x, q, qd, tau in values]
+        csv(tmp_path / f"{4 - k}.csv", HEADER + "".join(rows))
+    csv(tmp_path / "later.csv", HEADER + "".join(f"{origin + 6 + k / 100},0,0,0\n" for k in range(50)))
+    csv(tmp_path / "elsewhere.csv", HEADER + "".join(f"{origin + 5 + k / 100},9,0,0\n" for k in range(50)))
+    joined, *others = read_logs(tmp_path, ("a",))
+    assert [len(x) for x in (joined, *others)] == [500, 50, 50]
+    np.testing.assert_allclose(joined.t - joined.t[0], t, atol=1e-6)
+    np.testing.assert_array_equal(joined.q, whole.q)
+    assert "the files up to 0.csv continue it" in joined.remarks[0]

@@ -67,12 +67,59 @@ def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path
     assert text.count("gain: 1.0 # Nm per A at the joint, the gear included: write its value") == 4
 
 
+@pytest.mark.parametrize("derivative", ["D_Theta_{}", "theta_dot_{}", "dtheta{}"])
+def test_derivatives_of_positions_are_velocities(scara, tmp_path, derivative):
+    """Names of public simulations and of MATLAB; accelerations are not used."""
+    names = ["Theta_{}", derivative, "Torque_{}", "DD_Theta_{}", "theta_ddot_{}"]
+    head = ["Time", *(name.format(k) for name in names for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU, -Q, -Q])
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found)
+    assert "differentiated" not in text
+
+
+def test_rows_without_times_get_a_rate_to_write(scara, tmp_path):
+    head = [f"{x}{k}" for x in ("q", "tau") for k in range(4)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([Q, TAU]))
+    text = suggest_mapping(path, scara.chain.joint_names).text
+    assert "sample_rate: # [Hz] of the rows" in text
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(LogError, match="or 'sample_rate: HZ' if there is none"):
+        read_logs(path, scara, tmp_path / "map.yaml")
+    (tmp_path / "map.yaml").write_text(text.replace("sample_rate:", "sample_rate: 125"))
+    (found,) = read_logs(path, scara, tmp_path / "map.yaml")
+    np.testing.assert_allclose(found.t, T, atol=1e-12)
+    np.testing.assert_array_equal(found.tau, TAU)
+
+
+def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_path):
+    head = ["t", *(f"- {name}_effort" for name in scara.chain.joint_names)]
+    path = written(tmp_path / "effort.csv", head, np.column_stack([T, TAU]))
+    with pytest.raises(
+        LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"
+    ):
+        suggest_mapping(path, scara.chain.joint_names)
+    with pytest.raises(LogError, match="or write their names under 'logs'"):  # and not: rename effort to q
+        read_logs(path, scara)
+
+
+def test_a_row_per_joint_is_to_be_pivoted(scara, tmp_path):
+    rows = [[t, joint, 0.0, 0.0] for t in T for joint in scara.chain.joint_names]
+    path = written(tmp_path / "long.csv", ["time", "name", "position", "effort"], rows)
+    with pytest.raises(
+        LogError, match=r"joints in the column 'name', expected all joints in each row; .*columns='name'\)"
+    ):
+        suggest_mapping(path, scara.chain.joint_names)
+
+
 PUBLIC = {
     "libfranka": ("time", "q[{}]", "dq[{}]", "tau_J[{}]", "O_T_EE[{}] q_d[{}] dq_d[{}] tau_J_d[{}] dtau_J[{}] "
                   "tau_ext_hat_filtered[{}]"),
     "RTDE": ("timestamp", "actual_q_{}", "actual_qd_{}", "actual_moment_{}", "target_q_{} target_moment_{} "
              "actual_current_{} actual_TCP_speed_{} actual_TCP_force_{}"),
     "set and actual": ("t", "q_act_{}", "dq_act_{}", "trq_{}", "q_set_{} I_act_{} friction_trq_{} gravity_trq_{}"),
+    "Doosan": ("time", "actual_joint_position_{}", "actual_joint_velocity_{}", "actual_joint_torque_{}",
+               "raw_joint_torque_{} actual_motor_torque_{}"),
     "FRI": ("sec nsec", "measured_position_{}", "measured_speed_{}", "measured_torque_{}", "ipo_position_{} "
             "commanded_position_{} commanded_torque_{} external_torque_{}"),
     "Kortex": ("ts", "actuators[{}].position", "actuators[{}].velocity", "actuators[{}].torque", ""
@@ -133,7 +180,7 @@ def test_columns_of_another_arm_are_listed(scara, tmp_path):
     rows = np.column_stack([T, 0 * Q, 0 * QD, 0 * TAU, Q, QD, TAU])
     found, text = suggested(written(tmp_path / "log.csv", ["t", *sides], rows), scara)
     require_same(found)
-    assert f"# not used: left_pos_{names[0]}, left_pos_{names[1]}" in text
+    assert f"# not used for q: left_pos_{names[0]} ... left_pos_{names[-1]}\n" in text
 
 
 @pytest.mark.parametrize(("unit", "name"), [("%", "percent"), ("‰", "permille"), ("A", "A")])
@@ -147,7 +194,16 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
     assert f'"tau": "{name}"' in text and text.count(f"gain: 1.0 # Nm per {name}") == 4
 
 
-@pytest.mark.parametrize("words", [("Zeit", "Winkel", "Geschwindigkeit", "Drehmoment"), ("t", "θ", "ω", "τ")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("Zeit", "Winkel", "Geschwindigkeit", "Drehmoment"),
+        ("t", "θ", "ω", "τ"),
+        ("temps", "position", "vitesse", "couple"),
+        ("时间", "位置", "速度", "力矩"),
+        ("time", "qpos", "qvel", "qfrc_actuator"),
+    ],
+)
 def test_words_of_other_languages(scara, tmp_path, words):
     head = [words[0], *(f"{word} {k}" for word in words[1:] for k in range(4))]
     rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]

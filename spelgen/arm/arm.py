@@ -317,16 +317,19 @@ def _dependent_remarks(
     URDF has no closed loops: a linkage is opened. Its two joints then have the same parent body and parallel axes, and
     one of them is not in the chain.
     """
-    behind: set[str] = set()
+    roots: dict[str, str] = {}  # first link of the branch to which a link belongs
+    branches: dict[str, list[UrdfJoint]] = {}
     for joint in locked:
-        if joint.moves or joint.parent in behind:
-            behind.add(joint.child)
-        turns = joint.type in ("revolute", "continuous") and joint.mimic is None
-        # A joint that another locked joint carries is not part of a parallelogram linkage of the arm.
-        if joint.parent in behind or not turns:
+        if joint.moves or joint.parent in roots:
+            root = roots[joint.child] = roots.get(joint.parent, joint.child)
+            branches.setdefault(root, []).extend([joint] * joint.moves)
+    for branch in branches.values():
+        joint, axes = branch[0], [_axis(placement.frames[x.parent], x) for x in branch]
+        if joint.mimic is not None or any(x.type not in ("revolute", "continuous") for x in branch):
             continue
-        beside = _parallel_beside(placement.frames[joint.parent], moved, joint)
-        if beside:
+        beside = _parallel_beside(placement.frames[joint.parent], moved, axes[0])
+        # All joints of a linkage turn in one plane; a head pans and tilts.
+        if beside and all(_are_parallel(axes[0], axis) for axis in axes):
             message = (
                 f"turns parallel to {beside[0]!r} beside it, and has no <mimic>: "
                 "if a linkage couples the two, add one; locked at 0 until then"
@@ -334,19 +337,19 @@ def _dependent_remarks(
             yield Diagnostic("warning", "dependent-joints", f"joint {joint.name!r}", joint.line, message)
 
 
-def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], joint: UrdfJoint) -> list[str]:
-    """Return the names of the revolute joints with the same parent body as ``joint`` and an axis parallel to it.
-
-    frame: frame of the parent link of ``joint``.
-    """
+def _axis(frame: Frame, joint: UrdfJoint) -> np.ndarray:
+    """Return the direction (3,) of a joint's axis in the frame of its parent body. frame: frame of its parent link."""
     rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
-    axis = rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis)
-    parallel = []
-    for body in (moving.body for moving in moved):
-        # Axis of the moving joint in the frame of the parent body: the z axis of the joint's frame.
-        beside = np.array(body.rotation, dtype=float)[:, 2]
-        # [rad] Axes count as parallel up to an angle of 0.01, since axes in URDFs are rounded.
-        is_parallel = np.linalg.norm(np.cross(axis, beside)) < 1e-2
-        if body.parent == frame.body >= 0 and body.joint_type != "prismatic" and is_parallel:
-            parallel.append(body.name)
-    return parallel
+    return np.asarray(rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis))
+
+
+def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
+    """Return True if the angle between two directions (3,) is below 0.01 rad: axes in URDFs are rounded."""
+    return bool(np.linalg.norm(np.cross(axis, other)) < 1e-2)
+
+
+def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
+    """Return the names of the revolute joints on the body of ``frame`` with an axis parallel to ``axis`` (3,)."""
+    # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
+    beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
+    return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from spelgen.arm.configured_arm import Arm
@@ -153,6 +154,10 @@ def _evaluate_torques(
         truth: true arm of simulated logs, or the path of its URDF; None if unknown.
         progress: function called before each horizon, see `evaluate`.
     """
+    # All errors are divided by the motion or by the variation of the torque, so at rest they would only show noise.
+    if max(float(np.ptp(trajectory.q, axis=0).max()) for trajectory in logs) < TUNING.smallest_motion:
+        got = f"no motion: all joints stay within {TUNING.smallest_motion:g} rad or m"
+        raise LogError(got, expected="test logs in which joints move")
     samples = dynamics_samples(logs, pauses=True, preprocessing=used, reach=tested.reach)
     samples = [sample for sample in samples if len(sample.q)]
     # A rollout needs at least two samples: the initial state and one prediction.

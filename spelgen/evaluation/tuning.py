@@ -36,6 +36,8 @@ class EvaluationTuning:
     # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
     # assessment recommends rough simulation.
     rough_prediction: float = 0.3
+    # [rad, m] Logs in which no joint has a larger range of positions contain no motion.
+    smallest_motion: float = 0.01
     # [1] Motion below this fraction of a joint's largest velocity is called slow.
     slow: float = 0.1
     # [1] If the RMS torque residuals of slow and of fast motion differ by more than this factor, the assessment names

@@ -7,7 +7,7 @@ body. https://mcap.dev/spec
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -140,12 +140,17 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name is the end of exactly one logged name ("j1" and "left_j1").
+    the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
+    logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
     """
-    endings = {name: [x for x in logged if x.endswith(name)] for name in names}
-    if any(len(full_names) != 1 for full_names in endings.values()):
-        return "map the joints' names under 'logs'"
-    return mapping_line({"joints": {name: {"name": full_name} for name, (full_name,) in endings.items()}})
+    words = [name.split("_") for name in names]
+    shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
+    for ends in (names, ["_".join(of_name[shared:]) for of_name in words]):
+        found = [[x for x in logged if x.endswith(end)] for end in ends]
+        if all(len(full_names) == 1 for full_names in found):
+            lines = {name: {"name": full_name} for name, (full_name,) in zip(names, found, strict=True)}
+            return mapping_line({"joints": lines})
+    return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

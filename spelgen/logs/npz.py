@@ -39,11 +39,11 @@ class NpzArrays:
             # bytes.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
-                got, expected = (
+                got, limit = (
                     f"{self._bytes / 1e9:.3g} GB of arrays",
                     f"at most {TUNING.npz_bytes / 1e9:.3g} GB",
                 )
-                raise self.error(member.filename, got, expected, "write larger logs as Parquet")
+                raise self.error(member.filename, got, limit, "write larger logs as Parquet")
             with self._archive.open(member) as data:
                 try:
                     self._arrays[name] = np.lib.format.read_array(data, allow_pickle=False)

@@ -351,9 +351,10 @@ def _backward_times(rows: Rows) -> LogError:
     """Return the error about the first row whose time is not later than the time of the row before."""
     t, backward = rows.t, np.flatnonzero(np.diff(rows.t) < TUNING.shortest_step)
     k = backward[0]
-    got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({backward.size} such steps, this is the first)"
-    do = "sort the rows, drop repeats, or split recordings by a column 'trajectory'"
-    return rows.layout.row_error(got, rows.numbers[k + 1], rows.layout.columns[0], "increasing times", do)
+    got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({counted(backward.size, 'such step')}, this is the first)"
+    clock = rows.layout.columns[0]
+    do = f"number the recordings, in Python: log['trajectory'] = (log['{clock}'].diff() < 0).cumsum()"
+    return rows.layout.row_error(got, rows.numbers[k + 1], clock, "increasing times", do)
 
 
 def _pieces(t: np.ndarray) -> Iterator[slice]:

@@ -1,6 +1,8 @@
 """Collector of recordings from log tables: all rows, or evenly spread segments if the rows exceed a limit of memory."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import groupby
 from math import inf
 from typing import NamedTuple
 
@@ -27,6 +29,7 @@ class Segment(NamedTuple):
         layout: columns of the file, with their units.
         rows: (T,) row numbers in the file, from 0.
         values: (T, C) values of the C columns of the layout, in SI units.
+        start: time [s] of the logged clock from which the times of the values are counted.
     """
 
     recording: int
@@ -34,6 +37,20 @@ class Segment(NamedTuple):
     layout: Layout
     rows: np.ndarray
     values: np.ndarray
+    start: float
+
+    def continued_by(self, other: "Segment") -> bool:
+        """Return True if another file continues this one: times and positions proceed by a step that is no gap."""
+        mine, others, count = self.layout, other.layout, 1 + len(self.layout.joints)
+        if mine.file == others.file or (mine.columns, mine.mapping) != (others.columns, others.mapping):
+            return False
+        if mine.mapping.sample_rate or len(self.values) < 2:
+            return False
+        steps = np.diff(self.values[:, :count], axis=0)
+        step = other.values[0, :count] - self.values[-1, :count]
+        step[0] += other.start - self.start
+        largest = np.array([np.median(steps[:, 0]), *np.abs(steps[:, 1:]).max(axis=0)])
+        return bool(min(step[0], *steps[:, 0]) > 0 and (np.abs(step) <= TUNING.gap * largest).all())
 
 
 class LogSegments:
@@ -58,7 +75,7 @@ class LogSegments:
         """
         if not table.num_rows:
             raise LogError("no rows", file=layout.file, expected="at least one window of samples")
-        start, pieces = clock_start(table, layout), []
+        (first, start), pieces = clock_start(table, layout), []
         for name, rows in _recordings(layout, table):
             count = 1 if self._kept_bytes == inf else -(-len(rows) // TUNING.segment_samples)
             pieces += [(self._recordings, name, piece) for piece in np.array_split(rows, count)]
@@ -66,25 +83,25 @@ class LogSegments:
         pieces = self._selected(pieces, 8 * len(layout.columns))
         # A table that is kept completely is converted in one call. This is faster than one call per recording, and an
         # error can state the number of faulty rows in the whole table.
-        data = values_in_si(table, layout, start, range(table.num_rows)) if self.every == 1 else None
+        data = values_in_si(table, layout, first, range(table.num_rows)) if self.every == 1 else None
         for recording, name, rows in pieces:
-            values = values_in_si(_rows_of(table, rows), layout, start, rows) if data is None else data[rows]
-            self._segments.append(Segment(recording, name, layout, rows, values))
+            values = values_in_si(_rows_of(table, rows), layout, first, rows) if data is None else data[rows]
+            self._segments.append(Segment(recording, name, layout, rows, values, start))
             self._bytes += values.nbytes
         self.rows += table.num_rows
 
     def trajectories(self) -> Iterator[Trajectory | LogError]:
         """Yield the trajectory of each recording, or a LogError if its times are wrong.
 
-        The collector is empty afterwards.
+        Files that continue each other are one recording. The collector is empty afterwards.
         """
+        recordings = [list(group) for _, group in groupby(self._segments, key=lambda x: x.recording)]
+        self._segments = []
+        recordings = _joined_files(recordings)[::-1]
         # Segments are removed from the collector before they are joined to a recording, so that there is no second copy
         # of all rows.
-        segments, self._segments = self._segments[::-1], []
-        while segments:
-            group = [segments.pop()]
-            while segments and segments[-1].recording == group[0].recording:
-                group.append(segments.pop())
+        while recordings:
+            group = recordings.pop()
             first = group[0]
             values = np.concatenate([x.values for x in group]) if len(group) > 1 else first.values
             rows = np.concatenate([x.rows for x in group])
@@ -109,6 +126,24 @@ class LogSegments:
             self.every *= 2
             self._segments = self._segments[::2]
             self._bytes = sum(x.values.nbytes for x in self._segments)
+
+
+def _joined_files(recordings: list[list[Segment]]) -> list[list[Segment]]:
+    """Return the segments of each recording, in the given order, after files that continue each other were joined."""
+    joined: list[list[Segment]] = []
+    for group in sorted(recordings, key=lambda x: x[0].start + x[0].values[0, 0]):
+        if not joined or not joined[-1][-1].continued_by(group[0]):
+            joined.append([])
+        first = joined[-1][0] if joined[-1] else group[0]
+        for segment in group:
+            segment.values[:, 0] += segment.start - first.start
+            joined[-1].append(segment._replace(start=first.start))
+    for group in joined:
+        layout, last = group[0].layout, group[-1].layout.file
+        if last != layout.file:
+            remark = f"the files up to {last.name} continue it by time and position, and were joined"
+            group[0] = group[0]._replace(layout=replace(layout, remarks=(*layout.remarks, remark)))
+    return sorted(joined, key=lambda x: x[0].recording)
 
 
 def _rows_of(table: pa.Table, rows: np.ndarray) -> pa.Table:

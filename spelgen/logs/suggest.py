@@ -7,7 +7,8 @@ SI units: the checks of logs then detect degrees, for example, and state the set
 import difflib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
+from spelgen.labels import listed
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import SERVO_ADVICE, names_joint, reading
@@ -24,11 +26,14 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 WORDS = {
-    "t": {"t", "ts", "time", "times", "timestamp", "stamp", "clock", "secs", "seconds", "millis", "zeit"},
-    "q": {"q", "pos", "position", "positions", "angle", "angles", "theta", "θ", "winkel"},
-    "qd": {"qd", "dq", "vel", "velocity", "velocities", "speed", "speeds", "omega", "ω", "geschwindigkeit"},
-    "tau": {"tau", "τ", "torque", "torques", "trq", "tq", "effort", "efforts", "force", "forces", "current", "currents",
-            "curr", "cur", "moment", "drehmoment", "strom", "load"},
+    quantity: frozenset(words.split())
+    for quantity, words in (
+        ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
+        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
+        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
+        ("tau", "tau τ torque torques trq tq tor effort efforts force forces qfrc moment load current currents curr "
+                "cur drehmoment strom couple par 力矩 扭矩"),
+    )
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
 COMMANDED = {
@@ -38,6 +43,7 @@ COMMANDED = {
 # Words in names of columns that mark signals other than measured joint signals.
 NOT_MEASURED = COMMANDED | {
     "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
+    "dd", "ddot",
 }  # fmt: skip
 MEASURED = {"actual", "act", "measured", "meas", "present", "feedback", "fb", "ist"}
 # For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
@@ -53,6 +59,12 @@ UNITS = {
 }  # fmt: skip
 # Letters in column names that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
+# Names of derivatives of positions, such as `d_theta` and `q_dot`.
+DERIVATIVE = r"(?<![^\W\d_])(?:d[ _]?(?:theta|pos|q)|(?:theta|pos|q)[ _]?dot)(?![^\W\d_])"
+JOINING = (
+    "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
+    "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
+)
 CURRENT = {"current", "currents", "curr", "cur", "strom"}
 
 
@@ -75,7 +87,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
-    read, if it has no column of times, or commanded positions and no torques without `commands`.
+    read, if all its columns are of positions or of torques only, or of commanded positions and no torques without
+    `commands`.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -87,59 +100,86 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
     with reading(file):
         table = log_format.read(file, (), LogMapping())[0].read(None)
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    for name in (x for x in texts if set(joints) <= set(table[x].to_pylist())):
+        do = f"in Python: wide = log.pivot(index=TIME, columns={name!r}); wide.columns = map('_'.join, wide.columns)"
+        raise LogError(f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do)
+    return _table_mapping(table, file, joints, commands)
+
+
+def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
+    """Return the draft for a table of the log `file`; see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
-    if not columns_of["t"]:
-        got = f"only the columns {shortened([x.name for x in columns], TUNING.listed)}"
-        do = "name it so, or write 'columns' and 'sample_rate' under 'logs' if there is none and rows are evenly spaced"
-        raise LogError(got, file=file, expected="one of times, called t or time", do=do)
     # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
-    # Of several columns of times, the stamp in a message header is used: the others may be times of receipt and not of
-    # measurement. Without a stamp, the column whose name has the fewest words is used.
-    clock = min(columns_of.pop("t"), key=lambda x: ("header" not in x.words, len(x.words)))
-    stamp = re.sub(r"secs?$", "", clock.name)
-    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
-    if stamp != clock.name and nanoseconds:
-        clock = ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
+    clock = _clock(columns_of.pop("t"), columns)
     # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
     # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {
-        quantity: _by_joint(_of_one_signal(named, joints), joints, order)
-        for quantity, named in columns_of.items()
-    }
+    by_joint = {x: _by_joint(_of_one_signal(named, joints), joints, order) for x, named in columns_of.items()}
+    used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
+    absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
+    if absent and used.issuperset(x.name for x in columns):
+        expected = "all signals of a recording in one file"
+        raise LogError(
+            f"no {listed(absent)} beside its other columns", file=file, expected=expected, do=JOINING
+        )
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(clock, by_joint, table)
+    rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
-        f"columns: {{t: {json.dumps(clock.name)}}}",
+        f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
         f"units: {json.dumps(units)}",
     ]
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
-    lines.append("joints:")
-    for joint in joints:
-        entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
-        lines += [f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}"]
-        if units.get("tau") in CURRENTS:
-            at_joint = "at the joint, the gear included: write its value"
-            lines.append(f"    gain: 1.0 # Nm per {units['tau']} {at_joint}")
-        if units.get("q") == "counts":
-            lines.append("    counts_per_turn: 4096 # of the joint, the gear included: write its value")
-    used = {column.name for named in by_joint.values() for column in named.values()}
-    unused = [x.name for quantity in by_joint for x in columns_of[quantity] if x.name not in used]
-    # A comment of the draft lists unused columns, for example of a gripper, or of another arm with similar names.
-    if unused:
-        lines.append(f"# not used: {shortened(unused, TUNING.listed)}")
+    lines += ["joints:", *chain.from_iterable(_joint_lines(joint, by_joint, units) for joint in joints)]
+    # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
+    unused = {x: _ranges([y.name for y in columns_of[x] if y.name not in used]) for x in by_joint}
+    lines += [
+        f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
+    ]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
+
+
+def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> ColumnName:
+    """Return the column of times, or "sec + nsec" of two columns; with the name "" if there is none."""
+    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
+    # measurement. Without a stamp, the name with the fewest words is used.
+    none = ColumnName("", set(), "s")
+    clock = min(clocks, key=lambda x: ("header" not in x.words, len(x.words)), default=none)
+    stamp = re.sub(r"secs?$", "", clock.name)
+    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
+    if stamp != clock.name and nanoseconds:
+        return ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
+    return clock
+
+
+def _joint_lines(
+    joint: str, by_joint: Mapping[str, Mapping[str, ColumnName]], units: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield the lines of a joint: its columns, and the conversions whose values the user must write."""
+    entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
+    yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
+    if units.get("tau") in CURRENTS:
+        yield f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
+    if units.get("q") == "counts":
+        yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
+
+
+def _ranges(names: Sequence[str]) -> list[str]:
+    """Return the names, in which runs such as x1, x2, x3, that differ only in a number, are `x1 ... x3`."""
+    groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
+    return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
 
 
 def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Suggestion:
@@ -177,7 +217,8 @@ def _column_name(name: str, words: set[str]) -> ColumnName:
     if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, unit = last.groups()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
-    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", separated.lower())), unit.strip().lower())
+    text = re.sub(DERIVATIVE, "qd", separated.lower())
+    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", text)), unit.strip().lower())
 
 
 def _by_quantity(
@@ -278,8 +319,9 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequ
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. Torques are preferred to currents, names with a word such as "actual" to
-    others, and names with few words to longer ones: `tau_J` to `tau_hat_filtered`.
+    differ only in the words of the joint. Torques are preferred to currents, torques of joints to torques of motors,
+    names with a word such as "actual" to others, and names with few words to longer ones: `tau_J` to
+    `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each joint.
     """
@@ -288,7 +330,7 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequ
         joint = max((x for x in joints if names_joint(column.name, x)), key=len, default="")
         signals.setdefault(frozenset(column.words - _column_name(joint, set()).words), []).append(column)
     complete = [
-        ((bool(words & CURRENT), not words & MEASURED, len(words)), named)
+        ((bool(words & CURRENT), "motor" in words, not words & MEASURED, len(words)), named)
         for words, named in signals.items()
         if len(named) >= len(joints)
     ]

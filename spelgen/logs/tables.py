@@ -1,10 +1,9 @@
 """Common result of all readers of logs: a table, and its layout, which states the column of each quantity and joint."""
 
-import difflib
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, starmap
@@ -105,7 +104,8 @@ class LogFormat(NamedTuple):
 
 
 SERVO_ADVICE = (
-    "write 'input: position' into the YAML beside the URDF if these are commands of position servos"
+    "write 'input: position' into the YAML beside the URDF if these are commands of position servos, "
+    "or map them as tau"
 )
 
 
@@ -216,14 +216,13 @@ def missing_columns(
     elif set(missing) <= set(of_quantity.get("qd", ())):
         do = "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged"
     else:
-        others = [x for x in columns if x not in (mapping.columns.t, mapping.columns.trajectory)]
-        do = _renaming(missing[0], others, of_quantity, [mapping.log_name(joint) for joint in joints])
+        used = {mapping.columns.t, mapping.columns.trajectory, *chain(*of_quantity.values())}
+        do = _naming([x for x in columns if x not in used])
     element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
-    got, expected = (
-        f"only the columns {shortened(list(columns), TUNING.listed)}",
-        ", ".join([mapping.columns.t, *patterns]),
+    got = f"only the columns {shortened(list(columns), TUNING.listed)}"
+    return LogError(
+        got, file=file, element=element, expected=", ".join([mapping.columns.t, *patterns]), do=do
     )
-    return LogError(got, file=file, element=element, expected=expected, do=do)
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
@@ -233,28 +232,11 @@ def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequenc
     return torques.isdisjoint(columns) and all(x in columns or list_element(x, columns) for x in commands)
 
 
-def _renaming(
-    name: str, columns: Collection[str], of_quantity: Mapping[str, Sequence[str]], joints: Sequence[str]
-) -> str:
-    """Return the advice, for an error message, about the missing column `name`: rename a similar column, or map names.
-
-    A similar column is an unused column whose name contains the same joint. of_quantity: names of the expected columns
-    per quantity. joints: the joints' names in the log.
-    """
-    named = [
-        joint for names in of_quantity.values() for x, joint in zip(names, joints, strict=True) if x == name
-    ]
+def _naming(unused: Collection[str]) -> str:
+    """Return the advice, for an error message, about missing columns. unused: columns that were not expected."""
     # Columns of accelerations are not proposed as torques: files of the command `excite` contain accelerations, too.
-    unused = [
-        x
-        for x in columns
-        if x not in chain(*of_quantity.values()) and not x.lower().startswith(("qdd", "acc"))
-    ]
-    if not unused:
+    if all(x.lower().startswith(("qdd", "acc")) for x in unused):
         return "log them, torques for example as efforts of ROS, or as motor currents with a 'gain'"
-    for close in difflib.get_close_matches(name, unused, n=5):
-        if names_joint(close, "".join(named[-1:])):
-            return f"rename the column {close!r} to {name!r}?"
     return (
         "rename the columns, or write their names under 'logs' in the robot's YAML: "
         "`spelgen logs LOGS --robot ROBOT.urdf --suggest FILE` drafts them"

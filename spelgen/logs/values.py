@@ -90,18 +90,21 @@ def is_split(data: np.ndarray) -> bool:
     return TUNING.jump_window <= rarest <= len(data) / 2
 
 
-def clock_start(table: pa.Table, layout: Layout) -> pa.Scalar | None:
-    """Return the first logged time, to be subtracted from all, if the times are dates; None for relative times."""
+def clock_start(table: pa.Table, layout: Layout) -> tuple[pa.Scalar | None, float]:
+    """Return the first logged time, as logged and [s], to be subtracted from all times, if the times are dates.
+
+    The result is (None, 0.0) for relative times.
+    """
     first_row = table.slice(0, 1)
-    times, _ = _clock(first_row, layout)
+    times, unit = _clock(first_row, layout)
     is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
-        return None
+        return None, 0.0
     # Times since 1970 would have too few digits as floating-point numbers, so their start is subtracted. A clock that
     # starts with the recording has a first time below 1e8 in any unit.
     first = times[0].as_py()
     is_date = first is not None and (is_stamp or 1e8 < abs(first) < np.inf)
-    return times[0] if is_date else None
+    return (times[0], first * unit) if is_date else (None, 0.0)
 
 
 def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:

@@ -11,6 +11,8 @@ from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
 # [1] An inertia tensor is reported if its smallest principal moment is negative, or if the moments violate the triangle
 # inequality, by more than this fraction of the largest moment: printed tensors are rounded.
 _ROUNDING = 1e-6
+# [kg m2] Smaller principal moments are rounding errors of 0: the moments of a milligram of 1 mm are 1e-12.
+_SMALLEST_INERTIA = 1e-15
 
 _LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
@@ -41,7 +43,7 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
     where, line, tensor = f"link {link!r} inertial", inertial.line, inertial.tensor
     if inertial.mass < 0:
         yield "negative-mass", where, line, f"the mass is {inertial.mass:g} kg"
-    if not any(tensor):
+    if max(map(abs, tensor)) < _SMALLEST_INERTIA:
         if inertial.mass > 0:
             yield "zero-inertia", where, line, "the inertia tensor is zero: a point mass"
         return
@@ -67,7 +69,8 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
     # Triangle inequality: each principal moment is the sum of two of three nonnegative second moments of mass, so that
     # none exceeds the sum of the other two.
     elif smallest + middle < largest * (1 - _ROUNDING):
-        inequality = f"{smallest:.3g} + {middle:.3g} < {largest:.3g}"
+        sides = [x if abs(x) > _ROUNDING * largest else 0.0 for x in (smallest, middle)]
+        inequality = f"{sides[0]:.3g} + {sides[1]:.3g} < {largest:.3g}"
         message = f"no mass distribution has these principal moments: {inequality}"
         yield "triangle-inequality", where, line, message
 
