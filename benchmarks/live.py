@@ -145,8 +145,8 @@ def without_load(case: Case) -> None:
     )
 
 
-def synthetic_loads(case: Case, draws: int = 3) -> None:
-    scale = SMALL.get(case.name, 1.0)
+def synthetic_loads(case: Case) -> None:
+    scale, draws = SMALL.get(case.name, 1.0), max(3, 12 // len(case.tests))
     print(
         "\nSynthetic payloads: reported, error rms [kg], errors within the interval, median time of the first report\n"
     )

@@ -214,6 +214,10 @@ class CompiledEstimator:
         """Load a state that `saved` returned; return False if the estimator refuses its bytes."""
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
+    def compensate_external(self, wanted: bool) -> None:
+        """Set the option, which is after the rate of alarms and the torque limits."""
+        ctypes.c_int.from_buffer(self.state, 8 * (1 + self.n)).value = wanted
+
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:
         """Return the joint torques (n,) of the model at a state, for the acceleration qdd (n,)."""
         tau = np.zeros(self.n, self.dtype)

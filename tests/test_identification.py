@@ -15,7 +15,7 @@ from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.errors import LogError, SettingsError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
-from spelgen.identification.identify import least_squares
+from spelgen.identification.identify import identify, least_squares
 from spelgen.identification.least_squares import correlation_time
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -131,6 +131,19 @@ def test_a_known_arm_is_found_exactly(robots):
     assert found.condition < 1e4
     fresh, _ = excited(arm, seed=1, friction=friction)
     np.testing.assert_allclose(found.torque(fresh.q, fresh.qd, fresh.qdd), fresh.tau, atol=1e-4)
+
+
+def test_negative_viscous_friction_is_a_warning(robots):
+    """A coefficient of -3 at joint 2 (-2.9 after the low-pass filter), and of 3 at the other joints."""
+    arm = load_arm(robots / "rpr.urdf")
+    log, _ = excited(arm.chain, noise=0.01)
+    tau = log.tau - 6.0 * log.qd * [0.0, 1.0, 0.0]
+    found = identify(arm, Trajectory(0.01 * np.arange(len(tau)), log.q, log.qd, tau))
+    (warning,) = [x.message for x in found.diagnostics if x.code == "friction-compensated"]
+    names = arm.chain.joint_names
+    assert (
+        f"viscous friction {names[1]} -2.9" in warning and names[0] not in warning and names[2] not in warning
+    )
 
 
 def test_standard_deviations_are_those_of_repeated_experiments(robots):

@@ -74,14 +74,15 @@ def test_c_equals_python_along_recordings(name, tmp_path):
         pytest.skip(f"no logs of {name}: the folder of recordings is not here")
     model, arm = randomised(urdf), load_arm(urdf)
     log = segments(files, arm)
-    # airbot has no delay here, since its log odds amplify rounding errors most
-    levels = levels_of(model, log, 0.02, delay=0.0 if name == "airbot" else 0.015)
+    levels = levels_of(model, log, 0.02, delay=0.015)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels, *([PLAIN] if name != "ur10e" else []))
     found = compiled.run(log.t, log.q, log.qd, log.tau)
-    require_equal(found, estimator.replay(log), 1e-9)
+    require_equal(found, estimator.replay(log), 1e-11)
     at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
-    for ahead in (0.0, 0.1, 1.0):
+    for ahead, external in ((0.0, False), (0.1, False), (0.1, True), (1.0, True)):
+        estimator.compensate_external = external
+        compiled.compensate_external(external)
         expected = estimator.torque(*at, ahead)
         np.testing.assert_allclose(compiled.torque(*at, ahead), expected, atol=1e-9 * np.abs(expected).max())
 
@@ -100,7 +101,7 @@ def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
     found = compiled.run(*log)
     fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)
     estimator = Estimator(fit, levels=levels)
-    require_equal(found, list(estimator.steps(*log)), 1e-9)
+    require_equal(found, list(estimator.steps(*log)), 1e-10)
     assert compiled.refused() == estimator.intake.counts
     assert min(estimator.intake.counts.values()) > 0
 
@@ -114,7 +115,7 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
     levels = levels_of(model, log, 0.02)
     found = CompiledEstimator(model, load_arm(urdf), levels, PLAIN).run(log.t, log.q, log.qd, log.tau)
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path / "run").path), levels=levels)
-    require_equal(found, estimator.replay(log), 1e-9)
+    require_equal(found, estimator.replay(log), 1e-11)
 
 
 def motion_of(model, seconds: float) -> Trajectory:
@@ -187,19 +188,25 @@ def test_float_is_close_to_double():
     np.testing.assert_array_equal(double.status, single.status)
 
 
-def test_a_saved_state_is_restored_and_a_damaged_one_is_not():
+def test_a_state_saved_during_a_contact_is_restored_and_a_damaged_one_is_not():
     model = moved_model("six_dof", "closed-form", 0.1).double()
     log = motion_of(model, 10.0)
     from exported_runs import arm_of
 
     compiled = CompiledEstimator(model, arm_of("six_dof"), levels_of(model, log), PLAIN)
-    before = compiled.run(log.t, log.q, log.qd, log.tau)
+    push = 0.5 * np.abs(log.tau).max(axis=0) * (np.arange(model.n) == 1)
+    tau = log.tau - push * (log.t > log.t[-1] - 0.5)[:, None]
+    before = compiled.run(log.t, log.q, log.qd, tau)
+    assert (np.abs(before.external_torque) > before.threshold)[-40:, 1].all()
     state = compiled.saved()
     compiled.start()
     assert compiled.restore(state)
-    # after `restore`, times may start at zero again, and all estimates are kept
-    after = compiled.run(log.t[:50], log.q[:50], log.qd[:50], log.tau[:50])
+    # after `restore`, times may start at zero again, and all estimates are kept; the contact lasts for another second
+    tau = log.tau - push * (log.t < log.t[0] + 1.0)[:, None]
+    after = compiled.run(log.t[:300], log.q[:300], log.qd[:300], tau[:300])
     assert (after.refusal == 0).all()
+    touched = np.abs(after.external_torque) > after.threshold
+    assert touched[50:100, 1].all() and not touched[:, [0, 2, 3, 4, 5]].any() and not touched[120:].any()
     np.testing.assert_array_equal(after.status[0], before.status[-1])
     np.testing.assert_array_equal(after.friction_scale[0], before.friction_scale[-1])
     for position in (0, 9, 200, len(state) - 1):

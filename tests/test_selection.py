@@ -321,6 +321,15 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
     assert torque_problem.TorqueProblem.cost(problem, x, squares) == pytest.approx(expected)
 
 
+def test_noise_is_at_most_the_largest_error():
+    """A joint with a residual of 5 Nm and a largest error of 2 Nm; the other joint has its own residual of 1 Nm."""
+    columns = torch.tensor([[5.0, 5.0], [10.0, 10.0], [2.0, 2.0]]).double()
+    estimator = torque_problem.NoiseEstimator(50, *columns)
+    noise = estimator.estimate(50 * torch.tensor([25.0, 1.0]).double())
+    torch.testing.assert_close(noise, 5**0.5 * torch.tensor([2.0, 1.0]).double())
+    torch.testing.assert_close(estimator.upper_bound(), 5**0.5 * estimator.max_error)
+
+
 def test_noise_is_estimated_per_joint():
     """The noise of a joint is proportional to the root of its own squared residual."""
     estimator = torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double())

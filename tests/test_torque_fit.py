@@ -287,11 +287,18 @@ def test_a_fit_is_as_good_as_least_squares_for_any_urdf(emitted, robots, tmp_pat
     assert ("fit-from-regression" in codes) == replaced and "behind-regression" not in codes
 
 
-def test_torques_that_no_bodies_have_are_named(emitted):
+def test_torques_that_no_bodies_have_are_named(emitted, monkeypatch):
     """Torques that no physically consistent bodies have, such as negative inertia at one joint, are named.
 
-    Ridge regression explains these torques.
+    Ridge regression explains these torques. Its held-out error bounds the noise of the second and third fit.
     """
+    bounds, staged_fit = [], torque_fit._staged_fit
+
+    def recorded_fit(*arguments, max_error=None):
+        bounds.append(max_error)
+        return staged_fit(*arguments, **({} if max_error is None else {"max_error": max_error}))
+
+    monkeypatch.setattr(torque_fit, "_staged_fit", recorded_fit)
     model = emitted["rpr"][0].Model()
     log = recorded(emitted["rpr"][0].Model(), 10.0, 0.02, seed=1)
     tau = log.tau.copy()
@@ -301,6 +308,31 @@ def test_torques_that_no_bodies_have_are_named(emitted):
     assert solution.comparison.behind
     notes = {note.code: note.message for note in torque_notes(model, TorqueSamples.of(logs), solution)}
     assert f"(nMSE {solution.comparison.regression:.2g})" in notes["behind-regression"]
+    samples = TorqueSamples.of(logs, TorqueTuning.decimation)
+    held_out = best_regression(model, contiguous_blocks(samples), tau.std(axis=0)).held_out
+    assert bounds[0] is None and len(bounds) == 3
+    for bound in bounds[1:]:
+        expected = tau.std(axis=0) * np.sqrt(held_out.sum(axis=0) / samples.count)
+        np.testing.assert_allclose(bound, expected, rtol=0.02)
+
+
+def test_a_fit_that_the_logs_do_not_support_is_discarded(emitted):
+    """A quarter of a second of torques as noisy as they vary: the model keeps the URDF's values, a warning says so."""
+    module = emitted["rpr"][0]
+    found = drawn(module, seed=2, deviation=0.1)
+    before = found.bodies.raw.detach().clone()
+    logs = [recorded(module.Model(), 0.25, 1.0, seed=1)]
+    solution = fit_torque(found, logs)
+    assert solution.comparison.discarded > solution.comparison.fit
+    assert solution.steps == 0 and torch.equal(found.bodies.raw, before)
+    # the covariance is the prior's: an inertial parameter has the default standard deviation
+    bodies = ParameterVector(found).mask("bodies")
+    torch.testing.assert_close(
+        solution.covariance[bodies][:, bodies], GaussianPrior().bodies ** 2 * torch.eye(30).double()
+    )
+    samples = TorqueSamples.of(logs, TorqueTuning.decimation)
+    notes = {note.code: note.message for note in torque_notes(found, samples, solution)}
+    assert f"(nMSE {solution.comparison.discarded:.2g})" in notes["fit-discarded"]
 
 
 def test_held_out_errors_of_ridge_regression_are_those_of_refits(emitted, robots):
@@ -328,9 +360,9 @@ def test_held_out_errors_of_ridge_regression_are_those_of_refits(emitted, robots
             stacked = np.vstack([rows[kept].reshape(-1, rows.shape[2]), ridge])
             known = np.append(target[kept].ravel(), np.zeros(rows.shape[2]))
             parameters = np.linalg.lstsq(stacked, known, rcond=None)[0]
-            errors.append(np.square(rows[block] @ parameters - target[block]).sum())
+            errors.append(np.square(rows[block] @ parameters - target[block]).sum(axis=0))
         of_penalties.append(errors)
-    expected = min(of_penalties, key=sum)
+    expected = min(of_penalties, key=np.sum)
     np.testing.assert_allclose(found.held_out, expected, rtol=1e-4)
 
 

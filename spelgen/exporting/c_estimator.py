@@ -75,14 +75,9 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     # Pose and Jacobian of the last body's frame relative to the root frame. The Jacobian has three rows of linear
     # velocity, then three rows of angular velocity.
     pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
-    rotation, weight = pose[:3, :3], load[0] * constant(model.arm.gravity)
     load_momentum, load_gradient = payload.momentum(qd)
-    moment = ca.cross(rotation @ load[1:4], constant(model.arm.gravity))
-    # The payload's gravity torque is computed as J^T (weight, moment of the weight). The Newton-Euler algorithm would
-    # have larger rounding errors: the estimator's log odds of "no payload" would differ 40 times as much from the
-    # Python estimator.
-    load_gradient += jacobian.T @ ca.vertcat(weight, moment)
-    at_point = jacobian[:3, :] - ca.skew(rotation @ levels.point) @ jacobian[3:, :]
+    load_gradient -= payload.torque(still, still)
+    at_point = jacobian[:3, :] - ca.skew(pose[:3, :3] @ levels.point) @ jacobian[3:, :]
     outputs = {
         "momentum_balance": (
             momentum, torque, (first + second) / 2, ca.fabs(first - second) / 2,

@@ -21,6 +21,7 @@ from scipy.special import stdtrit
 from spelgen.arm.actuation import Drives
 from spelgen.dynamics.body_regressor import chain_regressor
 from spelgen.dynamics.friction import FrictionModel
+from spelgen.errors import Diagnostic
 from spelgen.identification.least_squares import block_products, normal_solution, varying
 from spelgen.identification.motion_samples import MotionSamples
 from spelgen.identification.tuning import HINTS, TUNING
@@ -47,6 +48,15 @@ class Coupling:
     def pair(self) -> list[int]:
         """Indices of the coupled joints: the joint that the motor drives, and the joint that also rotates the motor."""
         return [self.joint, self.moved_by]
+
+
+def friction_compensated(values: str) -> Diagnostic:
+    """Return the warning about drives that compensate friction. values: friction or compensation per joint."""
+    message = (
+        f"the measured torque decreases with velocity, as if the drive compensated friction: {values}; check the "
+        "signs of the torques, and whether the controller subtracts friction"
+    )
+    return Diagnostic("warning", "friction-compensated", "logs", None, message)
 
 
 def drive_rows(

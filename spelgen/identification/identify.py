@@ -15,6 +15,7 @@ from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import body_chain, regressor
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.base_parameters import base_parameters
+from spelgen.identification.drive_hints import friction_compensated
 from spelgen.identification.identification import Identification, LeastSquares
 from spelgen.identification.intervals import BLOCKS, jackknife_covariance, student_scale
 from spelgen.identification.least_squares import Solution, deviations, solve
@@ -79,7 +80,16 @@ def identify_by(
         notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
     # logged motor torques are converted to joint torques, which the regressor describes
     equations = _Equations(arm.chain, [replace(x, tau=x.tau @ drives.inputs.T) for x in samples], drives)
-    return [replace(equations.solved(x), diagnostics=tuple(notes), torque_delay=delay) for x in methods]
+    solved = map(equations.solved, methods)
+    return [replace(x, diagnostics=(*notes, *_negative_friction(x)), torque_delay=delay) for x in solved]
+
+
+def _negative_friction(result: Identification) -> Iterator[Diagnostic]:
+    """Yield a warning if the 95 % interval of a viscous friction coefficient is below zero."""
+    names = {f"viscous{k}": name for k, name in enumerate(result.arm.joint_names, start=1)}
+    negative = [f"{names[x.name]} {x.text}" for x in result.intervals if x.name in names and x.high < 0]
+    if negative:
+        yield friction_compensated(f"viscous friction {', '.join(negative)} Nm s/rad (N s/m)")
 
 
 def least_squares(

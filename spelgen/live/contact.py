@@ -51,7 +51,8 @@ class ContactObserver:
         """Discard the filter states, for example after a gap; the next sample initialises the filters."""
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
-        self.touched = np.zeros(len(self.levels.speed), dtype=bool)
+        self.baseline = np.zeros_like(self.levels.speed)
+        self.touched = np.zeros(len(self.baseline), dtype=bool)
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Update the observer with a sample; return the external torques and the detected contact.

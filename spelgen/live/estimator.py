@@ -63,6 +63,7 @@ class Estimator:
         *,
         levels: NoiseLevels | None = None,
         alarms_per_minute: float = TUNING.alarms_per_minute,
+        compensate_external: bool = False,
     ) -> None:
         """Initialize the estimator for the model of a fit.
 
@@ -71,6 +72,8 @@ class Estimator:
             levels: noise levels; by default the noise levels in the run folder, or noise levels that are estimated from
                 the logs of the fit.
             alarms_per_minute: rate of false contact alarms [1/min].
+            compensate_external: whether `torque` compensates all external torques, also of contacts and of loads that
+                are not reported yet.
 
         Raises RunError for a model without rigid bodies or with position servos, and if there are no noise levels.
         """
@@ -78,7 +81,7 @@ class Estimator:
         with torch.no_grad():
             self.prepared = self.model.prepare()
         self.levels = noise_levels(fit) if levels is None else levels
-        self.alarms_per_minute = alarms_per_minute
+        self.alarms_per_minute, self.compensate_external = alarms_per_minute, compensate_external
         self.reach = bristle_reach(self.model)
         self.reset()
 
@@ -187,7 +190,8 @@ class Estimator:
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
             ahead: time from the last sample to the motion [s]. The estimated disturbance decays during this time; if
-                it is longer than 0.3 s, the disturbance is omitted.
+                it is longer than 0.3 s, the disturbance is omitted. With `compensate_external`, the disturbance is the
+                torque residual of the momentum observer.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy(self.intake.bounds.mean(axis=0))
@@ -204,6 +208,10 @@ class Estimator:
             if ahead <= TUNING.disturbance_ahead:
                 decay = np.exp(-ahead / self.levels.drift.time_constant)
             a, d = self.drift.x.T
+            if self.compensate_external:
+                # The bound is for measured torques with errors: commands are not larger than torques of the arm.
+                limit, d = self.levels.effort, self.observer.baseline - self.contact.external_torque
+                d = np.clip(d, -limit, limit)
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)
             return (torque + self.model.input_torque(cache, load + drift)).numpy()
 

@@ -155,7 +155,12 @@ class LoadFilter:
         if block.moving[joint]:
             self.surprise += residual**2 / expected
             self.x += gain * residual
-            self.P -= np.outer(gain, covariance)
+            # The product is exactly symmetric. An asymmetry of P from rounding errors would grow with each update.
+            product = np.outer(covariance, covariance) / variance
+            recurring = TUNING.recurring * (noise + self.disturbance[joint])
+            kept = recurring / max(float(row[:10] @ self.P[:10, :10] @ row[:10]), recurring)
+            self.P -= product
+            self.P[:10, :10] += kept * product[:10, :10]
         else:
             # The Kalman gains of all states except d are set to zero. Such a gain is not optimal, so the covariance is
             # updated by Joseph's form, which is valid for any gain.
@@ -229,10 +234,10 @@ class JointFilters:
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
         # The Kalman gain K is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's
-        # form of the update of the covariance P is P_ij - K_i c_j if state i is used, else P_ij - c_i K_j, with c the
+        # form of the update of the covariance P is P_ij - c_i c_j / variance if state i or j is used, with c the
         # covariance of state and measurement.
-        product = gain[..., None] * covariance[..., None, :]
-        self.P = self.P - np.where(used[..., None], product, product.swapaxes(-1, -2))
+        product = covariance[..., None] * covariance[..., None, :] / variance[..., None, None]
+        self.P = self.P - np.where(used[..., None] | used[..., None, :], product, 0.0)
         return residual, expected
 
 

@@ -2,6 +2,7 @@
 
 initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
     -> comparison with ridge regression on held-out blocks of samples -> another fit if the regression is better
+    -> comparison with the model before the fit, which is kept if the fit is not better
 
 The stages before the residual terms use a subset of the samples, residual terms are selected on a larger subset, and
 the final fit uses all samples.
@@ -18,10 +19,12 @@ from scipy.special import stdtrit
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
+from spelgen.fitting.levenberg_marquardt import initial_state
 from spelgen.fitting.torque.covariance import Jackknife, contiguous_blocks, jackknife
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.parameters import joint_torque, limit_friction, set_initial_gains
 from spelgen.fitting.torque.problem import (
+    UNBOUNDED,
     TorqueEstimate,
     TorqueProblem,
     refine,
@@ -41,8 +44,8 @@ from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
 
-class RegressionComparison(NamedTuple):
-    """Held-out errors of a torque fit and of ridge regression, see `Regression`.
+class FitComparison(NamedTuple):
+    """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
     Attributes:
         fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
@@ -50,12 +53,15 @@ class RegressionComparison(NamedTuple):
         behind: True if the regression is significantly better than the fit.
         replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
             initial guess is the regression; otherwise None.
+        discarded: the error of the fit, if the logs do not support a fit and the model before the fit has no larger
+            error; otherwise None. `fit` is then the error of the model before the fit, which is the result.
     """
 
     fit: float
     regression: float
     behind: bool
     replaced: float | None
+    discarded: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +79,7 @@ class TorqueSolution:
         correlation_time: correlation time of the torque errors, (n,) [s].
         held_out_nmse: mean squared error of held-out blocks divided by the variance of the torque, (n,).
         selected_terms: the selected residual terms.
-        comparison: comparison with ridge regression; None if `fit_torque` fitted only the group of parameters `adapt`.
+        comparison: comparison with simpler methods; None if `fit_torque` fitted only the group of parameters `adapt`.
     """
 
     rms_residual: np.ndarray
@@ -86,7 +92,7 @@ class TorqueSolution:
     correlation_time: np.ndarray
     held_out_nmse: np.ndarray
     selected_terms: tuple[SelectedTerm, ...]
-    comparison: RegressionComparison | None
+    comparison: FitComparison | None
 
 
 class _StagedFit(NamedTuple):
@@ -130,10 +136,9 @@ def fit_torque(
         subset = samples.subsampled(TUNING.initial_samples)
         set_initial_gains(model, subset, prior.gains)
         limit_friction(model, subset.columns)
-    initial = copy.deepcopy(model.state_dict())
-    fitted, comparison = _staged_fit(model, samples, prior, adapt), None
-    if adapt is None:
-        fitted, comparison = _not_behind_regression(model, samples, prior, fitted, initial)
+        fitted, comparison = _compared_fit(model, samples, prior)
+    else:
+        fitted, comparison = _staged_fit(model, samples, prior, adapt), None
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
@@ -155,11 +160,18 @@ def fit_torque(
 
 
 def _staged_fit(
-    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, adapt: Adaptation | None
+    model: ArmModel,
+    samples: TorqueSamples,
+    prior: GaussianPrior,
+    adapt: Adaptation | None = None,
+    max_error: torch.Tensor = UNBOUNDED,
 ) -> _StagedFit:
-    """Run all stages of a torque fit and the jackknife; the prior mean is the model's current parameters."""
-    subset = samples.subsampled(TUNING.initial_samples)
-    estimate, selected = _run_stages(TorqueProblem.of(TorqueJacobian(model, subset), prior, adapt), samples)
+    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
+
+    max_error: (n,), see `TorqueProblem`.
+    """
+    jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
+    estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)
     problem = estimate.problem
     problem.jacobian.rigid.write(estimate.state.x)
     errors = jackknife(estimate)
@@ -168,25 +180,24 @@ def _staged_fit(
     return _StagedFit(estimate, errors, selected, held_out, copy.deepcopy(model.state_dict()))
 
 
-def _not_behind_regression(
-    model: ArmModel,
-    samples: TorqueSamples,
-    prior: GaussianPrior,
-    fitted: _StagedFit,
-    initial: dict[str, torch.Tensor],
-) -> tuple[_StagedFit, RegressionComparison]:
-    """Return ``fitted``, or a second fit if ridge regression predicts held-out torques significantly better.
+def _compared_fit(
+    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior
+) -> tuple[_StagedFit, FitComparison]:
+    """Fit all parameters, and fit again if ridge regression predicts held-out torques significantly better.
 
-    The second fit has the result of the regression as its initial guess. The second fit is returned only if its
-    held-out error is below the error of ``fitted``. The parameters of the returned fit are written to the model.
-    initial: state_dict of the model before the fit.
+    The second fit bounds the torque noise by the held-out error of the regression. If the regression is still better, a
+    third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
+    returned. If its error is above `TUNING.unsupported`, and not below the error of the model before the fit, the model
+    before the fit is returned. The returned parameters are written to the model.
     """
-    blocks = contiguous_blocks(samples)
-    regression = best_regression(model, blocks, joint_torque(model, samples.columns).std(dim=0).numpy())
+    initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
+    torque_std = joint_torque(model, samples.columns).std(dim=0)
+    regression = best_regression(model, blocks, torque_std.numpy())
+    squares = torch.from_numpy(regression.held_out)
     # The squared lower bound of the noise is added to the held-out errors of the fit and of the regression, so that
     # smaller differences are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
-    other = torch.from_numpy(regression.held_out) + negligible
+    other = squares.sum(dim=1) + negligible
 
     def behind(fit: _StagedFit) -> bool:
         """Return True if the regression has a significantly smaller held-out error than `fit`.
@@ -206,15 +217,41 @@ def _not_behind_regression(
         """
         return float(held_out.sum()) / samples.count / model.n
 
-    best, replaced = fitted, None
-    if behind(fitted):
+    best, replaced, discarded = _staged_fit(model, samples, prior), None, None
+    if behind(best):
+        max_error = torque_std * (squares.sum(dim=0) / samples.count).sqrt()
+        model.load_state_dict(initial)
+        bounded = _staged_fit(model, samples, prior, max_error=max_error)
+        best = min(best, bounded, key=lambda fit: float(fit.held_out.sum()))
+    if behind(best):
         model.load_state_dict(initial)
         start_at(model, samples.subsampled(TUNING.initial_samples), regression)
-        restarted = _staged_fit(model, samples, prior, None)
-        if restarted.held_out.sum() < fitted.held_out.sum():
-            best, replaced = restarted, nmse(fitted.held_out)
-        model.load_state_dict(best.parameters)
-    return best, RegressionComparison(nmse(best.held_out), nmse(other), behind(best), replaced)
+        restarted = _staged_fit(model, samples, prior, max_error=max_error)
+        if restarted.held_out.sum() < best.held_out.sum():
+            best, replaced = restarted, nmse(best.held_out)
+    # A fit that is supported by its data is kept even if the URDF is exact: it has the smaller intervals.
+    if nmse(best.held_out) > TUNING.unsupported:
+        model.load_state_dict(initial)
+        unfitted = _unfitted(model, samples, prior)
+        if unfitted.held_out.sum() <= best.held_out.sum():
+            best, discarded = unfitted, nmse(best.held_out)
+    model.load_state_dict(best.parameters)
+    return best, FitComparison(nmse(best.held_out), nmse(other), behind(best), replaced, discarded)
+
+
+def _unfitted(model: ArmModel, samples: TorqueSamples, prior: GaussianPrior) -> _StagedFit:
+    """Return the current parameters of a model as an estimate with the covariance of the prior."""
+    problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
+    state, free = initial_state(problem, problem.prior.mean), problem.free
+    covariance = problem.of_all_parameters(torch.linalg.inv(problem.prior.precision[free][:, free]))
+    residual = problem.jacobian.residual_samples(state.x).torque_residual
+    sizes = [block.count for block in contiguous_blocks(samples)]
+    squares = torch.stack([block.square().sum(dim=0) for block in residual.split(sizes)])
+    held_out = (squares / problem.noise_estimator.torque_std.square()).sum(dim=1)
+    estimate = TorqueEstimate(problem, state, covariance)
+    return _StagedFit(
+        estimate, Jackknife(covariance, squares), (), held_out, copy.deepcopy(model.state_dict())
+    )
 
 
 def _run_stages(

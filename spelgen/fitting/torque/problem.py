@@ -38,6 +38,8 @@ from spelgen.fitting.torque.tuning import TUNING
 from spelgen.identification.least_squares import correlation_time
 from spelgen.settings.fits import Adaptation, GaussianPrior
 
+UNBOUNDED = torch.tensor(torch.inf).double()
+"""Bound of the torque errors of a fit that is not compared with a simpler method [Nm, N]."""
 State = SolverState[torch.Tensor]
 """State of the solver: parameters x (K,), and as `residual` the squared torque residual per joint, (n,) [Nm^2, N^2]."""
 
@@ -48,21 +50,25 @@ class NoiseEstimator:
 
     s^2 is the mean squared residual times the correlation length. The sum over all samples of residual^2 / s^2 is then
     the number of independent errors instead of the number of samples. correlation_length: (n,), number of correlated
-    samples that count as one independent error. torque_std: (n,) [Nm, N], standard deviation of the torque.
+    samples that count as one independent error. torque_std: (n,) [Nm, N], standard deviation of the torque. max_error:
+    (n,) [Nm, N], largest root mean square torque error.
     """
 
     count: int
     correlation_length: torch.Tensor
     torque_std: torch.Tensor
+    max_error: torch.Tensor = UNBOUNDED
 
     @classmethod
-    def of(cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor) -> NoiseEstimator:
+    def of(
+        cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor = UNBOUNDED
+    ) -> NoiseEstimator:
         """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
         # torque.
         torque_std = torch.maximum(jacobian.torque_std, 1e-3 * jacobian.torque_std.max())
-        return cls(jacobian.samples.count, correlation_length, torque_std)
+        return cls(jacobian.samples.count, correlation_length, torque_std, max_error)
 
     @property
     def errors(self) -> torch.Tensor:
@@ -70,13 +76,13 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] of a model that predicts a constant torque: an upper bound of the noise."""
-        return self.torque_std * self.correlation_length.sqrt()
+        """Return the largest noise (n,) [Nm, N], at most the noise of a model that predicts a constant torque."""
+        return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for a squared residual; its lower bound is a fraction of `torque_std`.
+        """Return the noise (n,) [Nm, N] for a squared residual, between a fraction of `torque_std` and `max_error`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
@@ -86,7 +92,7 @@ class NoiseEstimator:
         # The degrees of freedom (independent errors minus parameters) are at least one. They could be negative
         # otherwise, since `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
         fraction = (self.errors - effective_parameters).clamp(min=1.0) / self.errors
-        rms = (squared_residual / self.count / fraction).sqrt()
+        rms = torch.minimum((squared_residual / self.count / fraction).sqrt(), self.max_error)
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
@@ -109,6 +115,9 @@ class TorqueProblem:
         adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
         compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
         correlation_time: (n,) [s], correlation time of the torque errors.
+        max_error: (n,) [Nm, N], upper bound of the root mean square torque error, for example the held-out error of
+            ridge regression. Without a bound, a joint that is fitted badly has a large noise and therefore a small
+            weight, which keeps its fit bad.
     """
 
     jacobian: TorqueJacobian
@@ -117,10 +126,15 @@ class TorqueProblem:
     adapt: Adaptation | None
     compensated: torch.Tensor
     correlation_time: torch.Tensor
+    max_error: torch.Tensor = UNBOUNDED
 
     @classmethod
     def of(
-        cls, jacobian: TorqueJacobian, widths: GaussianPrior, adapt: Adaptation | None = None
+        cls,
+        jacobian: TorqueJacobian,
+        widths: GaussianPrior,
+        adapt: Adaptation | None = None,
+        max_error: torch.Tensor = UNBOUNDED,
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
@@ -128,10 +142,10 @@ class TorqueProblem:
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
-        noise = NoiseEstimator.of(jacobian, correlation_time).upper_bound()
+        noise = NoiseEstimator.of(jacobian, correlation_time, max_error).upper_bound()
         prior = ParameterPrior.of(rigid, widths)
         compensated = rigid.initial[rigid.compensation] != 0
-        return cls(jacobian, noise, prior, adapt, compensated, correlation_time)
+        return cls(jacobian, noise, prior, adapt, compensated, correlation_time, max_error)
 
     @cached_property
     def free(self) -> torch.Tensor:
@@ -141,7 +155,7 @@ class TorqueProblem:
     @cached_property
     def noise_estimator(self) -> NoiseEstimator:
         """Estimator of the torque noise for the samples of the Jacobian."""
-        return NoiseEstimator.of(self.jacobian, self.correlation_time)
+        return NoiseEstimator.of(self.jacobian, self.correlation_time, self.max_error)
 
     @property
     def correlation_length(self) -> torch.Tensor:

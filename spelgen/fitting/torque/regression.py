@@ -29,8 +29,8 @@ DEFAULT_BODY = (1.0, 0.1, 0.0, 0.1, 0.02, 0.0, -0.01, 0.03, 0.0, 0.02)
 class Regression(NamedTuple):
     """Result of ridge regression with the penalty that has the smallest held-out error.
 
-    held_out: (blocks,) [1], sum over joints and samples of the squared torque residual of each block after a fit to all
-    other blocks, divided by the variance of the joint's torque. torque: function that predicts the joint torques (T, n)
+    held_out: (blocks, n) [1], sum over samples of the squared torque residual of each block after a fit to all other
+    blocks, divided by the variance of the joint's torque. torque: function that predicts the joint torques (T, n)
     [Nm, N] of samples.
     """
 
@@ -69,16 +69,16 @@ def _regression(
         return np.concatenate([regressor_of(model.chain, x.q, x.qd, x.qdd).numpy(), drives], axis=2)
 
     def products(x: SampleBlock) -> np.ndarray:
-        """Return the Gram matrix (K + 1, K + 1) of the K columns of the regressor and the torque.
+        """Return the Gram matrix of the K columns of the regressor and the torque per joint, (n, K + 1, K + 1).
 
         Columns and torque are first divided by `torque_std` per joint.
         """
         rows = np.concatenate([columns(x), joint_torque(model, x).numpy()[..., None]], axis=2)
-        rows = (rows / torque_std[:, None]).reshape(-1, rows.shape[2])
-        return np.asarray(rows.T @ rows)
+        rows = (rows / torque_std[:, None]).swapaxes(0, 1)
+        return np.asarray(rows.swapaxes(1, 2) @ rows)
 
     grams = np.stack([products(block.columns) for block in blocks])
-    total = grams.sum(axis=0)
+    total = grams.sum(axis=(0, 1))
     length = np.sqrt(np.diagonal(total)[:-1])
     scale = np.append(np.where(length > 0, length, 1.0), 1.0)
     grams, total = (gram / np.outer(scale, scale) for gram in (grams, total))
@@ -94,9 +94,9 @@ def _regression(
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the sum of the squared residual of each block, (blocks,), after a ridge fit to all other blocks."""
-        weights = solution(total - grams, penalty)
-        return np.asarray(np.einsum("bk,bkl,bl->b", weights, grams, weights))
+        """Return the sum of the squared residual of each block after a fit to all other blocks, (blocks, n)."""
+        weights = solution(total - grams.sum(axis=1), penalty)[:, None, :, None]
+        return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
     parameters = (solution(total, penalty) / scale)[:-1]  # parameters: weights of the unscaled columns

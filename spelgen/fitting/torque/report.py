@@ -13,9 +13,10 @@ from spelgen.dynamics.protocol import residual_terms
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.posterior import Posterior
-from spelgen.fitting.torque.fit import RegressionComparison, TorqueSolution
+from spelgen.fitting.torque.fit import FitComparison, TorqueSolution
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING
+from spelgen.identification.drive_hints import friction_compensated
 from spelgen.runtime.motors import MotorInputs
 
 TERM_NAMES = {
@@ -42,7 +43,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
     if (nmse > TUNING.unsupported).any():
         yield _few_data(samples, nmse, names, solution.comparison)
     if solution.comparison is not None:
-        yield from _behind_regression(solution.comparison)
+        yield from _behind_simpler_methods(solution.comparison)
     if isinstance(model.inputs, MotorInputs) and len(model.inputs.gain_rows):
         yield _trained_gains(posterior)
     if solution.compensated.any():
@@ -50,12 +51,7 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         joints = ", ".join(
             f"{names[k]} {value[k]:.3g}" for k in np.flatnonzero(solution.compensated) if value[k] > 0
         )
-        yield _warning(
-            "friction-compensated",
-            "the measured torque decreases with velocity, as if the drive compensated friction: "
-            f"{joints} Nm s/rad (N s/m) are added; check the signs of the torques, and whether the controller "
-            "subtracts friction",
-        )
+        yield friction_compensated(f"{joints} Nm s/rad (N s/m) are added")
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
     # A few positions suffice for the mean inertia.
@@ -112,7 +108,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
 
 
 def _few_data(
-    samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: RegressionComparison | None
+    samples: TorqueSamples, nmse: np.ndarray, names: np.ndarray, comparison: FitComparison | None
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
@@ -132,9 +128,16 @@ def _few_data(
     )
 
 
-def _behind_regression(comparison: RegressionComparison) -> Iterator[Diagnostic]:
-    """Yield a warning if ridge regression predicted held-out torques better than the fit from the URDF's values."""
+def _behind_simpler_methods(comparison: FitComparison) -> Iterator[Diagnostic]:
+    """Yield a warning if ridge regression or the URDF's values predicted held-out torques better than the fit."""
     regression = f"ridge regression (nMSE {comparison.regression:.2g})"
+    if comparison.discarded is not None:
+        yield _warning(
+            "fit-discarded",
+            "the model keeps the inertials of the URDF and typical friction: they predict torques that were not fitted "
+            f"(nMSE {comparison.fit:.2g}) as well as a fit to these logs (nMSE {comparison.discarded:.2g}) or "
+            "better; record more motion",
+        )
     if comparison.replaced is not None:
         yield _warning(
             "fit-from-regression",

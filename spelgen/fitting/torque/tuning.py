@@ -91,7 +91,8 @@ class TorqueTuning:
     # [1] A warning names motor gains whose relative standard deviation exceeds this value. The 95 % interval is then
     # wider than +-20 %, a typical difference between two datasheets.
     undetermined_gain: float = 0.1
-    # [1] A warning names joints whose nMSE of held-out blocks exceeds this value.
+    # [1] A warning names joints whose nMSE of held-out blocks exceeds this value. If the mean nMSE does, a fit that is
+    # not better than the URDF is discarded.
     unsupported: float = 0.5
     # [1] The masses of a URDF are implausible if exp(estimated prior standard deviation of the logarithms of the
     # masses) exceeds this factor. The fit then tries friction compensation at all joints, and a warning is issued.
