@@ -155,15 +155,19 @@ def compared(problem: GeometryProblem) -> list[HypothesisFit]:
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Return True if two readings of a log's columns agree up to the tolerances `NEAR` and `NEAR_DELAY`."""
+    """Return True if two readings of a log's columns agree up to the tolerances and to a delay of the whole log.
+
+    The tolerances are `NEAR` and `NEAR_DELAY`.
+    """
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
+    delay, drift = one.delay - other.delay, one.drift - other.drift
     gravity = np.array(one.gravity) - np.array(other.gravity)
     return bool(
         (one.source == other.source).all()
         and np.allclose(one.scale, other.scale)
         and np.abs(turn).max() < NEAR
-        and np.abs(one.delay - other.delay).max() < NEAR_DELAY
-        and SECONDS * np.abs(one.drift - other.drift).max() < NEAR_DELAY
+        and np.abs(delay - delay.mean()).max() < NEAR_DELAY
+        and SECONDS * np.abs(drift - drift.mean()).max() < NEAR_DELAY
         and np.linalg.norm(gravity) < NEAR * 9.81
     )
 
@@ -210,7 +214,7 @@ def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
     clean = compared(problem)
     codes = " ".join(fault.code for fit in clean[:1] for fault in fit.hypothesis.faults)
     yield Row(*log, "clean", f"false: {codes}" if clean else "silent")
-    rng = np.random.default_rng([number, 1])
+    rng = np.random.default_rng([number, 1, *urdf.stem.encode()])
     for fault in range(faults):
         kind = KINDS[(fault + number * faults) % len(KINDS)]
         right = draw_fault(arm.chain, kind, rng)

@@ -45,6 +45,11 @@ def parameter_name(index: int) -> str:
     return f"{INERTIAL_PARAMETERS[index % 10]}{index // 10 + 1}"
 
 
+def base_name(first: str, terms: int) -> str:
+    """Return the name of a base parameter: the name of its first term, with the suffix R if it has several terms."""
+    return first + "R" * (terms > 1)
+
+
 @dataclass(frozen=True)
 class NamedJoint:
     """The name of a joint and the units of its quantities, for charts and tables."""

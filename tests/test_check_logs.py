@@ -17,6 +17,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain, regressor, urdf_para
 from spelgen.errors import LogError, SpelgenError
 from spelgen.identification import motion_samples
 from spelgen.identification.drive_hints import drive_problem, find_coupling
+from spelgen.identification.identify import identify
 from spelgen.identification.motion_samples import DriveLog
 from spelgen.log_checks import check_torque_logs, robot_checks
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
@@ -337,11 +338,20 @@ def test_a_new_check_is_a_function_and_its_row(loaded, log, monkeypatch, registr
         assert {(x.code, x.message) for x in report.findings} == {("odd-name", "it is called odd")}
 
 
+@pytest.mark.parametrize("samples", [1, 2, 10, 60])
+def test_a_log_too_short_for_a_fit_is_named(loaded, log, samples):
+    short = log[:samples]
+    with pytest.raises(LogError, match="no samples to identify from") as refused:
+        identify(loaded, short)
+    (message,) = [str(x) for x in check_logs(short, loaded).findings if x.code == "no-accelerations"]
+    assert message.endswith(refused.value.expected)
+
+
 def test_a_few_samples_give_no_figures_of_gravity(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
     # within a fifth of a second no joint reverses
-    assert {x.code for x in result.findings} == {"one-way"}
+    assert {x.code for x in result.findings} == {"no-accelerations", "one-way"}
 
 
 def test_logs_of_real_arms_have_no_errors(shared):

@@ -7,9 +7,11 @@ read without the fault. The URDF's inertials are 30 % wrong, torques have noise,
 import re
 import shutil
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
@@ -151,6 +153,15 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
     assert check_logs([read], again).errors == ()
 
 
+def test_two_reversed_joints_are_not_taken_for_a_third(shared):
+    """The best single correction is a wrong one, the reversed torque of a joint whose position is reversed."""
+    arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
+    wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
+    error = told(arm, wrong)
+    assert "'joints: {joint2: {sign: -1, gain: -1}, joint5: {sign: -1}}'" in error
+    assert "torques of either sense" in error
+
+
 @pytest.mark.parametrize("angle", [90, 180, -90, 37])
 def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     rng = np.random.default_rng(angle % 360)
@@ -234,22 +245,63 @@ def test_a_link_with_a_mistyped_mass_is_named(arm):
     assert not [x for x in check_logs([log], arm).findings if x.code == "urdf-inertials"]
 
 
-@pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
-@pytest.mark.parametrize("k", [3, 5])
-def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
-    """A link at the wrist whose mass in the URDF is ten times too large is named.
-
-    Its centre of mass is near its joint, so that only the joints before it carry the mass.
-    """
+def exact_log_and_mistyped_arm(arm, k, factor):
+    """Return the exact log of an arm, and the arm with another mass of body k in its URDF."""
     t, q = excitation(arm, np.random.default_rng(17))
     motion = q, np.gradient(q, t, axis=0), np.gradient(np.gradient(q, t, axis=0), t, axis=0)
     log = Trajectory(t, *motion[:2], regressor(arm.chain, *motion) @ urdf_parameters(arm.chain), "exact")
     bodies = list(arm.chain.bodies)
-    mass, *rest = bodies[k].inertia
-    bodies[k] = replace(bodies[k], inertia=(10 * mass, *(10 * x for x in rest[:3]), *rest[3:]))
-    report = check_logs([log], replace(arm, chain=replace(arm.chain, bodies=tuple(bodies))))
+    inertia = bodies[k].inertia
+    bodies[k] = replace(bodies[k], inertia=(*(factor * x for x in inertia[:4]), *inertia[4:]))
+    return log, replace(arm, chain=replace(arm.chain, bodies=tuple(bodies))), f"link {bodies[k].link!r}"
+
+
+@pytest.mark.parametrize(("arm", "k"), [("ur10e", 3), ("ur10e", 5), ("rpr", 2)], indirect=["arm"])
+def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
+    """Ten times the mass of a link that only other joints carry, or whose own torque is relatively small."""
+    log, mistyped, link = exact_log_and_mistyped_arm(arm, k, 10)
+    report = check_logs([log], mistyped)
     assert report.errors == ()
-    assert [x.where for x in report.findings if x.code == "urdf-inertials"] == [f"link {bodies[k].link!r}"]
+    found = [(x.code, x.where) for x in report.findings if not x.code.startswith("beyond")]
+    assert found == [("urdf-inertials", link)]
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_the_torque_of_a_light_link_is_of_another_unit_or_the_link_is_wrong(arm):
+    """Only the last joint of this arm carries weight: both explain the log."""
+    log, mistyped, link = exact_log_and_mistyped_arm(arm, 2, Fraction(1, 10))
+    report = check_logs([log], mistyped)
+    assert "--accept torque-unit" in str(report.errors[0])
+    found = [(x.code, x.where) for x in report.findings if not x.code.startswith("beyond")]
+    assert found == [("urdf-inertials", link)]
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+@pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
+def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
+    """Another signal in the torque columns: there is no line that mends it, and none is advised."""
+    log, rng = recorded(arm, 18), np.random.default_rng(18)
+    other = log.tau.std(axis=0) * lfilter([0.2], [1, -0.98], rng.standard_normal(log.tau.shape), axis=0)
+    tau = {
+        "noise": rng.standard_normal(log.tau.shape),
+        "one joint": np.where(np.arange(3) == 1, other, log.tau),
+        "late": np.roll(log.tau, 300, axis=0),
+        "load register": np.round(100 * np.abs(other) / log.tau.std(axis=0)),
+    }[form]
+    error = told(arm, replace(log, tau=tau))
+    assert "no hypothesis" in error and "write '" not in error and "--accept torque-unexplained" in error
+    mapping = LogMapping.model_validate({"accept": ["torque-unexplained"]})
+    assert check_logs([replace(log, tau=tau)], arm, mapping).errors == ()
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_noise_of_joints_at_rest_is_no_wrong_torque(arm):
+    log, rng = recorded(arm, 19), np.random.default_rng(19)
+    q = np.where(np.arange(3) == 2, log.q, log.q[0])
+    motion = q, np.gradient(q, log.t, axis=0), np.gradient(np.gradient(q, log.t, axis=0), log.t, axis=0)
+    tau = regressor(arm.chain, *motion) @ urdf_parameters(arm.chain)
+    tau = tau + 0.5 * tau.std(axis=0).max() * rng.standard_normal(q.shape) * [1, 1, 0.02]
+    assert check_logs([Trajectory(log.t, *motion[:2], tau, "rest")], arm).errors == ()
 
 
 def test_training_refuses_it_unless_it_is_accepted(arm):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from emitted import FOLLOWED
+from emitted import FOLLOWED, GANTRY
 from motions import smooth_motion
 from scipy.signal import lfilter
 from typer.testing import CliRunner
@@ -42,12 +42,13 @@ from spelgen.settings.fits import TorqueFit
 from tests.test_closed_form import drawn
 
 
-@pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed"])
+@pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
+    """Fits and least squares use the same names: the report matches their values by name."""
     urdf = robots / f"{robot}.urdf"
-    if robot == "followed":
-        urdf = tmp_path / "followed.urdf"
-        urdf.write_text(FOLLOWED, encoding="utf-8")
+    if robot in ("followed", "gantry"):
+        urdf = tmp_path / f"{robot}.urdf"
+        urdf.write_text(FOLLOWED if robot == "followed" else GANTRY, encoding="utf-8")
     arm = load_arm(urdf)
     exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
     count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
@@ -57,6 +58,9 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     names, combination = base_combinations(model.chain, motors_of(model))
     assert names == tuple(np.array(exact.names)[common])
     np.testing.assert_allclose(combination, exact.combination[common, :count], atol=1e-7)
+    # a name of a parameter means this parameter, without rotors or torque offsets: others end in R
+    single = [exact.identifiability().get(name) == "alone" for name in names]
+    assert single == [not name.endswith("R") for name in names]
 
 
 def test_base_parameters_are_equal_in_every_bit(robots):

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
+from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, base_name, parameter_name
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.port_hamiltonian import applied
 
@@ -107,7 +107,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     A base parameter is its row of coefficients times the inertial parameters of B bodies and the n armatures, in the
     order of `constants_regressor`. That regressor is evaluated at random states. The parameter of a column that depends
     linearly on the preceding columns is regrouped into the parameters of those columns (Gautier and Khalil, IEEE T-RA
-    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter.
+    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter; torque offsets count, since
+    gravity along a prismatic joint is constant.
 
     Args:
         chain: kinematics of B bodies.
@@ -119,12 +120,13 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
-    order += range(inertial, inertial + n)
+    order += range(inertial, inertial + 2 * n)
     # The random states give twice as many equations as parameters, so that they do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
     # The random states are copied, since results on memory of NumPy depend in the last digit on its alignment.
     motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
-    columns = constants_regressor(chain, motors, *motion).flatten(0, 1)
+    columns = constants_regressor(chain, motors, *motion)
+    columns = torch.cat([columns, motors.mT.expand(len(columns), n, n)], dim=-1).flatten(0, 1)
     # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
     # A column is regarded as linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8
@@ -136,11 +138,9 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     combination = torch.linalg.lstsq(columns[:, base], columns, driver="gels").solution
     # Coefficients of base parameters below 1e-9 are rounding errors.
     combination[combination.abs() < 1e-9] = 0.0
+    labels = [*map(parameter_name, range(inertial)), *(f"armature{joint + 1}" for joint in range(n))]
     names = []
-    for index, row in zip(base.tolist(), combination, strict=True):
-        if index < inertial:
-            regrouped = int(row[:inertial].count_nonzero()) > 1
-            names.append(parameter_name(index) + "R" * regrouped)
-        else:
-            names.append(f"armature{index - inertial + 1}")
-    return tuple(names), combination
+    # Rows of torque offsets are omitted: they are the last ones.
+    for index, row in zip(base[base < len(labels)].tolist(), combination, strict=False):
+        names.append(base_name(labels[index], int(row.count_nonzero())))
+    return tuple(names), combination[: len(names), : len(labels)]

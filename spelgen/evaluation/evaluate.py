@@ -33,7 +33,7 @@ from spelgen.evaluation.verdict import SEEN
 from spelgen.fitting.fitted import Fit
 from spelgen.labels import MODEL
 from spelgen.logs.checks import check
-from spelgen.logs.dynamics_samples import SHORTEST, dynamics_samples
+from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import (
     Trajectory,
@@ -42,7 +42,6 @@ from spelgen.logs.trajectory import (
     require_commands,
     require_torques,
 )
-from spelgen.logs.tuning import SLOWEST
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)
@@ -194,7 +193,7 @@ def _evaluate_torques(
     if not horizons and not torque:
         raise LogError(
             "no figure: no rollout is evaluated, and torques need accelerations, which these logs do not show",
-            expected=f"motion at {SLOWEST:g} Hz or more, {SHORTEST:g} s without a gap",
+            expected=NEEDED,
             do="omit --quick",
         )
     # Joints with coarsely quantised torques have torque errors in the tables, but the assessment in words omits them.

@@ -9,7 +9,6 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import compress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -163,17 +162,20 @@ class Posterior:
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
         """95 % intervals of the masses [kg] and first moments [kg m] that are base parameters by themselves."""
-        _, combination = self._base
-        alone = compress(self.base_parameters, (combination.count_nonzero(dim=1) == 1).tolist())
-        return tuple(replace(x, positive=x.name[0] == "m") for x in alone if x.name[0] in "mh")
+        pairs = zip(self._base[0], self.base_parameters, strict=True)
+        return tuple(replace(x, positive=name[0] == "m") for name, x in pairs if name in self._first_moments)
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
         """Names of the masses and first moments that logs determine only in combinations, or not at all."""
-        names, combination = self._base
-        alone = set(compress(names, (combination.count_nonzero(dim=1) == 1).tolist()))
-        single = map(parameter_name, range(10 * len(self.model.chain.parents)))
-        return tuple(name for name in single if name[0] in "mh" and name not in alone)
+        names, _ = self._base
+        return tuple(name for name in self._first_moments if name not in names)
+
+    @property
+    def _first_moments(self) -> list[str]:
+        """Names of the masses and first moments of all bodies."""
+        names = map(parameter_name, range(10 * len(self.model.chain.parents)))
+        return [name for name in names if name[0] in "mh"]
 
     @cached_property
     def drives(self) -> dict[str, tuple[Interval, ...]]:

@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import BRISTLES, FrictionModel
 from spelgen.dynamics.regressor_dynamics import regressor
-from spelgen.labels import parameter_name
+from spelgen.labels import base_name, parameter_name
 from spelgen.structure.base_parameters import base_parameters as body_base_parameters
 
 
@@ -86,7 +86,8 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
     # coefficients below this bound are rounding errors
     drives[np.abs(drives) < 1e-8 * np.abs(drives).max(initial=1.0)] = 0.0
     combination[:, inertial:] = drives
-    base_names = [parameter.name for parameter in exact] + [names[k] for k in chosen[len(exact) :].tolist()]
+    terms = np.count_nonzero(combination, axis=1)
+    base_names = [base_name(names[k], x) for k, x in zip(chosen.tolist(), terms.tolist(), strict=True)]
     return BaseParameters(tuple(base_names), chosen, combination, tuple(names), len(exact))
 
 

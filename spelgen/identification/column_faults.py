@@ -17,6 +17,8 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
+# [1] Smallest factor between torques and the URDF's gravity that wrong inertials do not explain.
+OTHER_UNIT = 5.0
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
@@ -115,8 +117,14 @@ class WrongScale(Fault):
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the least-squares fit of the log's torques with each candidate for factors on motion and torque."""
+        return self._scaled_by(self.factors, problem, base)
+
+    def _scaled_by(
+        self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
+    ) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fit of the log's torques with each of the factors (2, n) on motion and torque."""
         reading = base.hypothesis
-        for factor in self.factors:
+        for factor in factors:
             # Both signs of the offset are tried: the offset in the mapping may have been measured with the right or the
             # wrong sign.
             offsets = {x.tobytes(): x for x in (reading.offset, np.sign(factor[0]) * reading.offset + 0.0)}
@@ -170,9 +178,11 @@ class JointSense(WrongScale):
     def text(self, correction: Correction) -> str:
         """Return the text about joints of the opposite sense, which states whether it includes their torques."""
         motion, torque = correction.factors
-        if (torque[motion < 0] < 0).all():
+        is_reversed = torque[motion < 0] < 0
+        if is_reversed.all():
             return "positions, velocities and torques of the opposite sense"
-        return "positions and velocities of the opposite sense, and torques of the right one"
+        right = "torques of the right one" if not is_reversed.any() else "torques of either sense"
+        return f"positions and velocities of the opposite sense, and {right}"
 
 
 class TorqueSense(WrongScale):
@@ -190,7 +200,7 @@ class TorqueSense(WrongScale):
 
 
 class TorqueUnit(WrongScale):
-    """Kind of fault of a log: torques in another unit.
+    """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
     The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
     candidate need not lower the cost much, unlike other faults: the fit without it explains torques that are too small
@@ -202,18 +212,42 @@ class TorqueUnit(WrongScale):
     needed = 0.0
     evidence = "by the URDF's gravity"
 
+    def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
+        """Define the candidates.
+
+        factors: factors (n,) on the torques. is_open: (n,) True for joints whose torque may have another unit.
+        is_milli: (n,) True for joints whose torques are declared in mNm.
+        """
+        super().__init__([])
+        self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
+
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
 
         A fit with a separate factor for each joint is added if it is better.
         """
-        if self in base.hypothesis.faults or not self.factors:
+        is_open, is_found = self._is_open, self in base.hypothesis.faults
+        candidates = [] if is_found else [x.copy() for x in self._torque_factors]
+        if is_open.all():
+            # Under a hypothesis with other senses or orders, the gravity in the torques has another magnitude. A factor
+            # that was found with a wrong sense is corrected.
+            fitted, of_urdf = problem.gravity_torques(base)
+            ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
+            if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
+                candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+        if not candidates:
             return
-        fits = list(super().fits(problem, base))
+        for factor in candidates:
+            # Factors near 1000 on torques in mNm become 1000: the torques are in Nm, and the masses of the URDF are
+            # inexact.
+            is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
+            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
+        fits = list(self._scaled_by(scales, problem, base))
         yield from fits
+        if is_found:
+            return
         best = lowest = min(fits, key=lambda fit: fit.cost)
-        # `is_open`: joints whose torque has no declared unit, so that a factor is possible
-        is_open = np.any([factor[1] != 1 for factor in self.factors], axis=0)
         # Factors are optimised for one joint after the other, then for all joints together: the dynamic coupling of the
         # joints determines the ratios of the factors, and the masses of the URDF determine their common factor.
         for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
@@ -222,10 +256,13 @@ class TorqueUnit(WrongScale):
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # Two conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost a
-        # little, so the cost decrease must be significant. Torques of another fault, such as torques without sign, are
-        # not explained by any factor, so the relative residual of each joint must be small.
-        if best.cost < lowest.cost - GEOMETRY.needed and best.errors.max() <= GEOMETRY.unexplained:
+        # Three conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost
+        # a little: one factor must be as large as of another unit, and the cost decrease must be significant. Torques
+        # of another fault, such as torques without sign, are not explained by any factor, so the relative residual of
+        # each joint must be small.
+        is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
+        is_explained = best.errors.max() <= GEOMETRY.unexplained
+        if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
@@ -263,6 +300,24 @@ class TorqueUnit(WrongScale):
         """
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
+
+
+def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
+    """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
+    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(OTHER_UNIT))
+
+
+def rounded_factor(factor: float) -> float:
+    """Return a factor on torques, rounded for a message; its sign remains.
+
+    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
+    changes it by less than 10 %, otherwise to two digits.
+    """
+    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
+        # The bound is wide, since the factor is only as exact as the masses of the URDF.
+        return float(np.copysign(1e-3, factor))
+    one = float(f"{factor:.1g}")
+    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 class PositionUnit(WrongScale):

@@ -18,6 +18,7 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 
 RIGHT_ANGLE = np.pi / 2
+DIFFERENCE = 1e-4  # [s] step of finite differences with respect to delays
 
 
 class ZeroOffset(Fault):
@@ -55,18 +56,22 @@ class ZeroOffset(Fault):
         # offset is only a calibration error; otherwise shorter, since the offset near a right angle has to be accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
-        is_right_angle = False
+        candidates = []
         if is_revolute:
             offset = (offset + np.pi) % (2 * np.pi) - np.pi
             right = RIGHT_ANGLE * np.round(offset / RIGHT_ANGLE)
             exact = problem.fit(shifted(right))
-            is_right_angle = bool(right.any()) and exact.cost < best.cost + GEOMETRY.right_angle
-            if is_right_angle:
-                best, offset = exact, right
+            if right.any() and exact.cost < best.cost + GEOMETRY.right_angle:
+                candidates.append(exact)
+        # an uncertain angle may be far from a multiple of 90 degrees of about the same cost: both are possible
+        if not candidates or abs(offset - right)[0] > GEOMETRY.serious_angle:
+            candidates.append(problem.fit(shifted(offset.round(4))))
         # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only
         # replaces a change of the masses, whose values in the URDF are uncertain.
-        if abs(offset[0]) >= min_offset and best.misfit <= base.misfit - GEOMETRY.needed / 2:
-            yield best if is_right_angle else problem.fit(shifted(offset.round(4)))
+        for fit in candidates:
+            change = (fit.hypothesis.offset - reading.offset)[joint]
+            if abs(change) >= min_offset and fit.misfit <= base.misfit - GEOMETRY.needed / 2:
+                yield fit
 
     def text(self, correction: Correction) -> str:
         """Return the text about zero offsets: the largest offset of the joints that have the right sense."""
@@ -114,8 +119,6 @@ class Delay(Fault):
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
             return
-        stateful = problem.with_hysteresis()
-        stateful_errors = stateful.fit(reading).errors
         for signals in _delayed_signals(len(reading.offset)):
 
             def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
@@ -135,11 +138,7 @@ class Delay(Fault):
             if abs(delay[0]) < GEOMETRY.min_delay:
                 continue
             fit = problem.fit(delayed(delay.round(3)))
-            # Hysteresis of dry friction resembles a delay. A delay is therefore accepted only if it lowers a joint's
-            # residual with both friction models, without and with hysteresis.
-            is_better = fit.errors < GEOMETRY.delay_gain * base.errors
-            is_better &= stateful.fit(fit.hypothesis).errors < GEOMETRY.delay_gain * stateful_errors
-            if is_better.any():
+            if _explains_more(problem, base, fit):
                 yield fit
 
     def text(self, correction: Correction) -> str:
@@ -181,15 +180,42 @@ class JointClock(Fault):
     advice = "no setting corrects it: log all joints with one clock"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the torques in which the delay of `base` changes linearly with time.
+        """Yield the least-squares fit of the torques with a delay that changes linearly with time.
 
-        Nothing is yielded if `base` has no delay, or a delay that already changes.
+        The search starts from the delay of `base` or, if there is none, near 0. Nothing is yielded if the delay of
+        `base` already changes.
         """
         delay = base.hypothesis.delay
         if delay.any() and not base.hypothesis.drift.any():
             faults = tuple(x for x in base.hypothesis.faults if not isinstance(x, Delay))
             reading = replace(base.hypothesis, faults=faults, delay=np.zeros_like(delay))
             yield from self._best(problem, reading, np.full(2, delay[delay != 0][0]), 1.0 * (delay != 0))
+        elif problem.samples.longest_delay and not base.hypothesis.drift.any():
+            yield from self._near(problem, base)
+
+    def _near(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the best fit with delays near 0 at both ends that differ, if a step towards them lowers the cost.
+
+        The step needs the derivative of the residual with respect to the delay of each signal only: the derivative with
+        respect to the delay at the end of a recording is this derivative times the relative time.
+        """
+        reading, parameters = base.hypothesis, base.parameters
+        residual, columns = problem.residual(reading, parameters), []
+        for signals in (rows := np.eye(2 * len(reading.offset)).reshape(-1, *reading.delay.shape)):
+            shifted = reading.changed(self, delay=reading.delay + DIFFERENCE * signals)
+            columns.append((problem.residual(shifted, parameters) - residual) / DIFFERENCE)
+        time = (problem.samples.times / problem.samples.times.max())[:, None, None]
+        starts = []
+        for signals in _delayed_signals(len(reading.offset)):
+            column = np.tensordot(np.tensordot(rows, signals, 2), columns, 1)[..., None]
+            step = problem.step(base, np.concatenate([(1 - time) * column, time * column], axis=2))
+            if abs(step[1] - step[0]) >= GEOMETRY.min_delay / 2:
+                delays = np.clip(step, -0.3, 0.3)
+                cost = problem.fit(self._drifting(problem, reading, delays, signals)).cost
+                starts.append((cost, delays, signals))
+        for cost, start, signals in sorted(starts, key=itemgetter(0))[:1]:
+            if cost < base.cost - GEOMETRY.slight:
+                yield from self._best(problem, reading, start, signals)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
@@ -215,7 +241,8 @@ class JointClock(Fault):
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
         )
-        if abs(delays[1] - delays[0]) >= 2 * GEOMETRY.min_delay:
+        is_long = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
+        if is_long and _explains_more(problem, problem.fit(reading), best):
             yield best
 
     def _drifting(
@@ -239,6 +266,17 @@ class JointClock(Fault):
         """Return the names of the joints that have signals with times of another clock."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
+
+
+def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:
+    """Return True if a fit with other times explains much more of a joint's torque than the base.
+
+    Friction with a history also resembles a delay: the residual must be smaller with both friction models.
+    """
+    stateful = problem.with_hysteresis()
+    is_better = fit.errors < GEOMETRY.delay_gain * base.errors
+    before, after = (stateful.fit(x.hypothesis).errors for x in (base, fit))
+    return bool((is_better & (after < GEOMETRY.delay_gain * before)).any())
 
 
 def _delayed_signals(n: int) -> list[np.ndarray]:

@@ -29,12 +29,12 @@ RANK = attrgetter("rank")
 
 
 def kinds_of_faults(
-    arm: Chain, torque_factors: Sequence[np.ndarray] = (), position_scale: np.ndarray | None = None
+    arm: Chain, torque_unit: TorqueUnit | None = None, position_scale: np.ndarray | None = None
 ) -> tuple[Fault, ...]:
     """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
 
-    torque_factors: candidates (n,) for factors on the torques. position_scale: (n,) factor from logged positions to SI
-    units; None: the unit of positions is right.
+    torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
+    logged positions to SI units; None: the unit of positions is right.
     """
     n, units = len(arm.coordinates), list[np.ndarray]()
     if position_scale is not None:
@@ -47,7 +47,7 @@ def kinds_of_faults(
         JointSense(n),
         TorqueSense(n),
         PositionUnit(units),
-        TorqueUnit([np.stack([np.ones(n), factor]) for factor in torque_factors]),
+        *([] if torque_unit is None else [torque_unit]),
         ZeroOffset(),
         Delay(),
         JointClock(),
@@ -71,13 +71,19 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     # explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
-        tried = _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, base)], base)
+        # one fault of two may look like another one: the first correction is then left open
+        is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
+        tried: list[HypothesisFit] = []
+        for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
+            tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
-        # orders of all joints are searched only if no single correction explains the torques
+        # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
+        # of other signals may be nearer than the right one
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
-        if base is unchanged and is_wrong and better.errors.max() > GEOMETRY.explained:
+        is_open = better.errors.max() > GEOMETRY.explained or better.hypothesis.drift.any()
+        if base is unchanged and is_wrong and is_open:
             orders = [fit for fault in faults for fit in fault.thorough_fits(coarse, base)]
             tried += _weighed(coarse, orders, base)
         if min(tried, key=RANK).cost > base.cost - GEOMETRY.needed:

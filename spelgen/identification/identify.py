@@ -22,10 +22,9 @@ from spelgen.identification.least_squares import Solution, deviations, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.identification.tuning import TUNING
 from spelgen.logs.checks import check
-from spelgen.logs.dynamics_samples import SHORTEST, DynamicsSamples, dynamics_samples
+from spelgen.logs.dynamics_samples import NEEDED, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, recordings, require_torques
-from spelgen.logs.tuning import SLOWEST
 
 
 def identify(
@@ -174,10 +173,7 @@ class _Equations:
         Raises LogError if there are no samples.
         """
         if not self._blocks:
-            raise LogError(
-                "no samples to identify from",
-                expected=f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least",
-            )
+            raise LogError("no samples to identify from", expected=NEEDED)
         base = base_parameters(self.arm, method.friction, self.drives.speeds)
         products = self._products(method.friction, len(base.parameters))
         torques = np.concatenate([block.tau for block in self._blocks])

@@ -62,12 +62,19 @@ class LogGeometryTuning:
     slight: float = 3.0
     # [1] Number of the best hypotheses that are also compared with hysteresis.
     weighed: int = 10
+    # [1] Number of the best hypotheses to which a further correction is added if the best one is not enough.
+    beam: int = 3
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
+    # [1] Relative residual variance above which a hypothesis is no advice. Mended logs of recorded arms have at most
+    # 0.07 in the mean of the joints, and at most 0.27 at a joint whose torque is mostly friction.
+    no_advice: float = 0.2
+    # [1] Relative residual variance of the unchanged log above which its torques are no joint torques.
+    no_torque: float = 0.6
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.

@@ -344,7 +344,8 @@ def _command_warning(
     elif not following.moves[k]:
         # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]
-        code, message = "idle-command", f"its command moves by only {width:.3g}: its servo is not determined"
+        motion = f"moves by only {width:.3g}" if width else "does not move"
+        code, message = "idle-command", f"its command {motion}: its servo is not determined"
     elif correlation < 0.5:
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
     elif abs(offset) > OTHER_ZERO:

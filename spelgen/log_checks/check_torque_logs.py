@@ -11,7 +11,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic
-from spelgen.identification.column_faults import UNITS
+from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
@@ -22,7 +22,7 @@ from spelgen.identification.motion_samples import DriveLog, MotionSamples, joine
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.geometry_finding import geometry_finding
+from spelgen.log_checks.geometry_finding import UNEXPLAINED, find_unexplained, geometry_finding
 from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
@@ -30,10 +30,10 @@ from spelgen.log_checks.robot_checks import (
     TUNING,
     JointEvidence,
     fit_gravity,
-    rounded_factor,
     torque_factors,
 )
 from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.dynamics_samples import NEEDED
 from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
@@ -102,6 +102,9 @@ class TorqueLogs:
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
+        if moving is None:
+            message = f"no samples for identify and for fits of torques: they need {NEEDED}"
+            summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
         if is_sound:
             # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
@@ -204,11 +207,20 @@ class TorqueLogs:
             summary.errors.extend(limits.errors)
             return False
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        unexplained = find_unexplained(problem, unchanged, better[0] if better else unchanged)
+        if unexplained:
+            summary.errors.extend(unexplained if UNEXPLAINED not in accepted else [])
+            return UNEXPLAINED in accepted
         if not better:
             summary.notes.extend(_link_notes(problem, unchanged))
             return True
-        if {fault.code for fault in better[0].hypothesis.faults} <= accepted:
+        faults = better[0].hypothesis.faults
+        if {fault.code for fault in faults} <= accepted:
             return True
+        # the evidence for another unit of one torque is gravity, which a wrong link of the URDF may change as well
+        changed = better[0].hypothesis.scale != problem.unchanged.scale
+        if changed.sum() == 1 and not any(fault.needed for fault in faults):
+            summary.notes.extend(_link_notes(problem, unchanged))
         corrections = []
         for fit in better:
             corrections.append(
@@ -227,27 +239,20 @@ class TorqueLogs:
         The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
         that the mapping states is not changed, unless it is mNm.
         """
-        names, ones = self._arm.chain.joint_names, np.ones(len(evidence))
-        undeclared = [self._mapping.unit("tau", name) in (None, "mNm") for name in names]
+        names = self._arm.chain.joint_names
+        units = [self._mapping.unit("tau", name) for name in names]
+        is_milli = np.array([unit == "mNm" for unit in units])
+        is_open = is_milli | np.array([unit is None for unit in units])
         coarse = problem.thinned(GEOMETRY.coarse_samples)
-        fitted, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
+        _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
         loads = of_urdf.std(axis=0)
-        candidates = torque_factors(evidence, undeclared, loads > TUNING.loaded * loads.max())
-        ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
-        if all(undeclared) and ratio > 0 and not 1 / 5 < ratio < 5:
-            candidates.append(rounded_factor(1 / ratio) * ones)
-        # Factors near 1000 on torques in mNm become 1000: the torques are in Nm, and the masses of the URDF are
-        # inexact.
-        is_milli = np.array([self._mapping.unit("tau", name) == "mNm" for name in names])
-        for factor in candidates:
-            is_unit = is_milli & (np.abs(factor) > 1e3 / 5) & (np.abs(factor) < 1e3 * 5)
-            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
         # Units of positions are tested only if velocities have the same unit per second, so that one factor changes
         # both.
-        units = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
+        motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
-        scale = problem.unchanged.scale[0] if units <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, candidates, scale)
+        scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
+        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
@@ -287,24 +292,22 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
     """Yield a warning for each link whose mass or first moment, by least squares, is far from its value in the URDF.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference must be large enough to be visible in the torques, since wrong parameters of small distal bodies can
-    compensate each other.
+    difference must change the torque of a joint by half of the torque's standard deviation, since parameters of bodies
+    that hardly affect the torques are uncertain.
     """
-    visible = 0.5 * float(problem.samples.tau.std(axis=0).max())
-    gravity = float(np.linalg.norm(fit.hypothesis.gravity))
-    levers: list[float] = []  # [m] `levers`: length of the chain from the first joint to each body
+    rows, _ = problem.equations(fit.hypothesis)
+    torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
     for k, body in enumerate(problem.arm.bodies):
-        length = float(np.linalg.norm(np.array(body.translation, dtype=float)))
-        levers.append(0.0 if body.parent < 0 else levers[body.parent] + length)
         first = 10 * k
-        quantities = (
-            ("first moment (mass times centre of mass)", slice(first + 1, first + 4), 1.0),
-            ("mass", slice(first, first + 1), levers[k]),
-        )
-        for name, block, lever in quantities:
+        quantities = {
+            "first moment (mass times centre of mass)": slice(first + 1, first + 4),
+            "mass": slice(first, first + 1),
+        }
+        for name, block in quantities.items():
             stated, found = problem.prior_mean[block], fit.parameters[block]
             size = float(np.linalg.norm(stated))
-            if not size or float(np.linalg.norm(found - stated)) * lever * gravity < visible:
+            effect = (rows[..., block] @ (found - stated)).std(axis=0)
+            if not size or not (effect > 0.5 * torque).any():
                 continue
             axis = stated / size
             ratio = float(axis @ found) / size

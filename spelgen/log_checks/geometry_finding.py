@@ -5,11 +5,17 @@ The finding names the settings that correct the log. If no setting can correct i
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.continuous_faults import Gravity, ZeroOffset
 from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.tuning import SAMPLES
 
+UNEXPLAINED = "torque-unexplained"
 WARNINGS = ("torque-scale", ZeroOffset.code, Gravity.code)
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
@@ -41,6 +47,45 @@ def geometry_finding(
         return Diagnostic("warning", code, where, None, f"{got}; {do}")
     do += f"; {' '.join(f'--accept {fault.code}' for fault in faults)} if it is right"
     return LogError(got, element=where, expected=RIGHT, do=do)
+
+
+def find_unexplained(
+    problem: GeometryProblem, unchanged: HypothesisFit, best: HypothesisFit
+) -> list[LogError]:
+    """Return an error if neither the unchanged log nor a hypothesis about it explains the torques; else [].
+
+    best: fit of the best hypothesis, or `unchanged` if none is significantly better. The joints whose torque residual
+    the hypothesis changes count. In the unchanged log, the torque of a joint at rest may be noise only: a joint counts
+    in proportion to the variance of its torque or, if it moves and the URDF's torque is as large, by itself.
+    """
+    errors = best.errors
+    weights, limit, wrong = np.abs(errors - unchanged.errors) + 1e-9, GEOMETRY.no_advice, errors > np.inf
+    if best is unchanged:
+        coarse = problem.thinned(GEOMETRY.coarse_samples)
+        signals = coarse.unchanged.signals(coarse.samples)
+        tau, speed = signals.tau, signals.motion[1].std(axis=0)
+        of_urdf = tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
+        weights, limit = tau.var(axis=0) + 1e-30, GEOMETRY.no_torque
+        wrong = (errors > limit) & (speed > SAMPLES.moving) & (of_urdf.std(axis=0) > 0.5 * tau.std(axis=0))
+    remaining = float(np.average(errors, weights=weights))
+    if remaining > limit:
+        wrong = errors > GEOMETRY.no_advice
+    elif wrong.any():
+        remaining = float(errors[wrong].max())
+    else:
+        return []
+    names = [name for name, is_wrong in zip(problem.arm.joint_names, wrong, strict=True) if is_wrong]
+    got = (
+        "torques that no hypothesis about senses, order, zeros, units and gravity explains: "
+        f"{min(remaining, 1.0):.0%} of the variance remains"
+    )
+    recordings = 1 + np.count_nonzero(np.diff(problem.samples.times) < 0)
+    do = "check each recording by itself, and " * bool(recordings > 1) + (
+        "check that the columns are the torques of these joints, with their sign and at the times of the positions; "
+        f"--accept {UNEXPLAINED} if it is right"
+    )
+    where = f"joint {', '.join(map(repr, names))}, tau"
+    return [LogError(got, element=where, expected="joint torques of a rigid arm with friction", do=do)]
 
 
 def _place(correction: Correction, fault: Fault) -> str:

@@ -11,6 +11,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
+from spelgen.identification.column_faults import is_other_unit, rounded_factor
 from spelgen.identification.motion_samples import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
@@ -186,27 +187,14 @@ def torque_factors(
         if factor is None or not (is_known and undeclared[k] and loaded[k]):
             continue
         seen.append(factor)
-        if not 1 / 5 < abs(factor) < 5:
+        if is_other_unit(factor):
             single = np.ones(len(joints))
             single[k] = rounded_factor(1 / factor)
             factors.append(single)
     median = float(np.median(seen)) if seen else 1.0
-    if all(undeclared) and not 1 / 5 < abs(median) < 5:
+    if all(undeclared) and is_other_unit(median):
         factors.append(np.full(len(joints), rounded_factor(1 / median)))
     return factors
-
-
-def rounded_factor(factor: float) -> float:
-    """Return a factor on torques, rounded for a message; its sign remains.
-
-    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
-    changes it by less than 10 %, otherwise to two digits.
-    """
-    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # The bound is wide, since the factor is only as exact as the masses of the URDF.
-        return float(np.copysign(1e-3, factor))
-    one = float(f"{factor:.1g}")
-    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:

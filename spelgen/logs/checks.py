@@ -133,7 +133,7 @@ def find_no_torques(signals: JointSignals) -> str | None:
 def find_constant_torque(signals: JointSignals) -> str | None:
     """Return a message if the torque of the joint is constant; None for logs without torques (position commands)."""
     tau = signals.trajectory.tau
-    if not tau.size or np.ptp(tau[:, signals.number]) > 0:
+    if not tau.size or len(tau) == 1 or np.ptp(tau[:, signals.number]) > 0:
         return None
     return f"tau is always {tau[0, signals.number]:g}: right for a joint without a motor only"
 

@@ -11,11 +11,12 @@ from spelgen.dynamics.bristles import BristleReach, bristles_along, direction_al
 from spelgen.logs.filtering import interpolated, low_passed, regular_times, require_cutoff, resampled
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
-from spelgen.logs.tuning import SAMPLES, TUNING, shows_accelerations
+from spelgen.logs.tuning import SAMPLES, SLOWEST, TUNING, shows_accelerations
 
 FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default cutoff of the low-pass filter
 # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
 SHORTEST = 1.0
+NEEDED = f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least"
 # [s] Shorter gaps do not cut a recording: the low-pass would remove motion that is fast enough to occur within them.
 HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()

@@ -17,7 +17,7 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 
 from spelgen.arm.arm import Chain
-from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, parameter_name
+from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, base_name, parameter_name
 from spelgen.structure import field
 from spelgen.structure.recursion import Position, coefficients
 from spelgen.structure.sampling import regressor_rows
@@ -68,7 +68,7 @@ def base_parameters(arm: Chain) -> tuple[BaseParameter, ...]:
         # The first nonzero element of a row of the echelon form is its pivot, which is 1: it is the coefficient of the
         # first inertial parameter of the combination.
         first, _ = weights[0]
-        name = parameter_name(first) + "R" * (len(weights) > 1)
+        name = base_name(parameter_name(first), len(weights))
         result.append(BaseParameter(name, first, weights, _value(arm, weights)))
     return tuple(result)
 
