@@ -108,9 +108,9 @@ def test_torques_without_gravity_or_of_another_scale_are_found(loaded, arm, log,
         "torque-scale": tau[:, joint] / 8,
     }[code]
     findings = check_logs([replace(log, tau=tau)], loaded).findings
-    assert [(x.severity, x.code, x.where) for x in findings] == [
-        ("warning", code, f"joint {arm.coordinates[joint].name!r}")
-    ]
+    # A wrong link of the URDF explains a wrong scale of one torque as well.
+    found = [(x.severity, x.code, x.where) for x in findings if x.code != "urdf-inertials"]
+    assert found == [("warning", code, f"joint {arm.coordinates[joint].name!r}")]
 
 
 IMPOSSIBLE = {

@@ -190,7 +190,7 @@ def test_the_true_model_has_no_error_and_its_baseline_has(run):
 
 
 def test_without_rollouts_logs_too_sparse_for_torques_are_an_error(run):
-    with pytest.raises(LogError, match=r"torques need accelerations, .*24 Hz or more.*; omit --quick"):
+    with pytest.raises(LogError, match=r"torques need accelerations, .*24 Hz or faster.*; omit --quick"):
         evaluated(run, run.parent / "logs", steps=(), seconds=())
 
 

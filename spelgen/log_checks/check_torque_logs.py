@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.errors import Diagnostic
+from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
@@ -197,6 +197,16 @@ class TorqueLogs:
             accepted: codes of the checks that the mapping accepts.
             summary: findings, to which findings are added.
         """
+        motion = problem.unchanged.signals(problem.samples).motion[0]
+        is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
+        # Units that the mapping states wrongly make motions small, so they are tested nevertheless.
+        if not is_stated and np.ptp(motion, axis=0).max() < TUNING.smallest_motion:
+            message = (
+                f"all joints stay within {TUNING.smallest_motion:g} rad or m: too little motion to test senses, order, "
+                "zeros, units and gravity"
+            )
+            summary.notes.append(Diagnostic("warning", "small-motion", "logs", None, message))
+            return False
         unsigned = find_unsigned(problem) if UNSIGNED not in accepted else []
         if unsigned:
             summary.errors.extend(unsigned)
@@ -207,10 +217,13 @@ class TorqueLogs:
             summary.errors.extend(limits.errors)
             return False
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
-        unexplained = find_unexplained(problem, unchanged, better[0] if better else unchanged)
-        if unexplained:
-            summary.errors.extend(unexplained if UNEXPLAINED not in accepted else [])
+        unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
+        if isinstance(unexplained, LogError):
+            summary.errors.extend([unexplained] if UNEXPLAINED not in accepted else [])
             return UNEXPLAINED in accepted
+        if unexplained:
+            summary.notes.append(unexplained)
+            return False
         if not better:
             summary.notes.extend(_link_notes(problem, unchanged))
             return True

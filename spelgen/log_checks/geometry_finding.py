@@ -50,42 +50,55 @@ def geometry_finding(
 
 
 def find_unexplained(
-    problem: GeometryProblem, unchanged: HypothesisFit, best: HypothesisFit
-) -> list[LogError]:
-    """Return an error if neither the unchanged log nor a hypothesis about it explains the torques; else [].
+    problem: GeometryProblem, unchanged: HypothesisFit, best: HypothesisFit | None
+) -> Diagnostic | LogError | None:
+    """Return the finding that neither the unchanged log nor a hypothesis about it explains the torques, or None.
 
-    best: fit of the best hypothesis, or `unchanged` if none is significantly better. The joints whose torque residual
-    the hypothesis changes count. In the unchanged log, the torque of a joint at rest may be noise only: a joint counts
-    in proportion to the variance of its torque or, if it moves and the URDF's torque is as large, by itself.
+    The finding is an error if a hypothesis is significantly better than the unchanged log, and nevertheless leaves a
+    large residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without
+    such a hypothesis, the finding is a warning, since torques of noise or of friction may be right.
+
+    best: fit of the best hypothesis; None if no hypothesis is significantly better.
     """
-    errors = best.errors
-    weights, limit, wrong = np.abs(errors - unchanged.errors) + 1e-9, GEOMETRY.no_advice, errors > np.inf
-    if best is unchanged:
-        coarse = problem.thinned(GEOMETRY.coarse_samples)
-        signals = coarse.unchanged.signals(coarse.samples)
-        tau, speed = signals.tau, signals.motion[1].std(axis=0)
-        of_urdf = tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
-        weights, limit = tau.var(axis=0) + 1e-30, GEOMETRY.no_torque
-        wrong = (errors > limit) & (speed > SAMPLES.moving) & (of_urdf.std(axis=0) > 0.5 * tau.std(axis=0))
-    remaining = float(np.average(errors, weights=weights))
-    if remaining > limit:
-        wrong = errors > GEOMETRY.no_advice
-    elif wrong.any():
-        remaining = float(errors[wrong].max())
+    if best is None:
+        wrong, remaining = _unexplained_joints(problem, unchanged)
     else:
-        return []
-    names = [name for name, is_wrong in zip(problem.arm.joint_names, wrong, strict=True) if is_wrong]
+        affected = np.abs(best.errors - unchanged.errors) + 1e-9
+        remaining = float(np.average(best.errors, weights=affected))
+        wrong = (best.errors > GEOMETRY.no_advice) & (remaining > GEOMETRY.no_advice)
+    if not wrong.any():
+        return None
+    where = f"joint {', '.join(repr(problem.arm.joint_names[k]) for k in np.flatnonzero(wrong))}, tau"
     got = (
         "torques that no hypothesis about senses, order, zeros, units and gravity explains: "
         f"{min(remaining, 1.0):.0%} of the variance remains"
     )
     recordings = 1 + np.count_nonzero(np.diff(problem.samples.times) < 0)
     do = "check each recording by itself, and " * bool(recordings > 1) + (
-        "check that the columns are the torques of these joints, with their sign and at the times of the positions; "
-        f"--accept {UNEXPLAINED} if it is right"
+        "check that the columns are the torques of these joints, with their sign and at the times of the positions"
     )
-    where = f"joint {', '.join(map(repr, names))}, tau"
-    return [LogError(got, element=where, expected="joint torques of a rigid arm with friction", do=do)]
+    if best is None:
+        return Diagnostic("warning", UNEXPLAINED, where, None, f"{got}; {do}")
+    do += f"; --accept {UNEXPLAINED} if it is right"
+    return LogError(got, element=where, expected="joint torques of a rigid arm with friction", do=do)
+
+
+def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
+    """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
+
+    A joint counts in proportion to the variance of its torque, since the torque of a joint at rest may be noise only. A
+    joint counts by itself if it moves, and if the URDF's torque is about as large as the logged one.
+    """
+    coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
+    signals = coarse.unchanged.signals(coarse.samples)
+    of_urdf = signals.tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
+    mean = float(np.average(errors, weights=signals.tau.var(axis=0) + 1e-30))
+    if mean > GEOMETRY.no_torque:
+        return errors > GEOMETRY.no_advice, mean
+    is_moving = signals.motion[1].std(axis=0) > SAMPLES.moving
+    is_loaded = of_urdf.std(axis=0) > 0.5 * signals.tau.std(axis=0)
+    wrong = (errors > GEOMETRY.no_torque) & is_moving & is_loaded
+    return wrong, float(errors[wrong].max(initial=0.0))
 
 
 def _place(correction: Correction, fault: Fault) -> str:

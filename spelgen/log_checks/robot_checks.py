@@ -36,6 +36,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
+    # [rad, m] Largest range of positions of a log in which friction before sliding may determine the torques: the
+    # geometry is not tested. At 0.02, wrong hypotheses are the best ones on simulated arms; at 0.1, none is.
+    smallest_motion: float = 0.05
     # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
     # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
     # multiply the gravity torque.
