@@ -54,7 +54,7 @@ def find_unexplained(
 ) -> Diagnostic | LogError | None:
     """Return the finding that neither the unchanged log nor a hypothesis about it explains the torques, or None.
 
-    The finding is an error if a hypothesis is significantly better than the unchanged log, and nevertheless leaves a
+    The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a
     large residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without
     such a hypothesis, the finding is a warning, since torques of noise or of friction may be right.
 
