@@ -98,7 +98,7 @@ class LogGeometryTuning:
     unsigned_gain: float = 0.4
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
-    # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
+    # Zero offsets [rad, m] and tilts of the base [rad] below this bound give warnings, not errors.
     serious_angle: float = 0.17
 
 
