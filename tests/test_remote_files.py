@@ -94,8 +94,12 @@ def test_keys_that_lead_out_of_an_address_are_refused(tmp_path, memory):
         local(f"zip://logs::{tmp_path}/evil.zip")
     memory.pipe("/bucket/logs/../../x.csv", b"t")
     memory.store["/bucket/logs/a/../../../y.csv"] = memory.store.popitem()[1]
-    with pytest.raises(SpelgenError, match=r"^memory://bucket: got the key '.*y\.csv', expected only keys inside"):
+    with pytest.raises(
+        SpelgenError, match=r"^memory://bucket: got the key '.*y\.csv', expected only keys inside"
+    ):
         local("memory://bucket")
-    with pytest.raises(SpelgenError, match=r"^memory://data/\.\.: got the key '\.\.', expected only keys inside"):
+    with pytest.raises(
+        SpelgenError, match=r"^memory://data/\.\.: got the key '\.\.', expected only keys inside"
+    ):
         local("memory://data/..")
     assert not Path("/tmp/spelgen_was_here").exists()

@@ -242,7 +242,10 @@ class JointClock(Fault):
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
         )
         is_long = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
-        if is_long and _explains_more(problem, problem.fit(reading), best):
+        base = problem.fit(reading)
+        # No setting corrects a clock, so the finding must be certain: the mean residual of the joints must fall, too.
+        is_certain = best.errors.mean() < 0.9 * base.errors.mean()
+        if is_long and is_certain and _explains_more(problem, base, best):
             yield best
 
     def _drifting(

@@ -91,6 +91,8 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
+    # Smaller differences are rounding errors, for example of a unit conversion.
+    differences = differences[differences > 1e-9 * np.abs(values).max(initial=0.0)]
     # A difference of two levels counts as a multiple of the step if its distance from the nearest multiple is less than
     # 5 % of a step. At least 95 % of the differences must be multiples. `tolerance` is the 5 % of both bounds.
     tolerance = 0.05

@@ -168,7 +168,8 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
         if rows.size:
             value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
             message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"
-            return Advice(message, keys={"dropouts": "dropped"})
+            # If most of the recording would be dropped, the column is not a measurement: there is no advice.
+            return Advice(message, keys={"dropouts": "dropped"} if len(rows) < len(t) / 2 else {})
     return None
 
 

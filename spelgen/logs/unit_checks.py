@@ -287,7 +287,7 @@ def find_held(signals: JointSignals) -> str | None:
     for name in signals.measured:
         often = held_samples(signals.signal(name))
         if often > 1:
-            rates = f"{rate / often:.3g} times a second in rows at {rate:.3g} Hz"
+            rates = f"{rate / often:.3g} times a second in rows at {rate:.4g} Hz"
             return f"{name} that changes {rates}: each value lasts {often} samples"
     return None
 
