@@ -250,6 +250,15 @@ def test_values_that_stay_while_the_joint_moves(arm, quantity):
 
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_values_that_stay_in_most_of_a_recording_are_not_dropped(arm):
+    log = recorded(arm, 14)
+    tau = log.tau.copy()
+    tau[: 3 * len(log) // 4, 1] = tau[0, 1]
+    message = message_of(arm, logged(arm, replace(log, tau=tau)))
+    assert "tau that stays at" in message and "dropouts" not in message
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_velocities_that_are_refreshed_rarely(arm):
     log = recorded(arm, 15)
     path = logged(arm, replace(log, qd=log.qd[np.arange(len(log)) // 10 * 10]))

@@ -177,6 +177,9 @@ def test_noise_and_encoder_steps_are_estimated(log):
         assert quantisation_step(np.round(log.q[:, 0] / step) * step) == pytest.approx(step, rel=1e-6)
     assert np.isnan(quantisation_step(noisy.q[:, 0]))
     assert np.isnan(quantisation_step(np.ones(100)))
+    # Levels that differ by rounding errors are no levels: millimetres that were converted to metres.
+    rounded = np.tile([1e-3, 1e-3 + 2e-19, 2e-3, 2e-3 + 4e-19, 4e-3, 5e-3], 20)
+    assert quantisation_step(rounded) == pytest.approx(1e-3)
     assert np.isnan(statistics(log[::4]).signals["q"][2]).all()
 
 
