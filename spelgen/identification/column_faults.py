@@ -17,8 +17,6 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
-# [1] Smallest factor between torques and the URDF's gravity that wrong inertials do not explain.
-OTHER_UNIT = 5.0
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
@@ -304,7 +302,7 @@ class TorqueUnit(WrongScale):
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
     """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
-    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(OTHER_UNIT))
+    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
 
 def rounded_factor(factor: float) -> float:

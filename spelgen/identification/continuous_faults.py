@@ -244,7 +244,7 @@ class JointClock(Fault):
         is_long = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
         base = problem.fit(reading)
         # No setting corrects a clock, so the finding must be certain: the mean residual of the joints must fall, too.
-        is_certain = best.errors.mean() < 0.9 * base.errors.mean()
+        is_certain = best.errors.mean() < GEOMETRY.lower * base.errors.mean()
         if is_long and is_certain and _explains_more(problem, base, best):
             yield best
 

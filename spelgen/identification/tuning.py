@@ -66,6 +66,11 @@ class LogGeometryTuning:
     beam: int = 3
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
+    # [1] Smallest factor between torques and the URDF's gravity that wrong inertials do not explain.
+    other_unit: float = 5.0
+    # [1] A hypothesis lowers the mean relative residual variance of the joints if the ratio to the variance without the
+    # hypothesis is below this value.
+    lower: float = 0.9
     # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.

@@ -113,6 +113,6 @@ def _evidence(before: float, after: float) -> str:
 
     before, after: mean squared residual, divided by the variance of the torques.
     """
-    if after < 0.9 * before:
+    if after < GEOMETRY.lower * before:
         return f"the squared torque error of least squares falls from {before:.2%} to {after:.2%} of the variance"
     return "the torque error of least squares remains the same, with plausible positions, masses, inertias and friction"

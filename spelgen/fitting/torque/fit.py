@@ -232,20 +232,25 @@ def _compared_fit(
     # A fit that is supported by its data is kept even if the URDF is exact: it has the smaller intervals.
     if nmse(best.held_out) > TUNING.unsupported:
         model.load_state_dict(initial)
-        unfitted = _unfitted(model, samples, prior)
+        unfitted = _unfitted(model, samples, prior, blocks)
         if unfitted.held_out.sum() <= best.held_out.sum():
             best, discarded = unfitted, nmse(best.held_out)
     model.load_state_dict(best.parameters)
     return best, FitComparison(nmse(best.held_out), nmse(other), behind(best), replaced, discarded)
 
 
-def _unfitted(model: ArmModel, samples: TorqueSamples, prior: GaussianPrior) -> _StagedFit:
-    """Return the current parameters of a model as an estimate with the covariance of the prior."""
+def _unfitted(
+    model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, blocks: Sequence[TorqueSamples]
+) -> _StagedFit:
+    """Return the current parameters of a model as an estimate with the covariance of the prior.
+
+    blocks: contiguous blocks of `samples`, for which the squared errors are computed.
+    """
     problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
     state, free = initial_state(problem, problem.prior.mean), problem.free
     covariance = problem.of_all_parameters(torch.linalg.inv(problem.prior.precision[free][:, free]))
     residual = problem.jacobian.residual_samples(state.x).torque_residual
-    sizes = [block.count for block in contiguous_blocks(samples)]
+    sizes = [block.count for block in blocks]
     squares = torch.stack([block.square().sum(dim=0) for block in residual.split(sizes)])
     held_out = (squares / problem.noise_estimator.torque_std.square()).sum(dim=1)
     estimate = TorqueEstimate(problem, state, covariance)
