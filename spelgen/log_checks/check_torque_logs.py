@@ -370,7 +370,7 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))
     note = (
         "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
-        "variance that gravity explains, beside friction and acceleration; x URDF: ratio to the URDF's gravity "
+        "variance that gravity explains, in addition to friction and acceleration; x URDF: ratio to the URDF's gravity "
         "torque."
     )
     return Listing("Physics", head, tuple(rows), note)

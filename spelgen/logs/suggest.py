@@ -126,7 +126,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
         raise LogError(
-            f"no {listed(absent)} beside its other columns", file=file, expected=expected, do=JOINING
+            f"no {listed(absent)} in addition to its other columns", file=file, expected=expected, do=JOINING
         )
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
