@@ -288,7 +288,7 @@ def prior_covariance(
     """Return the prior covariance (K, K) of the flattened parameters.
 
     parameters: {name: values}, K values in total. groups: {name: parameter group}. widths: prior standard deviations of
-    the groups, and of the factors common to all joints.
+    the groups, and of factors common to all joints, such as one factor of all armatures (see `SHARED`).
     """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
@@ -316,14 +316,14 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     The groups are bodies, armatures and torque offsets. The width s of a group is its prior standard deviation. In
     Laplace's approximation, the marginal likelihood has its maximum at the fixed point of s^2 = |x - mean|^2 / gamma,
     where gamma = k - tr(covariance) / s^2 is the effective number of the group's k parameters (MacKay, Bayesian
-    Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled inverse chi-squared hyperprior with c
-    degrees of freedom about its initial value s0^2, so that the fixed point is s^2 = (|x - mean|^2 + c s0^2) / (gamma +
-    c). The width has an upper bound.
+    Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled inverse chi-squared hyperprior with c =
+    `degrees_of_freedom` degrees of freedom and its initial value s0^2 as scale, so that the fixed point is s^2 = (|x -
+    mean|^2 + c s0^2) / (gamma + c). The width has an upper bound.
 
-    The width of a single body has a hyperprior of the same form about the common width s of all bodies. Integrated over
-    the width of the body, its prior is a t distribution with c degrees of freedom and scale s. In the fixed point for
-    s, the squared parameters of a body have the weight s^2 / (width of the body)^2 (Lange, Little and Taylor, J. Am.
-    Stat. Assoc. 84:881, 1989).
+    The width b of a single body has a hyperprior of the same form, with the width s of the group in place of s0.
+    Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale s. In
+    the fixed point for s, the squared offsets x - mean of a body have the weight s^2 / b^2 (Lange, Little and Taylor,
+    J. Am. Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.
@@ -339,7 +339,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         c is the number of degrees of freedom of the hyperprior.
 
         Args:
-            center: width about which the hyperprior is.
+            group: name of the group, for the upper bound.
+            center: scale of the hyperprior: s0, or for a single body the width s of all bodies.
             squares: sum of squared offsets from the prior mean.
             gamma: effective number of parameters, same shape as squares.
         """

@@ -96,7 +96,7 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the nMSE of held-out blocks, (n,), corrected such that too small and too large values are as likely.
+    """Return the nMSE of held-out blocks, (n,), corrected to be too small and too large with equal probability.
 
     The mean of few squared errors is more often too small than too large. The sum of the squared errors of S seconds is
     assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.

@@ -4,15 +4,15 @@ Several recordings are held out one at a time, or in groups if there are more th
 into ten contiguous blocks, which are held out one at a time, with a gap on both sides, since successive errors are
 correlated. A candidate must pass three tests:
 
-- The mean relative error reduction over ten blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two
-  recordings).
+- The relative reduction of the held-out squared error, averaged over ten blocks of all samples, is significant
+  (one-sided t test, 1 %, or 0.1 % for one or two recordings).
 - Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
   repeats errors that another motion does not have.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).
 
-If no candidate of a joint passes, the first two tests use only the held-out samples whose positions are within the
-range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the
-largest error reduction is selected.
+If no candidate of a joint passes, the tests are repeated without the samples whose positions are outside the range of
+the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the largest
+error reduction is selected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -118,8 +118,8 @@ def select_functions(
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
 
-    The bounds apply to terms that are selected on one or two recordings. The bound of a smooth torque is zero for
-    joints without gravity load, since springs and gas cylinders balance a load.
+    The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
+    torque splines is zero for joints without gravity load, since the springs that they represent balance a load.
 
     Args:
         model: fitted model.
