@@ -270,7 +270,7 @@ class Figure:
 
 
 def figures(results: Results) -> list[Figure]:
-    """Return the known numbers of the model: nMSE of torques, errors of the longest rollout and under replayed commands."""
+    """Return known numbers of the model: nMSE of torques, errors of longest rollout and of replayed commands."""
     candidates = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]
