@@ -63,7 +63,7 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """Error: the polynomial of an entry needs more multiplications of polynomial terms than the budget allows."""
+    """Error: the polynomial of an entry needs more multiplications of polynomial terms than its `Expansion` permits."""
 
 
 class Expansion:

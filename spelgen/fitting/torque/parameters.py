@@ -127,7 +127,7 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
         return
     with torch.no_grad():
-        # The inverse dynamics are logged torques, here converted to joint torques by the initial gains.
+        # `inverse_dynamics` returns torques as logged. They are converted to joint torques by the initial gains.
         joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
         rigid = joint - model.friction_torque(q, qd)
         # columns: (joints, T, 4), the regressor of each joint whose gain is trained: rigid-body torque, velocity, sign
@@ -198,8 +198,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    # After an overflow, the fraction cannot be computed. The whole step is returned; the solver rejects it because of
-    # its cost.
+    # If the change of S has overflowed, the fraction of it that keeps S positive definite cannot be computed. The whole
+    # step is returned; the solver rejects it because of its cost.
     if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
@@ -246,10 +246,11 @@ class ParameterPrior:
 
     Attributes:
         rigid: `ParameterVector` of the parameters x.
-        widths: current standard deviation of each group; for bodies, the scale of the t distribution.
-        hyperprior: the initial standard deviations, about which the estimates have a hyperprior.
+        widths: current standard deviation of each group of parameters; for bodies, the scale of the t distribution.
+        hyperprior: initial standard deviation of each group, the center of the hyperprior of its width (see
+            `update_widths`).
         mean: prior mean of x, (K,).
-        body_widths: current standard deviation of each body, (B,).
+        body_widths: current standard deviation of the Gaussian of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -341,7 +342,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         Args:
             group: name of the group, for the upper bound.
             center: scale of the hyperprior: s0, or for a single body the width s of all bodies.
-            squares: sum of squared offsets from the prior mean.
+            squares: sum of squares of x - prior mean.
             gamma: effective number of parameters, same shape as squares.
         """
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
@@ -359,7 +360,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         centring = torch.eye(count).double()
         if group in SHARED and count:
             # The common factor of all joints has a separate width. The width of single joints is therefore estimated
-            # from offsets minus their mean over the joints.
+            # from x - prior mean, minus the mean of this difference over the joints.
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = centring.trace() - spread.trace() / current[group] ** 2

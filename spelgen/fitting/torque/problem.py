@@ -294,8 +294,8 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # noise^2 / (correlation length) is the mean squared residual (see `NoiseEstimator`), which does not depend on
-        # the sample interval.
+        # noise^2 is defined as the mean squared residual times the correlation length (see `NoiseEstimator`). The mean
+        # squared residual does not depend on the sample interval, so noise^2 is proportional to the correlation length.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -358,8 +358,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the weight of the estimated correlation time, if the weight of its prior mean is 1: a ratio of numbers
-    # of independent errors.
+    # The prior mean has the weight 1, and the estimated correlation time has `weight`: the number of independent errors
+    # in the samples divided by the number to which the prior mean is equivalent.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

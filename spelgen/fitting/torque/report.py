@@ -102,7 +102,8 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # The correction of the nMSE is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
+    # The correction is important only for short logs: the factor is 1.27 for three seconds of motion, and 1.06 for
+    # twelve.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 

@@ -106,7 +106,8 @@ def select_functions(
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
     # With two recordings, each of two fits predicts half of the ten blocks, so the errors of the blocks are not
-    # independent. The stricter test is then used, as for a single recording.
+    # independent. As for a single recording, a candidate must then pass the test with `standard_errors_of_one`, and its
+    # torque is bounded.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -177,8 +178,8 @@ def _best(
                 best[index] = _better(
                     best[index], SelectedTerm(candidate.parameter, candidate.joint, reduction)
                 )
-    # A candidate that passes the tests on all held-out samples is preferred, since it also predicts the torque at
-    # positions outside the fitted range.
+    # `best`: the best candidate in tests on all held-out samples, and the best in tests on held-out samples within the
+    # fitted range of positions. The first is preferred, since it also predicts the torque outside this range.
     return best[0] or best[1]
 
 
@@ -259,8 +260,8 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # If a term halves the squared error of one block and doubles the squared error of another, the relative reductions
-    # g of these blocks add up to zero.
+    # g is used because it is symmetric: if a term halves the squared error of one block and doubles the squared error
+    # of another, their values of g add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:
