@@ -146,8 +146,8 @@ class TorqueLogs:
             return []
         message = (
             "currents or parts of a torque with a gain of 1: write 'gain', Nm per unit at the joint, the gear "
-            "included, under 'logs' in the robot's YAML; until then, senses, order and zeros of the joints are not "
-            "tested"
+            "included, under 'logs' in the robot's YAML, or, if it is unknown, 'torque: motor' and for each joint "
+            "'gain: trained' under 'joints'; until then, senses, order and zeros of the joints are not tested"
         )
         return [Diagnostic("warning", CURRENT, f"joint {', '.join(map(repr, names))}", None, message)]
 

@@ -31,8 +31,8 @@ WORDS = {
         ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
-        ("tau", "tau τ torque torques trq tq tor effort efforts force forces qfrc moment load current currents curr "
-                "cur drehmoment strom couple par 力矩 扭矩"),
+        ("tau", "tau τ torque torques trq tq tor eff effort efforts force forces qfrc moment load current currents "
+                "curr cur drehmoment strom couple par 力矩 扭矩"),
     )
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
@@ -229,8 +229,8 @@ def _by_quantity(
     The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
     commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints.
-    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques, unless the word is part
-    of a joint's name.
+    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques. Words of joints' names
+    do not count as words for commands.
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = set().union(*(_column_name(joint, set()).words for joint in joints))
@@ -238,7 +238,7 @@ def _by_quantity(
         quantity = next((x for x, words in WORDS.items() if column.words & words), None)
         if quantity is None:
             quantity = next((x for x, units in UNITS.items() if column.unit in units), None)
-        if commands and column.words & COMMANDED and quantity in ("q", None):
+        if commands and column.words & (COMMANDED - names) and quantity in ("q", None):
             quantity = "u"
         elif column.words & (NOT_MEASURED - names):
             continue

@@ -134,7 +134,7 @@ def fit_torque(
         # With `adapt`, motor gains and friction of the model are results of an earlier fit and not nominal values, so
         # they are not changed.
         subset = samples.subsampled(TUNING.initial_samples)
-        set_initial_gains(model, subset, prior.gains)
+        prior = prior.model_copy(update={"gains": set_initial_gains(model, subset, prior.gains)})
         limit_friction(model, subset.columns)
         fitted, comparison = _compared_fit(model, samples, prior)
     else:

@@ -112,20 +112,29 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
     return torque
 
 
-def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> None:
-    """Correct initial values of trained motor gains that are wrong by a large factor.
+def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> float:
+    """Correct initial values of trained motor gains that are wrong by a large factor; return their prior width.
 
     Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
     measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
     together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
     without a significant coefficient have the median coefficient of the others.
 
-    deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
-    coefficient exceeds three standard deviations.
+    Corrected gains have the scale of the URDF's masses at the most loaded links, so their prior is wide: the prior of
+    all bodies determines the scale.
+
+    Args:
+        model: model whose motor gains are corrected.
+        samples: samples with torques as logged, (T, n) [Nm, N].
+        deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
+            coefficient exceeds three standard deviations.
+
+    Returns:
+        `deviation` if no gain was changed, otherwise the upper bound of prior standard deviations.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
-        return
+        return deviation
     with torch.no_grad():
         # `inverse_dynamics` returns torques as logged. They are converted to joint torques by the initial gains.
         joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
@@ -143,9 +152,11 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
         slope = weights[:, 0, 0]
         known = slope > TUNING.min_significance * (correlated * variance).sqrt()
         if not known.any():
-            return
+            return deviation
         factors = -torch.where(known, slope, slope[known].median()).log()
-        inputs.raw_gains.add_(torch.where(factors.abs() > 3 * deviation, factors, 0.0))
+        wrong = factors.abs() > 3 * deviation
+        inputs.raw_gains.add_(torch.where(wrong, factors, 0.0))
+        return TUNING.max_width if wrong.any() else deviation
 
 
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
