@@ -237,10 +237,10 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
                 return None
-        # The advised line replaces the joint's line `sign_bit` in the mapping, and therefore repeats the sign bits of
-        # its other signals.
-        stated = {x: mapping.word("sign_bit", x, signals.joint) for x in signals.trajectory.quantities}
-        words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
+        # The advised line replaces the joint's line of the same key, `sign_bit` or `period`, in the mapping, and
+        # therefore repeats the values of its other signals.
+        stated = {x: mapping.word(word.key, x, signals.joint) for x in signals.trajectory.quantities}
+        words = {x: plain_number(y, 9) for x, y in stated.items() if y}
         keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
         if turn == 360.0 and unit is None:
             unit, units = "deg", {name: "deg"}

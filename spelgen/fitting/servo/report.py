@@ -250,10 +250,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # An undetermined dead zone is not in the list of undetermined ratios: in most cases the logs do not
-                # distinguish it from dry friction of the same joint, which is in the list.
-                if column != "dead_zone":
-                    undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
+                undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     end = "All ratios are determined"
