@@ -6,7 +6,7 @@ are the raw integers of a drive's register: they overflow at a period, or have a
 """
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -202,7 +202,7 @@ class Word(NamedTuple):
         values: (T,) decoded signal in the unit of the log.
     """
 
-    key: str
+    key: Literal["period", "sign_bit"]
     value: float
     values: np.ndarray
 
