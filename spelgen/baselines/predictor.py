@@ -113,8 +113,8 @@ def _stepper(
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u) with the approximate Jacobian A: the next state is u + step (3 k1 + k2) / 2, where (1 - h
-        # A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for u' = F(u) with the approximate Jacobian A and h = GAMMA * step: the next state is u + step (3 k1 +
+        # k2) / 2, where (1 - h A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -135,8 +135,13 @@ def _friction_slopes(
     """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
 
     D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
-    a joint depends only on the motion of the joint. Friction depends on position through the bristles. width: (n,)
-    finite-difference steps of velocity [rad/s, m/s].
+    a joint depends only on the motion of the joint. Friction depends on position through the bristles.
+
+    Args:
+        dynamics: dynamics of the arm.
+        pose: mass matrix and forces at the positions.
+        qd, z: velocities (W, n) [rad/s, m/s] and friction state (W, n, K) [rad, m] of K bristles.
+        width: finite-difference steps of velocity, (n,) [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
@@ -208,10 +213,10 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of integrator steps per sample interval, chosen at the first use: evaluations of torques need none.
+        """Number of integrator steps per sample interval; it is computed when motion is predicted for the first time.
 
-        A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
-        less than `TUNING.tolerance` times the error of the predictions.
+        The number is doubled until twice as many steps change the predictions of the `probe` windows by less than
+        `TUNING.tolerance` times the error of the predictions.
         """
         windows = thinned(self.probe, TUNING.probed_windows)
         motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)

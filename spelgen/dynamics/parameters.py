@@ -22,10 +22,14 @@ class ParameterInfo:
     """Group and unit of a trained parameter of a model. Fits select parameters by group.
 
     Attributes:
-        kind: group of the parameter: bodies (inertial parameters), armature, gains (of motors), offset (of torque),
-            friction_compensation; of friction: sizes (magnitude), effects (dependence on velocity), velocities,
-            load_dependence, fractions (of bristles); residual terms: torque_splines, torque_ripple, friction_splines,
-            mass_residuals; of M: mass_constants; of servos: stiffness, damping, dead_zone, delay; or network.
+        kind: group of the parameter, one of
+            rigid bodies and drives: bodies (inertial parameters), armature, gains (of motors), offset (of torque),
+                friction_compensation;
+            friction: sizes (viscous and Coulomb coefficients), effects (Stribeck and saturation torques), velocities
+                (velocity scales), load_dependence, fractions (of bristles);
+            residual terms: torque_splines, torque_ripple, friction_splines, mass_residuals;
+            models of networks: mass_constants (constants in M), network (weights and biases);
+            position servos: stiffness, damping, dead_zone, delay.
         unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
             parameters are the logarithm of this quantity divided by a nominal value.
     """
@@ -131,9 +135,10 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
 
 
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the torque of the residual terms of M and V, (..., n) [Nm, N]; zeros for a model without them.
+    """Return the torque of the residual terms of a model, (..., n) [Nm, N]; zeros for a model without them.
 
-    q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
+    These terms are added to the mass matrix M and the potential energy V. q, qd, qdd: positions [rad, m], velocities
+    [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)

@@ -123,7 +123,7 @@ class PreparedModel:
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each."""
+            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; ``speed`` is qd."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -166,7 +166,8 @@ class PreparedModel:
 
         A is the derivative with respect to the state (q, qd), B with respect to the inputs tau. Without dt, A and B are
         derivatives of the rate (qd, qdd) at constant z (continuous time). With dt [s], A and B are derivatives of q and
-        qd after ``step`` (discrete time).
+        qd after ``step`` with ``substeps`` Runge-Kutta steps (discrete time). z: friction state, by default
+        ``memory(qd)``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z

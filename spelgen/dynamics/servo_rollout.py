@@ -1,12 +1,12 @@
 """Rollouts of arms with position servos: positions under logged commands, by an implicit integration method.
 
 Servos act as springs, kp times the position error. These springs and dry friction are stiff. Both are integrated
-implicitly, so that a few steps between samples are stable for any kp. Springs are linearised at the start of a step
-(Rosenbrock method with the weights of the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed
-for each step: decaying motion then has its true rate of decay to third order (exponential fitting; Liniger and
-Willoughby, SIAM J. Numerical Analysis 7:47, 1970). Theta is 1/2 for slow motion, without numerical damping, and tends
-to 1 for motion that is too fast for the step. The friction state is not integrated, but computed from the displacement
-in the step.
+implicitly, so that a few steps between samples are stable for any kp. Springs are nonlinear (dead zone, torque limit),
+and are linearised at the start of a step (Rosenbrock method with the weights of the theta method; Hairer and Wanner,
+Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step from its duration x in units of the time
+constant of decay: it is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for
+the step. The computed decay is then exact to third order in x (exponential fitting; Liniger and Willoughby, SIAM J.
+Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step.
 """
 
 from typing import NamedTuple
@@ -22,9 +22,10 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 class ServoDrives(NamedTuple):
-    """Constants of servos and friction of an arm, (..., n), in the layout that rollouts of this module use.
+    """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
 
-    Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
+    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): a
+    rollout takes two thirds of the time that it takes with (..., n, K).
     """
 
     servo: ServoConstants
@@ -79,8 +80,9 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
     """Return the initial state of a rollout: q, qd, and the friction state that balances all other torques.
 
-    The acceleration is then zero, as for an arm at rest or in steady motion. If the other torques exceed the largest
-    dry friction, all bristles have their break-away displacements, and the acceleration is not zero.
+    The acceleration is then zero, as for an arm at rest or in steady motion. All bristles of a joint are deflected by
+    the same fraction of their break-away displacements. If the other torques exceed the largest dry friction, the
+    fraction is 1 and the acceleration is not zero.
 
     Args:
         drives: constants of servos and friction.
@@ -149,10 +151,10 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
     """Return the displacement x of each joint that balances a force against a spring and K bristles, (..., n).
 
-    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) is the deflection of bristle k after the
-    displacement x. For a given number of sliding bristles, 0 to K, the equation is linear in x. Of the solutions of
-    these K + 1 linear equations, the one with the largest |x| is valid: a bristle resists with at most its sliding
-    force, so that the true resistance is the smallest of the K + 1 linear ones.
+    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
+    deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
+    linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
+    resists with at most its sliding force, so that the true resistance is the smallest of the K + 1 linear ones.
 
     Args:
         push: force on the joint, (..., n).
