@@ -41,7 +41,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
 
     The constants are armature, viscous friction, Coulomb friction, torque offset and, if motor gains are trained, gain.
     The function returns (4, n) for a model, or (5, n) with gains. Viscous and Coulomb friction approximate the friction
-    by least squares up to the typical speed.
+    by least squares up to the typical speed of each drive.
     """
     line = friction_line(model)
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
@@ -66,10 +66,10 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
 def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n) [Nm s/rad, N s/m; Nm, N].
 
-    The coefficients are the slope and the intercept of a straight line through the friction torque at speeds up to the
-    typical speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and
-    the factor by which residual terms multiply friction at these positions are computed only once, from the argument
-    ``model``: the same load and factor are also used for models with other friction parameters.
+    The coefficients are the slope and the intercept of a straight line, fitted by least squares to the friction torque
+    at speeds up to the typical speed of each drive (`friction.speed`). The friction torque is averaged over random
+    positions. It depends on the gravity load and on the friction factor of residual terms. Both are computed once, from
+    the argument ``model``, and are then constant for all models.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]

@@ -102,7 +102,10 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""
 
     def normal_equations(self, x: Parameters, residual: Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
+        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters.
+
+        residual: result of `residual` at x.
+        """
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
         """Return one or more candidates for the parameters x after a step (k,) of the k free parameters.

@@ -137,10 +137,10 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the divisors of the errors in the losses for windows of logs.
+    """Return the divisors of the errors of q, qd and tau in the losses for windows of logs, from the logged motion.
 
-    A joint that hardly moves has 1 % of the largest scale of all joints. Raises LogError if no joint moves, since
-    windows at rest do not determine a model.
+    A divisor is at least 1 % of the largest one of all joints, also for a joint that hardly moves. Raises LogError if
+    no joint moves, since windows at rest do not determine a model. joint_types: see `position_difference`.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     if moved.abs().max() < AT_REST:
@@ -170,7 +170,8 @@ def rollout_errors(
 ) -> Tensor:
     """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities.
 
-    There are W windows of K samples; the first sample of a window is the initial state and has no error.
+    There are W windows of K samples; the first sample of a window is the initial state and has no error. substeps,
+    solver: see `roll_out`.
     """
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q

@@ -103,7 +103,12 @@ def _resumed(config: FitConfig | FitOptions | None, record: Record) -> FitConfig
 def robot_of(
     module: Path | None, urdf: Path | str | None, spec: ModelSpec
 ) -> tuple[Path | None, list[Diagnostic]]:
-    """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF."""
+    """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF.
+
+    The URDF is `urdf` or, if it is None, the file named in `spec` in the folder of `module`. It must be the URDF from
+    which the module was built: otherwise ModuleError is raised for `urdf`, and a warning is returned for the file
+    beside the module. Raises RunError if there is no file `urdf`.
+    """
     if urdf is not None:
         path = Path(urdf)
     elif module is not None:

@@ -19,11 +19,13 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
     computed by their derivatives. Users of the result multiply standard deviations by 1.96. The covariance is therefore
     scaled such that this product is half the 95 % interval of Student's t.
 
-    Two covariances are added. The first is the variance of kd, armature and friction due to errors of the friction
-    model (`ServoTuning.model_deviation`). The second is the prior covariance of the body parameters in the directions
-    that the fit does not change. If no kp is known, a common factor of all torques has at least the prior standard
-    deviation of masses: the logs may determine this factor by effort limits, but the limits in URDFs often differ from
-    the limits of the motors.
+    Two covariances are added to it: the variance of kd, armature and friction due to errors of the friction model
+    (`ServoTuning.model_deviation`), and the prior covariance of the body parameters in the directions that the fit does
+    not change.
+
+    If no kp is known, the logs determine the common factor of all torques only by effort limits, and the limits in
+    URDFs often differ from the limits of the motors. The variance of the logarithm of this factor is therefore raised
+    to at least the prior variance of the logarithm of a mass.
 
     The result also has the standard deviation of the delay, `delay_std` [s].
     """

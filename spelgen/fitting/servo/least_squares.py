@@ -100,7 +100,10 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     # differences change one of the four unknowns at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
-        """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m]."""
+        """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m].
+
+        delay: delay of the commands [s].
+        """
         return windows.commands(delay).mean(dim=2).numpy()
 
     def delayed_error(delay: float) -> float:

@@ -84,8 +84,9 @@ class ServoPosterior(Posterior):
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
         """Return the quantities of the servos that have intervals, and the function that returns their values.
 
-        The quantities are kp, and seven ratios: kd/kp, lag, armature/kp, coulomb/kp, dead zone, static error and
-        offset/kp (see `SERVO_UNITS`). The function returns (8, n) for a model.
+        The quantities are kp, kd/kp, lag (kd/kp plus the delay), armature/kp, coulomb/kp, dead zone (half its width),
+        static error (coulomb/kp plus half the dead zone) and offset/kp, with the units `SERVO_UNITS`. The function
+        returns (8, n) for a model.
         """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
@@ -93,7 +94,7 @@ class ServoPosterior(Posterior):
         ]
 
         def ratios(model: ArmModel) -> Tensor:
-            """Return kp and seven ratios of servo constants to kp, (8, n), in the order of `SERVO_UNITS`."""
+            """Return the values of the quantities in `SERVO_UNITS`, (8, n), in this order."""
             servo, kp = model.servo, model.servo.kp()
             damping, dry = servo.kd() / kp, line(model)[1] / kp
             return torch.stack([

@@ -139,10 +139,12 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
     """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
 
+    Dry friction depends on velocity and gravity torque, and is averaged over samples (`sliding_friction`).
+
     Args:
         model: model with position servos.
-        qd: velocities, (..., n) [rad/s, m/s].
-        gravity: gravity torques, (..., n) [Nm, N].
+        qd: velocities of the samples, (..., n) [rad/s, m/s].
+        gravity: gravity torques of the samples, (..., n) [Nm, N].
     """
     servo, kp = model.servo, model.servo.kp()
     dry = sliding_friction(model.friction, qd, gravity) / kp
@@ -189,10 +191,10 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    steps: number of Levenberg-Marquardt steps of the fit. The ratios are kd / kp, armature / kp and friction / kp, each
-    with its 95 % interval. The key "determined" of a ratio is True if the upper end of its interval is below
-    `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the logs must also distinguish one
-    from the other (see `identifiable`).
+    The ratios are the keys of `RATIOS`, each with its 95 % interval. The key "determined" of a ratio is True if the
+    upper end of its interval is below `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the
+    logs must also distinguish one from the other (see `identifiable`). x: fitted parameters. steps: number of
+    Levenberg-Marquardt steps of the fit.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},

@@ -56,7 +56,10 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts with ``motion`` as the fixed motion and x as x0; the model's parameters are set to x."""
+        """Return the rollouts with the load computed along ``motion`` (the fixed motion) for parameters x (the new x0).
+
+        The model's parameters are set to x.
+        """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -66,11 +69,11 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return the measured motion, whose velocities and accelerations are computed by rollouts with parameters x.
+        """Return the measured positions, with velocities and accelerations that use rollouts with the parameters x.
 
-        Positions are the measured ones. Velocities and accelerations are the derivatives of the predicted motion plus
-        smoothed derivatives of measured minus predicted positions: smoothed derivatives of the measured positions only
-        would attenuate fast motion (see `ServoWindows.motion`).
+        Velocities and accelerations are the derivatives of the predicted positions plus smoothed derivatives of the
+        differences, measured minus predicted positions: smoothed derivatives of the measured positions only would
+        attenuate fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

@@ -126,8 +126,8 @@ class TorqueJacobian:
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
         """Return the initial divided by the current motor gain of each joint, (..., n) [1]; 1 for fixed gains.
 
-        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`:
-        {name: values}, or values of a batch (...) of sets.
+        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`.
+        parameters: {name: values} of one set of parameters, or of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
         # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
@@ -299,7 +299,8 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: gravity torque on the drives, (T, n); None: it is computed from the parameters.
+        block: T samples with their regressors. load: gravity torque on the drives, (T, n); None: it is computed from
+        the parameters.
         """
         samples = block.samples
 
@@ -319,12 +320,16 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints on which no common drive
-        acts may have the same colour. A parameter of a drive, or the gravity torque on it, then affects the torque of
-        at most one joint of a colour. The torques of all joints of a colour are added. Each element of the gradient of
-        this sum is an element of the Jacobian row of a single joint, so that the gradient contains the rows of all
-        these joints. One reverse pass per colour (most arms have one colour) replaces n passes. Each sample has its own
-        copy of the parameters, so that a pass computes the gradients of all samples.
+        The rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
+        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
+        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
+        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
+        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
+        pass gives the derivatives of all samples.
+
+        Args:
+            parameters: {name: values}, the parameters at which the derivatives are computed.
+            block: T samples with their regressors.
 
         Returns:
             The scaled residual, (T, n) [Nm, N].

@@ -38,11 +38,11 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries, for example the spline coefficients of the joint. The first L weights are coefficients of
-    trends, which change all entries together: the mean and the slope of the spline coefficients. The last W weights
-    change single entries. The entries are the sum of these changes.
+    The term has W entries, for example the spline coefficients of the joint. For the weights w (P,), the entries are
+    trends @ w[:L] + w[L:]. The L trends, for example mean and slope of the spline coefficients, change all entries
+    together.
 
-    scale: the parameter in the model is the entries divided by this number.
+    scale: the parameter of the model is entries / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
@@ -210,7 +210,8 @@ def joint_functions(
     extrapolates to positions without samples (torque of a spring). Ripple has one precision per frequency, and only
     frequencies of which the samples contain two periods: slower ones fit a trend, and are wrong at other positions.
 
-    selected: (parameter, joint) of the terms to yield; None: all.
+    projection: projection onto the rigid-body and friction model. selected: (parameter, joint) of the terms to yield;
+    None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():

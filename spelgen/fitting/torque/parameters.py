@@ -120,8 +120,8 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
     together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
     without a significant coefficient have the median coefficient of the others.
 
-    Corrected gains have the scale of the URDF's masses at the most loaded links, so their prior is wide: the prior of
-    all bodies determines the scale.
+    A corrected gain is wrong by the same factor as the URDF's masses of the most loaded links. The prior of the gains
+    is then wide, so that the prior of all bodies determines the common scale of gains and masses.
 
     Args:
         model: model whose motor gains are corrected.
@@ -325,17 +325,17 @@ def prior_covariance(
 def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
     """Return the prior after one fixed-point step of evidence maximization for the widths of three groups.
 
-    The groups are bodies, armatures and torque offsets. The width s of a group is its prior standard deviation. In
-    Laplace's approximation, the marginal likelihood has its maximum at the fixed point of s^2 = |x - mean|^2 / gamma,
-    where gamma = k - tr(covariance) / s^2 is the effective number of the group's k parameters (MacKay, Bayesian
-    Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled inverse chi-squared hyperprior with c =
-    `degrees_of_freedom` degrees of freedom and its initial value s0^2 as scale, so that the fixed point is s^2 = (|x -
-    mean|^2 + c s0^2) / (gamma + c). The width has an upper bound.
+    The groups are bodies, armatures and torque offsets. The width s of a group is the prior standard deviation of its k
+    parameters, and d is the vector of their offsets x - prior mean. In Laplace's approximation, the marginal likelihood
+    has its maximum at the fixed point of s^2 = |d|^2 / gamma, where gamma = k - tr(covariance) / s^2 is the effective
+    number of parameters (MacKay, Bayesian Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled
+    inverse chi-squared hyperprior with c = `degrees_of_freedom` degrees of freedom, whose scale is the square of the
+    initial width s0. The fixed point is then s^2 = (|d|^2 + c s0^2) / (gamma + c). The width has an upper bound.
 
-    The width b of a single body has a hyperprior of the same form, with the width s of the group in place of s0.
-    Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale s. In
-    the fixed point for s, the squared offsets x - mean of a body have the weight s^2 / b^2 (Lange, Little and Taylor,
-    J. Am. Stat. Assoc. 84:881, 1989).
+    Each body also has a width b of its own. Its hyperprior has the same form, with the width s of all bodies in place
+    of s0. Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale
+    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2
+    (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.

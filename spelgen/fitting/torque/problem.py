@@ -63,7 +63,10 @@ class NoiseEstimator:
     def of(
         cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor = UNBOUNDED
     ) -> NoiseEstimator:
-        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
+        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors.
+
+        max_error: upper bound of the root mean square residual, (n,) [Nm, N].
+        """
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
         # torque.
@@ -141,7 +144,8 @@ class TorqueProblem:
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
-        widths: initial standard deviations of the prior. The initial noise is the upper bound of the noise.
+        widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
+        root mean square torque error (see the class). The initial noise is the upper bound of the noise.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -195,7 +199,10 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters.
+
+        residual: result of `residual`, (n,), which is not used: the residual of each sample is computed here.
+        """
         # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
         # computed first, and the rows and columns of the free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)

@@ -2,10 +2,10 @@
 
 Several recordings are held out one at a time, or in groups if there are more than ten. A single recording is divided
 into ten contiguous blocks, which are held out one at a time, with a gap on both sides, since successive errors are
-correlated. A candidate must pass three tests:
+correlated. Every sample is held out once and then has a held-out error. A candidate must pass three tests:
 
-- The relative reduction of the held-out squared error, averaged over ten blocks of all samples, is significant
-  (one-sided t test, 1 %, or 0.1 % for one or two recordings).
+- The relative reduction of the held-out squared error is significant (one-sided t test over ten contiguous blocks of
+  all samples, 1 %, or 0.1 % for one or two recordings).
 - Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
   repeats errors that another motion does not have.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).

@@ -130,9 +130,10 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of the fits with and without bristles decide (see `_rejected`). If their ratio over all joints favours
-    bristles, a joint has rate-only friction only if its torque residual is also smaller without bristles in most parts
-    of the log: the likelihood ratio of a single joint is unreliable, since the errors of a motion are correlated.
+    likelihoods of the fits with and without bristles decide (see `_rejected`), with one exception. If the likelihoods
+    of all joints together favour bristles, rate-only friction of a joint needs further evidence: the joint's torque
+    residual is significantly smaller without bristles on ten blocks of the log. The likelihood ratio of a single joint
+    is unreliable, since the errors of a motion are correlated.
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
