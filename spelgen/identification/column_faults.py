@@ -161,7 +161,7 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault of a log: positions and velocities of a joint have the opposite sense, with or without torque."""
+    """Kind of fault of a log: a joint's positions and velocities, and perhaps its torques, have the opposite sense."""
 
     code = "joint-sense"
 
@@ -213,16 +213,17 @@ class TorqueUnit(WrongScale):
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
         """Define the candidates.
 
-        factors: factors (n,) on the torques. is_open: (n,) True for joints whose torque may have another unit.
-        is_milli: (n,) True for joints whose torques are declared in mNm.
+        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
+        may have another unit. is_milli: (n,) True for joints whose torques are declared in mNm.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
+        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        A fit with a separate factor for each joint is added if it is better.
+        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
+        yielded, too.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -302,7 +303,10 @@ class TorqueUnit(WrongScale):
 
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
+    """Return True for ratios of torques to the URDF's gravity that wrong inertials do not explain.
+
+    These ratios are at least `GEOMETRY.other_unit`, or at most its inverse; the sign is ignored.
+    """
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
 

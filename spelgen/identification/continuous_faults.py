@@ -220,7 +220,11 @@ class JointClock(Fault):
                 yield from self._best(problem, reading, start, signals)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
+        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time.
+
+        Each set of signals (`_delayed_signals`) and each final delay `GEOMETRY.clock_starts` is an initial guess; the
+        three guesses of lowest cost are refined. unchanged: fit of the unchanged log.
+        """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -275,10 +279,10 @@ class JointClock(Fault):
 
 
 def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:
-    """Return True if a fit with delayed signals has a much smaller torque residual of a joint than the fit `base`.
+    """Return True if delayed signals explain the torque of at least one joint much better than the fit `base`.
 
-    Hysteresis of friction resembles a delay: the residual must be smaller both with a friction model without hysteresis
-    and with one with hysteresis.
+    The joint's squared torque residual in `fit` must be less than `GEOMETRY.delay_gain` times the residual in `base`.
+    Hysteresis of friction resembles a delay, so this must hold for friction models with and without hysteresis.
     """
     stateful = problem.with_hysteresis()
     is_better = fit.errors < GEOMETRY.delay_gain * base.errors

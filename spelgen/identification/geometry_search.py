@@ -112,14 +112,15 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    With hysteresis, the whole decrease shows, but wrong hypotheses also lower the cost more: on recorded arms by up to
-    32, and without hysteresis by up to 17. The decrease with hysteresis is therefore halved, and used if it is then
-    larger than the decrease without hysteresis. For a hypothesis with another delay, the smaller one of both decreases
-    (not halved) is used, since hysteresis resembles a delay.
+    Let a be the decrease of the cost from `base` to a hypothesis without hysteresis, and b the decrease with
+    hysteresis. That residual does not hide a part of b, but b is larger for wrong hypotheses, too: on recorded arms up
+    to 32, and a up to 17. The new cost is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay
+    than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a delay.
 
     Args:
         problem: problem without hysteresis.
-        fits: fits of `problem`; only the best ones, with a cost below the cost of `base`, get other costs.
+        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
+            with hysteresis.
         base: fit of `problem` with which the costs are compared.
     """
     stateful, best = problem.with_hysteresis(), sorted(fits, key=RANK)
