@@ -37,10 +37,11 @@ class ContactObserver:
 
     Attributes:
         low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
-            p of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of
-            the payload.
+            p of the arm; 5 to 14: regressor of the payload. Row 4 is filtered at twice the bandwidth of the observer,
+            all other rows at this bandwidth.
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
-        jerk: Low-pass filtered squared change of dp/dt, (n,) [Nm^2, N^2].
+        jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
+            the change of dp/dt, (n,) [Nm^2, N^2].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
