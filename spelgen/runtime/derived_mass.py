@@ -100,13 +100,13 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    The result is positive definite for all q and all parameters. C denotes M without armature if each
-    function has its nominal mean (``Function.mean``). ``margin``, below 1, is a lower bound of M relative to
-    C: if M - margin C is not positive definite, M is replaced by M' = C + t (M - C). The factor t is the
-    largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The norm |X| is an upper bound of the spectral
-    norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise constant, the derivatives of M' are t times the
-    derivatives of M. The zeros of M and the linear relations between entries of M are valid for C, and
-    therefore for M', too.
+    The result is positive definite for all q and all parameters: M (with armature) may be replaced by M' = C
+    + t (M - C). The matrix C has no armature; it is ``entries`` with the nominal mean of each function
+    (``Function.mean``) and the initial constants. ``margin``, below 1, is a lower bound of M relative to C: t
+    is 1 if M - margin C is positive definite, otherwise the largest of 1/2, 1/4, 1/8, ... with t |M - C| +
+    margin <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is
+    piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the linear
+    relations between entries of M are valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -155,8 +155,9 @@ class DerivedMass(LinearMass):
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return the mass matrix M'(q), (..., n, n), and intermediate values for its derivatives.
 
-        encoded: encoding of q, (..., 2 n). layers: parameter cache. The intermediate values are the values of
-        the network's layers, and the factor t of M' = C + t (M - C), (...).
+        M' = C + t (M - C) is the corrected mass matrix, see ``DerivedMass``. The intermediate values are the
+        values of the network's layers, and t, (...). encoded: encoding of q, (..., 2 n). layers: parameter
+        cache.
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)

@@ -54,7 +54,8 @@ class NetworkDynamics(PortHamiltonian):
     def prepare(self) -> dict[str, Parameters]:
         """Return the parameter caches of M, V and D, with the keys "mass", "potential" and "friction".
 
-        They depend on the trained parameters only, and are valid until a parameter changes.
+        M is the mass matrix, V the potential energy, D the dissipation matrix. The caches depend on the
+        trained parameters only, and are valid until a parameter changes.
         """
         # The offset of V is zero, since a constant in V has no effect on the motion. It is computed as
         # 0 * scale, which has the dtype and device of the model.

@@ -224,7 +224,7 @@ class MaskedMLP(MaskedNetwork):
 
 
 class Bumps(NamedTuple):
-    """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
+    """Arguments and values of the GRID Gaussians per input of a ``MaskedKAN`` layer, (..., inputs, GRID)."""
 
     distance: Tensor  # argument of the Gaussian: input minus grid point (signed), in grid spacings
     height: Tensor

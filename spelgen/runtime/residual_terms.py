@@ -137,11 +137,14 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). If no function or
-        constant exceeds its bound, A + R is positive definite: it is the sum of A - diag(d) and diag(d) + R,
-        with d = 1 / (row sums of |A^-1|). Since diag(1 / d) - A^-1 is diagonally dominant, the first matrix
-        is positive semi-definite. The bounds make all row sums of |R| / sqrt(d d^T) less than one, so that
-        the second matrix, scaled to a unit diagonal of diag(d), is strictly diagonally dominant.
+        R is the residual term of M, linear in its functions and constants (see the class). A + R is positive
+        definite if no function or constant exceeds its bound: ``part`` times the minimum of sqrt(d_i d_j) /
+        |coefficient in R_ij| over the entries of R, with d = 1 / (row sums of |A^-1|).
+
+        Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
+        dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
+        sqrt(d_i d_j) are less than one. The second matrix, scaled to a unit diagonal, is therefore strictly
+        diagonally dominant.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.
@@ -196,9 +199,10 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the sum of the residual terms of V, (...) [J]; cache: configuration cache at q.
+        """Return the sum of the residual terms of the potential energy V, (...) [J].
 
-        The energy of a B-spline is the integral of its torque from the middle of the spline to q.
+        cache: configuration cache at q. The energy of a B-spline is the integral of its torque from the
+        middle of the spline to q.
         """
         distance = self._distances(cache.q)
         size = distance.abs()
@@ -250,9 +254,9 @@ class ResidualTerms(nn.Module):
     def waves(self, q: Tensor) -> Tensor:
         """Return cos(f q) for all ripple frequencies f of each joint, then sin(f q).
 
-        A joint has HARMONICS + 2 frequencies: multiples of its revolution, and two of the motor's for large
-        gear ratios. The shape is (..., n, 2 HARMONICS + 4). A sum of these functions is the torque ripple of
-        a joint.
+        The shape is (..., n, 2 HARMONICS + 4). f is the number of periods per revolution of the joint: 1, 2,
+        ..., HARMONICS + 2. If the gear ratio exceeds HARMONICS, the last two are the gear ratio and twice the
+        gear ratio. A weighted sum of these functions is the torque ripple of a joint.
         """
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)
