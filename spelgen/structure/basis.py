@@ -5,8 +5,9 @@ weighted sum of the entries of M. A functional depends only on the joints in a s
 changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
 all changes.
 
-The f_j are selected greedily: sets of joints close to the tip first, small sets before large ones, single entries of M
-before sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
+The f_j are selected greedily. The sets J are tried in the order of their joint closest to the root, joints at the tip
+first, and sets with the same such joint in the order of their size. For each set, single entries of M are tried before
+sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
 selection is optimal.
 """
 
@@ -168,10 +169,10 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: (m, entries), rows of coefficients of a basis of the functionals that vanish on all changes of M caused
-            by other joints.
-        bound: indices of the pivots of an echelon basis of these changes. A row of `kernel` has one entry of M outside
-            of `bound`, with the coefficient 1; its other entries are in `bound`.
+        kernel: (m, entries), coefficients of a basis of the functionals that vanish on all changes of M caused by other
+            joints. Each row has the coefficient 1 for one entry of M that is not in `bound`; its other nonzero
+            coefficients belong to entries in `bound`.
+        bound: indices of the entries of M that are pivots of an echelon basis of these changes.
         tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """

@@ -131,8 +131,9 @@ def coefficients(
 ) -> list[Element]:
     """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
 
-    The recursion computes with vectors of 10 B numbers in place of numbers: since M and V are linear in the inertial
-    parameters, each entry becomes the row of its coefficients if unit vector k replaces the inertial parameter k.
+    M is the mass matrix, V the potential energy. The recursion computes with vectors of 10 B numbers in place of
+    numbers: since M and V are linear in the inertial parameters, each entry becomes the row of its coefficients if unit
+    vector k replaces the inertial parameter k.
 
     Args:
         arm: the arm.
