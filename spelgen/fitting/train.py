@@ -106,8 +106,8 @@ def robot_of(
     """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF.
 
     The URDF is `urdf` or, if it is None, the file named in `spec` in the folder of `module`. It must be the URDF from
-    which the module was built: otherwise ModuleError is raised for `urdf`, and a warning is returned for the file
-    beside the module. Raises RunError if there is no file `urdf`.
+    which the module was built: otherwise ModuleError is raised for `urdf`, and a warning is returned for the file in
+    the folder of `module`. Raises RunError if there is no file `urdf`.
     """
     if urdf is not None:
         path = Path(urdf)

@@ -104,9 +104,9 @@ class DerivedMass(LinearMass):
     + t (M - C). The matrix C has no armature; it is ``entries`` with the nominal mean of each function
     (``Function.mean``) and the initial constants. ``margin``, below 1, is a lower bound of M relative to C: t
     is 1 if M - margin C is positive definite, otherwise the largest of 1/2, 1/4, 1/8, ... with t |M - C| +
-    margin <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is
-    piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the linear
-    relations between entries of M are valid for C, and therefore for M', too.
+    margin <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t
+    is piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the
+    linear relations between entries of M are valid for C, and therefore for M', too.
     """
 
     def __init__(
