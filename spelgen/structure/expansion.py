@@ -98,7 +98,7 @@ class Expansion:
         )
 
     def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
-        """Return the coefficient of an inertial parameter in an entry of M or in V, as a polynomial.
+        """Return the coefficient of an inertial parameter in an entry of M or the potential energy V, as a polynomial.
 
         The variables of the polynomial are cosines, sines and lengths that depend on the joint positions.
 

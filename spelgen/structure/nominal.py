@@ -5,8 +5,8 @@ a model, not its structure. If the inertials of a URDF are absent or physically 
 used.
 
 The ten inertial parameters of a body are mass m, first moment h and inertia I. They are physically consistent, that is,
-belong to a distribution of mass, if and only if the pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is
-positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+belong to a distribution of mass, if and only if the pseudo-inertia J = [[S, h], [h^T, m]] is positive definite. S =
+tr(I)/2 E - I, with the identity matrix E (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 """
 
 from collections.abc import Sequence
@@ -125,7 +125,7 @@ def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
 
 
 def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
-    """Return the ten inertial parameters (m, h, I) of each body about the origin of its joint frame.
+    """Return the mass, first moment and inertia (10 numbers) of each body, about the origin of its joint frame.
 
     from_urdf: True: exact values of the URDF; False: default bodies of 1 kg.
     """
@@ -135,10 +135,11 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the ten inertial parameters (m, h, I) of a default body: a sphere of 1 kg, with 0.1 m radius of gyration.
+    """Return the inertial parameters of a default body: a sphere of 1 kg, with 0.1 m radius of gyration.
 
-    They are about the origin of the body's joint frame. The centre of the sphere is half-way to the next joint. For the
-    last body, or if the next joint is closer than 0.2 m, the centre is at (0.1, 0, 0.1) m in the joint frame.
+    They are mass, first moment and inertia about the origin of the joint frame of body ``index``. The centre of the
+    sphere is half-way to the next joint. For the last body, or if the next joint is closer than 0.2 m, the centre is at
+    (0.1, 0, 0.1) m in the joint frame.
     """
     gyration = 0.1  # [m] radius of gyration of a default body
     center = np.zeros(3)
@@ -242,7 +243,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
-    # The inertia tensor is I = tr(S) 1 - S for second moments of mass S. Solved for S, this is S = tr(I)/2 1 - I.
+    # The inertia tensor is I = tr(S) E - S for second moments of mass S and the identity E: hence S = tr(I)/2 E - I.
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]

@@ -90,7 +90,7 @@ def energies(
     Args:
         arm: the arm.
         positions: position of each coordinate.
-        inertias: ten inertial parameters (m, h, I) of each body, in the order of ``Body.inertia``.
+        inertias: mass, first moment and inertia (10 numbers) of each body, in the order of ``Body.inertia``.
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
     """
     transforms = _joint_transforms(arm, positions, number)
