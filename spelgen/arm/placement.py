@@ -56,7 +56,7 @@ class AngleRounding:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the position (3,) [m] and rotation (3, 3) of an <origin>; the rotation is None if all angles are zero.
 
-        where, line: name and line of the element in diagnostics.
+        xyz, rpy: attributes of the element [m, rad]. where, line: name and line of the element in diagnostics.
         """
         written = np.array(list(map(exact, xyz)))
         offset = self.position(written)
@@ -103,7 +103,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
+        """Return a position ``vector`` (3,) [m] with components below 1 nm (errors of rounded rotations) set to 0."""
         # [m] Bound of the rounding errors that composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
