@@ -98,10 +98,10 @@ class Axes:
     def keep_offset(self, slider: int, hinge: int) -> bool:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        ``hinge`` is a revolute joint nearer to the root. The plane contains the axis of ``hinge``, is parallel to the
-        axis of ``slider``, and moves with the child link of ``hinge``. The distances, with their signs, must be
-        constant while any joints after ``hinge`` move. The entry of M in the row of ``slider`` and the column of
-        ``hinge`` is then constant.
+        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
+        ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
+        the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
+        constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
             return False  # A revolute joint between them can turn ``slider`` out of any such plane.

@@ -54,7 +54,7 @@ class Formula:
 
     @property
     def name(self) -> str:
-        """Name of the entry of M, such as ``M21``, or ``V``."""
+        """Name of the entry of M, such as ``M21``, or ``V`` for the potential energy."""
         return "V" if self.entry == "V" else entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
@@ -104,7 +104,7 @@ class Formulas:
 
     @property
     def potential(self) -> Expr | None:
-        """Expression of V(q) [J]; None if V has no expression."""
+        """Expression of the potential energy V(q) [J]; None if V has no expression."""
         return next((row.expression for row in self.written if row.entry == "V"), None)
 
     @property
@@ -138,12 +138,12 @@ class Formulas:
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The entries of M, and V, that have an expression."""
+        """The formulas with an expression, of entries of M or of the potential energy V."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The entries of M, and V, that have no expression, because they are too long."""
+        """The formulas without an expression, of entries of M or of the potential energy V that are too long."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -161,7 +161,7 @@ class Formulas:
 def formulas(
     arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
-    """Return closed forms of all entries of M and of V, or only of one entry.
+    """Return closed forms of all entries of M and of the potential energy V, or only of one entry.
 
     Args:
         arm: The arm.
