@@ -222,7 +222,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
     The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. Both rows
-    contain the sensitivities of M: the change of M with each coordinate, divided by the largest such change.
+    are equal: the root mean square change of M if only one coordinate changes, divided by the largest such change.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
