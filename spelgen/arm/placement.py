@@ -124,7 +124,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text for a message, with six digits per component."""
+    """Return a vector (3,) as text for a message, with six significant digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
