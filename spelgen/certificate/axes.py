@@ -1,8 +1,8 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results prove reasons for the structure of M and V. A relation, such as parallel axes, is tested in exact arithmetic
-at two random rational configurations. A relation that is not true at all configurations fails this test with a
-probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results prove reasons for the structure of M and the potential energy V. A relation, such as parallel axes, is
+tested in exact arithmetic at two random rational configurations. A relation that is not true at all configurations
+fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random

@@ -25,7 +25,7 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 
 @dataclass(frozen=True)
 class Fact:
-    """A property of M or V that is true at all configurations, as text.
+    """A property of M or the potential energy V that is true at all configurations, as text.
 
     Attributes:
         statement: sentence with the property, such as "M21 is always zero".

@@ -1,4 +1,4 @@
-"""Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
+"""Closed forms of M(q) and the potential energy V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry of M, and V, is expanded exactly to polynomials (``structure.expansion``). Its terms are collected per base
 parameter (``structure.base_parameters``) and expressed with cosines and sines of sums of angles (``expressions``). For
@@ -39,7 +39,7 @@ Entry = tuple[int, int] | Literal["V"]
 
 @dataclass(frozen=True)
 class Formula:
-    """Closed form of an entry of the lower triangle of M, or of V.
+    """Closed form of an entry of the lower triangle of M, or of the potential energy V.
 
     Attributes:
         entry: (row, column) counted from 1, or "V".
@@ -67,7 +67,7 @@ class Formula:
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of M, and of V up to a constant, in the base parameters of an arm.
+    """Closed forms of M, and of the potential energy V up to a constant, in the base parameters of an arm.
 
     Attributes:
         arm: the arm.
@@ -197,7 +197,7 @@ def formulas(
 
 
 class _Writer:
-    """Computes closed forms of single entries of M, or of V; the expansion of an arm is prepared once for all entries.
+    """Computes closed forms of entries of M and of the potential energy V; the expansion is prepared only once.
 
     Attributes:
         base: base parameters in the closed forms.
@@ -210,7 +210,7 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int) -> Formula:
-        """Return the closed form of an entry of M, or of V.
+        """Return the closed form of an entry of M, or of the potential energy V.
 
         It has no expression if it has more than ``longest`` terms, or if its expansion to polynomials would exceed the
         permitted number of multiplications (`Expansion.budget`).

@@ -32,7 +32,7 @@ class Inspection:
 
     Attributes:
         arm: the arm.
-        structure: structure of M and V.
+        structure: structure of the mass matrix M and the potential energy V.
         actuation: entries of the input matrix G.
         diagnostics: remarks of the reading of the URDF, such as rounded angles.
         input: "torque", or "position" for an arm with position servos.
@@ -133,8 +133,8 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # Logs of torques determine all base parameters. Logs of position servos determine only ratios of parameters, so
-        # the undetermined parameters are listed.
+        # Logs of torques determine all base parameters. Logs of position servos determine some parameters only in ratio
+        # to kp or together with others, so their JSON object lists these parameters, too.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))

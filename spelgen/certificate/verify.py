@@ -28,7 +28,7 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """Result of the numerical verification of one derived fact about M or V.
+    """Result of the numerical verification of one derived fact about M or the potential energy V.
 
     Attributes:
         fact: name of the fact, such as "zero entries".
