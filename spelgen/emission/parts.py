@@ -328,7 +328,7 @@ def term_names(spec: ModelSpec) -> list[str]:
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
+    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], rounded.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
     outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
