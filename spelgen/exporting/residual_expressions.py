@@ -5,7 +5,7 @@ by loops over network weights and lookup of splines. R is the part of M that a n
 in the lower triangle; k is the number of joints whose friction depends on q. The symbols are:
 
 - ``mass`` (m, 1), entries of R; ``rate`` (m, 1), d mass / dt; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
-- ``energy`` (1, 1), the network of V; ``gravity`` (n, 1), d energy / dq;
+- ``energy`` (1, 1), the network of the potential energy V; ``gravity`` (n, 1), d energy / dq;
 - ``torque`` (n, 1), torques that depend on the position of a single joint; ``torque_energy`` (1, 1), their energy;
 - ``factor`` (k, 1), logarithms of the friction factors.
 
