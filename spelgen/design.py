@@ -31,6 +31,8 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of a model: how each quantity of the equations of motion (M, V, friction, G) is represented.
 
+    V is the potential energy, G the input matrix. The types of the fields list the values of each quantity.
+
     ``derived``: the structure of the arm determines which entries of the quantity are zero, are constant, or depend on
     which joints; networks learn only the entries that vary. ``dense``, ``dense-n``: a network learns the whole quantity
     without knowledge of the arm. ``dense-3n``: a network learns rows for all three axes of each joint's frame, as in
@@ -39,7 +41,7 @@ class Design:
     and networks for residual terms, if any. ``per-joint``: friction of each joint with a network. ``constants``: a
     friction model with trained constants.
 
-    The types of the fields list the values of each quantity. Raises SettingsError for an inconsistent combination.
+    Raises SettingsError for an inconsistent combination.
     """
 
     mass: Literal["derived", "dense-3n", "closed-form"]
