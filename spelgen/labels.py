@@ -152,7 +152,7 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of ``predictor`` with a momentum observer, whose estimate of the disturbance it adds."""
+    """Return the name of ``predictor`` with predictions that include the disturbance of a momentum observer."""
     return f"{predictor} + observer"
 
 

@@ -103,7 +103,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a position ``vector`` (3,) [m] with components below 1 nm (errors of rounded rotations) set to 0."""
+        """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
         # [m] Bound of the rounding errors that composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])

@@ -172,7 +172,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Exit with code 1 and a message about `subject` if `count` warnings are not 0: effect of the option --strict."""
+    """Exit with code 1 and a message about `subject` if `count`, the number of warnings, is not 0 (--strict)."""
     if count:
         note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

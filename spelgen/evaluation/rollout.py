@@ -58,7 +58,7 @@ def rollout(
 
 
 def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest eigenvalue of M over random positions, divided by the mean of all their eigenvalues.
+    """Return the smallest eigenvalue of M over random positions, divided by the mean eigenvalue over them.
 
     The positions are in [low, high] (n,) [rad, m]. The result is positive if M is positive definite at all positions.
     """

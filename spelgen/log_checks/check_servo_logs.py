@@ -47,7 +47,8 @@ SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
     """Return a finding if the positions of servos have another unit than `unit`, "deg" or "rad"; else None.
 
-    1. Quantisation steps of encoders (see the comment at `NORMALISED_RANGE`) in one of the two units: it is the unit.
+    1. In one of both units, the positions have the quantisation steps of encoders (see the comment at
+       `NORMALISED_RANGE`): this is their unit.
     2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by 0.5 rad or more, but
        not by over two turns: the unit is "rad".
     3. `unit` is "deg", and each joint has another step: the positions are normalised.
