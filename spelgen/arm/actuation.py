@@ -49,9 +49,10 @@ class Drives(NamedTuple):
 class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
-    couplings: nonzero entries, joint torques per motor torque, of motors that drive several joints, if the logs contain
-    joint torques. G is then the identity for these joints, and the couplings determine only the motor speeds (see
-    `drives`). If the logs contain motor torques, these entries are in ``entries``, and ``couplings`` is empty.
+    A motor that drives several joints has an entry, joint torque per motor torque, for each of these joints. If the
+    logs contain motor torques, these entries are in ``entries``, with all other entries of G. If the logs contain joint
+    torques, G is the identity for the driven joints; these entries are in ``couplings`` and determine only the motor
+    speeds (see `drives`).
     """
 
     joints: int

@@ -261,7 +261,8 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
 def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
     """Return the sum of the inertial parameters (m, m c, I) of the links of one body, (10,) [kg, kg m, kg m2].
 
-    The frame is the frame of the body, which ``placement`` has for each link. None if no link has an <inertial>.
+    The result is in the frame of the body; ``placement`` has the pose of each link in this frame. None if no link has
+    an <inertial>.
     """
     tens = [placement.inertia(link, link.inertial) for link in links if link.inertial]
     if not tens:
@@ -317,8 +318,8 @@ def _dependent_remarks(
 ) -> Iterator[Diagnostic]:
     """Yield a warning for each locked joint that may be part of a parallelogram linkage of the arm.
 
-    URDF has no closed loops: a linkage is opened. Its two joints then have the same parent body and parallel axes, and
-    one of them is not in the chain.
+    URDF has no closed loops, so a linkage is opened at a joint. Two revolute joints then have the same parent body and
+    parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links in their bodies.
     """
     roots: dict[str, str] = {}  # {link: first link of its branch}, to group joints by branch
     branches: dict[str, list[UrdfJoint]] = {}
@@ -353,7 +354,7 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of the revolute joints on the body of ``frame`` with an axis parallel to ``axis`` (3,)."""
+    """Return the names of the revolute joints in ``moved`` on the body of ``frame`` with axes parallel to ``axis``."""
     # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
     return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

@@ -147,10 +147,10 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    If the last joint is one of a pair of jaws, it is omitted. Jaws are prismatic joints with the same parent link:
-    either the last joint and its mimic joints, or the last joints of several chains of the same length. Otherwise, if
-    several chains are the longest, the only one with effort limits for all joints is returned; ArmError is raised if no
-    chain, or more than one, has these limits.
+    1. If the last joint is a jaw of a gripper, it is omitted. Jaws are two or more prismatic joints with the same
+       parent link: the last joint with its mimic joints, and the last joints of other chains of the same length.
+    2. Otherwise, if several chains are the longest, the only one with effort limits for all joints is returned. Raises
+       ArmError if no chain, or more than one, has these limits.
     """
     # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
     # shorter branches.

@@ -56,7 +56,7 @@ class AngleRounding:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the position (3,) [m] and rotation (3, 3) of an <origin>; the rotation is None if all angles are zero.
 
-        where, line: name and line of the element in diagnostics.
+        xyz, rpy: attributes of the element [m, rad]. where, line: name and line of the element in diagnostics.
         """
         written = np.array(list(map(exact, xyz)))
         offset = self.position(written)
@@ -103,7 +103,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
+        """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
         # [m] Bound of the rounding errors that composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
@@ -124,7 +124,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text for a message, with six digits per component."""
+    """Return a vector (3,) as text for a message, with six significant digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 

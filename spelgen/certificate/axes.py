@@ -1,8 +1,8 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results prove reasons for the structure of M and V. A relation, such as parallel axes, is tested in exact arithmetic
-at two random rational configurations. A relation that is not true at all configurations fails this test with a
-probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results prove reasons for the structure of M and the potential energy V. A relation, such as parallel axes, is
+tested in exact arithmetic at two random rational configurations. A relation that is not true at all configurations
+fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -98,10 +98,10 @@ class Axes:
     def keep_offset(self, slider: int, hinge: int) -> bool:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        ``hinge`` is a revolute joint nearer to the root. The plane contains the axis of ``hinge``, is parallel to the
-        axis of ``slider``, and moves with the child link of ``hinge``. The distances, with their signs, must be
-        constant while any joints after ``hinge`` move. The entry of M in the row of ``slider`` and the column of
-        ``hinge`` is then constant.
+        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
+        ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
+        the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
+        constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
             return False  # A revolute joint between them can turn ``slider`` out of any such plane.

@@ -25,7 +25,7 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 
 @dataclass(frozen=True)
 class Fact:
-    """A property of M or V that is true at all configurations, as text.
+    """A property of M or the potential energy V that is true at all configurations, as text.
 
     Attributes:
         statement: sentence with the property, such as "M21 is always zero".
@@ -44,7 +44,7 @@ class Fact:
 
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
-    """Return the facts about M and V of an arm: properties at all configurations, with geometric reasons if found."""
+    """Return the facts about M and the potential energy V: properties at all q, with geometric reasons if found."""
     # Reasons are about pairs of joint axes, so they are not valid for a coordinate that moves several joints (mimic
     # joints).
     words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
@@ -265,7 +265,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
 
 
 def weightless_reason(axes: Axes, joint: int) -> Reason:
-    """Return the geometric reason why V does not depend on the position of ``joint``; None if no reason is found."""
+    """Return the geometric reason why the potential energy V does not depend on ``joint``; None if none is found."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
@@ -277,7 +277,7 @@ def weightless_reason(axes: Axes, joint: int) -> Reason:
 
 
 def potential_reason(axes: Axes) -> Reason:
-    """Return the reason why V is zero at all configurations; None if no reason is found."""
+    """Return the reason why the potential energy V is zero at all configurations; None if no reason is found."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
     if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):

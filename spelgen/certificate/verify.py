@@ -28,7 +28,7 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """Result of the numerical verification of one derived fact about M or V.
+    """Result of the numerical verification of one derived fact about M or the potential energy V.
 
     Attributes:
         fact: name of the fact, such as "zero entries".
@@ -254,9 +254,10 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
 
-    Outputs are terms that vary with q. Their number must be the rank of the changes of M due to single joints. The
-    number of outputs and constants must be the rank of M at the random configurations. For each k, the number of
-    outputs that depend on any of the first k joints must be the rank of the changes of M due to these joints.
+    The columns of the matrices are the entries of M. Outputs are terms that vary with q. Their number must be the rank
+    of the changes of the entries if single joints move, one row per change. The number of outputs and constants must be
+    the rank of the entries at random configurations, one row per configuration. For each k, the number of outputs that
+    depend on any of the first k joints must be the rank of the changes if one of these joints moves.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
@@ -277,7 +278,7 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that V depends on the derived joints only, with the numbers that test it.
+    """Return the fact that the potential energy V depends only on the derived joints, with the numbers that test it.
 
     The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
     """

@@ -111,10 +111,10 @@ def train(
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
     """Write the noise levels of the live estimator into the run folder; return the payload to which a run is adapted.
 
-    source: the run that was adapted; None for a new fit. For a new fit of rigid bodies to torques, the noise levels are
-    estimated from its own logs, and the result is None. An adapted run gets a copy of the noise levels of `source`. For
-    `adapt=load`, the result is the payload that the model and the noise levels of `source` estimate from the logs; it
-    is None for other adaptations, or if `source` has no noise levels.
+    source: folder of the run that was adapted; None for a new fit. A new fit of rigid bodies to torques estimates the
+    noise levels from its logs. An adapted run gets a copy of the noise levels of `source`, if there are any. For
+    `adapt=load`, the result is the payload in the logs, estimated by the model and the noise levels of `source`. In all
+    other cases the result is None.
     """
     from spelgen.live.levels import cross_validated_levels
     from spelgen.live.noise import keep_levels, stored_levels

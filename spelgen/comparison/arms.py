@@ -186,6 +186,7 @@ def arm_inputs(
     """Return the input files of the runs on an arm: URDF, mapping and logs.
 
     If the arm has no logs, logs are simulated and written to ``folder``, together with the URDF that models may use.
+    splits: number of folds; LogError if there are too few trajectories. progress: argument of `simulate`.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """

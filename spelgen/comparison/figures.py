@@ -78,7 +78,10 @@ class SimulatedFigures:
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Return the results of one model of a simulated arm, for a comparison. truth: URDF with the true parameters."""
+    """Return the results of a model of a simulated arm, whose true parameters are in the URDF ``truth``.
+
+    training: logs for the training loss and the duration of a step. testing: logs for all other results.
+    """
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
@@ -109,7 +112,10 @@ def simulated_figures(
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
-    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included."""
+    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included.
+
+    config: length of the windows and size of the batch. decimation: log samples per sample of a window.
+    """
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
     # Parameters of loaded models are frozen, but a training step needs gradients.
@@ -154,8 +160,8 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[f
 def sizes(model: ArmModel) -> Figures:
     """Return {row of a table: size of the model}.
 
-    The rows are the number of outputs of each network (of M, D, G and V, residual networks included), the number of
-    inputs of the network of M, and the number of trained parameters.
+    The rows are the number of outputs of each network (of M, damping D, input matrix G and potential energy V, residual
+    networks included), the number of inputs of the network of M, and the number of trained parameters.
     """
     figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
     # The damping D has one output per joint if it is not computed by a network.

@@ -222,7 +222,7 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
     The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. Both rows
-    contain the sensitivities of M: the change of M with each coordinate, divided by the largest such change.
+    are equal: the root mean square change of M if only one coordinate changes, divided by the largest such change.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
@@ -328,7 +328,7 @@ def term_names(spec: ModelSpec) -> list[str]:
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
+    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], rounded.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
     outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.

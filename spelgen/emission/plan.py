@@ -181,14 +181,14 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(
     coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
 ) -> JointSpec:
-    """Return the ``JointSpec`` of a coordinate: limits, and typical values of motion, friction and armature.
+    """Return the ``JointSpec`` of a coordinate: limits, typical friction and armature, and sensitivities of M and V.
 
     Args:
         coordinate: joint with the limits of the URDF.
-        sizes: typical magnitudes of M, V and torques.
+        sizes: typical magnitudes of M, potential energy V and torques.
         index: index of the coordinate, from 0.
         drive: settings of the joint's drive.
-        min_armature: armature if the rotor inertia, the effort or the speed is unknown [kg m^2, kg].
+        min_armature: armature if neither the rotor inertia nor both limits, effort and speed, are known [kg m^2, kg].
     """
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
@@ -272,7 +272,8 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     """Return the inertial parameters ``ten`` of a body, (10,), made physically consistent if necessary.
 
-    Too small eigenvalues of the pseudo-inertia, and too small principal second moments of mass, are raised.
+    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`), as are principal second
+    moments of mass below `min_second_moment` times the largest.
     """
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T

@@ -53,9 +53,9 @@ class PredictedMotion(DrawnMotion):
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         u: Commands of position servos, (T, n) [rad, m]; None for a window.
-        error: For a window: relative error at the last sample of the window, the RMS over the relative errors of q and
-            qd of all joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a
-            replayed log: RMS position error [rad, m].
+        error: For a window: the RMS over q and qd of all joints of the error at the last sample, divided by the RMS
+            change of the same quantity from the first to the last sample, over all windows. For a replayed log: RMS
+            position error [rad, m].
     """
 
     start: float | None = None

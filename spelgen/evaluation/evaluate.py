@@ -142,12 +142,12 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of an arm under torques: inverse dynamics, and motion predicted under the logged torques.
+    """Return the errors of model and baselines for torque logs: of inverse dynamics, and of motion under these torques.
 
     Args:
         tested: the model with the data of its fit.
         logs: test logs with torques.
-        notes: notes about the logs and the evaluation, to which notes are appended.
+        notes: list of remarks about the logs and the evaluation; further remarks are appended.
         used: preprocessing of the logs.
         baselines: {name: dynamics} of further baselines.
         ahead: prediction horizons, in samples and in seconds.

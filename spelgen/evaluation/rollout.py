@@ -58,9 +58,9 @@ def rollout(
 
 
 def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest divided by the mean of all eigenvalues of M at random q in [low, high] (n,) [rad, m].
+    """Return the smallest eigenvalue of M over random positions, divided by the mean eigenvalue over them.
 
-    The result is positive if M is positive definite at all of these positions.
+    The positions are in [low, high] (n,) [rad, m]. The result is positive if M is positive definite at all positions.
     """
     # The seed of the random positions is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)

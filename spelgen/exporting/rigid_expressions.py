@@ -102,9 +102,9 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd, (n, 1), and d/dq of the kinetic energy, (n, 1), both without armature.
 
-        Let h be the spatial momentum of all bodies that a joint carries, and S the unit twist of the joint. The entry
-        of M qd is S . h. The entry of the gradient is (dS/dt) . h, with dS/dt = twist x S and the twist of the joint's
-        child body.
+        Let h be the spatial momentum of all bodies that a joint carries, S the unit twist of the joint, and v the twist
+        (spatial velocity) of its child body. The entry of M qd is S . h. The entry of the gradient is (dS/dt) . h, with
+        dS/dt = v x S.
         """
         # `twists` has the twist of the base, then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
@@ -153,7 +153,7 @@ def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1), by ``structure.recursion``."""
+    """Return M, (n, n), and potential energy, (1, 1) [J], of rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
         # `base` is chosen such that angles of mimic joints are integer multiples of q / `base`: their cosines and sines

@@ -79,7 +79,7 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
 def _usage(package: str, name: str, *, controller: bool) -> str:
     """Return the line of the README about the use of the ROS 2 package.
 
-    controller: True if the package contains the controller.
+    package: name of the package. name: name of the model. controller: True if the package contains the controller.
     """
     use = (
         f"Put this folder into a workspace and run colcon build --packages-select {package}. "

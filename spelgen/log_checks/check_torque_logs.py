@@ -249,10 +249,10 @@ class TorqueLogs:
         return False
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test, with candidates for wrong units of torques and positions.
+        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for wrong units.
 
         The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
-        that the mapping states is not changed, unless it is mNm.
+        that the mapping states is assumed to be right, except mNm: such torques may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]

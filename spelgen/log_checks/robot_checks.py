@@ -178,8 +178,9 @@ def torque_factors(
 
     Args:
         joints: the joints with their fits of gravity.
-        undeclared: (n,) True for joints whose torque has no unit in the mapping.
-        loaded: (n,) True for joints that gravity loads enough.
+        undeclared: (n,) True for joints whose torque may have another unit: none in the mapping, or mNm. A candidate
+            for all joints requires True for all joints.
+        loaded: (n,) True for joints that gravity loads enough. Only joints that are True in both masks have an r.
     """
     seen: list[float] = []
     factors = []
@@ -202,7 +203,7 @@ def torque_factors(
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Return a message if torques exceed the joint's effort limit 20 times, so that their unit is wrong; else None."""
+    """Return a message if torques exceed 20 times the joint's effort limit, so that their unit is wrong; else None."""
     # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     # The bound is 20 times the limit: torques in mNm are 1000 times as large as in Nm, and no drive gives 20 times its

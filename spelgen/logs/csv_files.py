@@ -161,8 +161,9 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
     """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    A line of names or units has no digits. cells: cells of the line in a file whose joint names are in a second line,
-    and may have digits, such as "joint1": a line without a number in any cell then has no values. None for other files.
+    A line without digits has no values. In a file with joint names in a second line, names such as "joint1" have
+    digits: there, a line has no values if none of its cells is a number. cells: cells of the line for such a file; None
+    for other files.
     """
     is_name = cells is not None and not any(map(is_number, cells))
     return bool(line) and (line == header or is_name or not re.search(r"\d", line))

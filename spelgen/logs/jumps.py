@@ -157,9 +157,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
-    at the end of the block is then about as large as k steps of the following motion. Equal rows of an arm at rest are
-    not repeats. A logger may write each row m times, which shows during motion; m is the number of copies (1 for other
-    loggers). Then at rest, too, only every m-th of the equal rows is original, and the others are repeats.
+    at the end of the block is then about as large as k steps of the following motion. The number m of copies is the
+    median length of these blocks, since a logger may write each row m times; m is 1 if there are none. In all other
+    blocks, the arm was at rest: every m-th row is original, and the others are repeats (no row for m = 1).
 
     positions: number of leading columns that are positions.
     """
@@ -260,9 +260,10 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit of register words: 2^k revolutions, and 2^k quantisation steps.
+    """Return candidates for the period or sign bit of register words (see `Word`): 2^k revolutions or 2^k steps.
 
-    values: signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not rotate.
+    The steps are the quantisation steps of ``values``, the signal (T,) in the unit of the log. turn: one revolution in
+    this unit; None if the joint does not rotate.
     """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)

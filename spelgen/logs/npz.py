@@ -57,7 +57,7 @@ class NpzArrays:
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the array of this name."""
+        """Return an error about the array of this name; other arguments as for `LogError`."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def is_vector(self, name: str) -> bool:

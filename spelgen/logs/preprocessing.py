@@ -20,7 +20,7 @@ class Preprocessing:
         cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for
             windows (segments of logs for momentum and rollout fits) if a log is sampled at 50 Hz or less.
         decimation: number of log samples from one sample of a window to the next; None: 1 without a filter, otherwise
-            the largest number with three samples per period of the cutoff.
+            the largest number with at least three samples per period of the cutoff.
         gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
         torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
@@ -44,7 +44,7 @@ class Preprocessing:
         """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
 
         The record of a training run contains the resolved options. A torque delay of None becomes 0. A cutoff of None
-        becomes 8 Hz; it remains None, which then means no filter, if the rate of a log is too low for the filter.
+        becomes 8 Hz if all logs are sampled above 50 Hz. Otherwise it remains None, and the logs are not filtered.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1

@@ -211,7 +211,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
     A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
-    torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
+    torque. A torque with the last value of the recording is not stale: the motor may be off while the joint moves.
 
     Args:
         quantity: name of the signal, "q", "qd" or "tau".

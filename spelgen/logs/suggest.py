@@ -152,7 +152,10 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> ColumnName:
-    """Return the column of times, or "sec + nsec" of two columns; with the name "" if there is none."""
+    """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
+
+    If it contains seconds, and ``columns`` (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
+    """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
     none = ColumnName("", set(), "s")
@@ -167,7 +170,10 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> Colum
 def _joint_lines(
     joint: str, by_joint: Mapping[str, Mapping[str, ColumnName]], units: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield the lines of a joint: its columns, and the conversions whose values the user must write."""
+    """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
+
+    by_joint: {quantity: {joint: column}}. units: {quantity: unit of its columns}.
+    """
     entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
     yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
     if units.get("tau") in CURRENTS:

@@ -206,8 +206,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # A log of at most ten samples has a single increment, whose correlation is always 1 or -1: too little for
-        # advice.
+        # Increments are changes over ten samples. A log of at most ten samples has only one, the change from its first
+        # to its last sample, whose correlation is always 1 or -1: too little for advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.

@@ -91,9 +91,9 @@ def is_split(data: np.ndarray) -> bool:
 
 
 def clock_start(table: pa.Table, layout: Layout) -> tuple[pa.Scalar | None, float]:
-    """Return the first logged time, as logged and [s], to be subtracted from all times, if the times are dates.
+    """Return the first logged time, as logged and in seconds, if the times are dates; else (None, 0.0).
 
-    The result is (None, 0.0) for relative times.
+    The first time is subtracted from all times, since dates have too few digits as floating-point numbers.
     """
     first_row = table.slice(0, 1)
     times, unit = _clock(first_row, layout)

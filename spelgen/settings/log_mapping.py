@@ -120,15 +120,15 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Periods or sign bits of the logged values of one joint, in logged units; default: values are plain numbers.
+    """Periods, or sign bits, of the logged signals of one joint, in logged units; default: values are plain numbers.
 
     A period is the interval after which logged values wrap around.
 
     Attributes:
-        q: Value for positions.
-        qd: Value for velocities.
-        tau: Value for torques.
-        u: Value for commanded positions.
+        q: Period or sign bit of positions.
+        qd: Period or sign bit of velocities.
+        tau: Period or sign bit of torques.
+        u: Period or sign bit of commanded positions.
     """
 
     q: Positive | None = None
@@ -293,7 +293,10 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with other names of columns. columns: {joint: {quantity: name of the column}}."""
+        """Return the mapping with other names of columns.
+
+        columns: {joint: {quantity: name of the column}}; None: the name in `columns` for all joints.
+        """
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)

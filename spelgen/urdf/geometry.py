@@ -75,7 +75,8 @@ def link_shapes(
         urdf: Path of the URDF; its folder and all parent folders are searched for meshes.
         element: Elements to read, "visual" or "collision".
         links: Names of the links whose shapes are returned.
-        faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
+        faces: Largest number of triangles of all meshes together; a mesh is simplified to this number divided by the
+            number of meshes.
     """
     shapes: list[LinkShape] = []
     unread: dict[str, tuple[str, ...]] = {}
