@@ -15,14 +15,17 @@ from spelgen.runtime.rows import Joint, Link, vector
 class ChainConfiguration(NamedTuple):
     """Configuration cache of ``BodyChain``: all its quantities that depend on q only, in the base frame.
 
-    Each of the B bodies is represented by four point masses.
+    Four point masses suffice to represent a rigid body (see ``BodyChain``). Positions and velocities of a
+    point are multiplied by the square root of its mass, so that products of two of them are moments and
+    energies.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
     mass: Tensor  # square roots of the point masses, (..., 1, B bodies, 4 points) [kg^(1/2)]
     axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, B bodies)
-    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each of B
-    # bodies, times sqrt(mass), (..., B, 12 B): 3 coordinates of 4 point masses per body.
+    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each body,
+    # times sqrt(mass), (..., B, 12 B). A body has 3 coordinates of each of its 4 point masses: coordinate,
+    # body and point are the order of the 12 B entries.
     jacobian: Tensor
     # Minus the acceleration of gravity, times sqrt(mass), for each coordinate of each point mass of B
     # bodies, (..., 12 B) [m/s^2 kg^(1/2)].
@@ -135,8 +138,9 @@ class BodyChain(nn.Module):
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
 
-        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian``, which has one
-        row per joint, times the returned vector is the Coriolis, centrifugal and gravity torque.
+        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the returned
+        vector is the Coriolis, centrifugal and gravity torque at the joint of each body. ``ratios`` transposed
+        maps it to the n joints, to which mimic joints are coupled.
 
         Args:
             cache: configuration cache at q.

@@ -82,13 +82,18 @@ class FrictionConstants(NamedTuple):
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
         # Each bristle is a spring of stiffness coulomb * fraction / breakaway. The Stribeck and load
-        # terms of dry friction vary with velocity and load, and are counted as dissipation.
+        # terms of dry friction vary with velocity and load, and are counted as dissipation, which may
+        # therefore be slightly negative.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
-    """Friction of all joints with trained constants; it dissipates energy for any values of the parameters.
+    """Friction of all joints with trained constants.
+
+    Without bristles, it dissipates energy for any values of the parameters. Bristles store energy and return
+    it. Their stiffness is proportional to dry friction, which depends on velocity and load: they can return
+    slightly more than they have stored if velocity or load have changed meanwhile.
 
     The friction torque of a joint with velocity qd is
 
@@ -162,8 +167,8 @@ class FrictionLaws(nn.Module):
         # |gravity torque| has no derivative at zero: `load` smooths it below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        # At joints without bristles the smooth sign has a width of 0.1 % of the typical speed: a wider
-        # transition would be confounded with hysteresis.
+        # The smooth sign has a width of 0.1 % of the typical speed (`SlidingFriction` trains the width): a wider
+        # transition at joints without bristles would be confounded with hysteresis.
         rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
             [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]

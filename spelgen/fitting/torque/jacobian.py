@@ -67,11 +67,13 @@ class TorqueJacobian:
 
     x contains the K parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is
 
-        Y(q, qd, qdd) pi + C^T (friction(C qd) + armature C qdd) + torque of the residual terms,
+        Y(q, qd, qdd) pi + C^T (f friction + armature C qdd) + torque of the residual terms,
 
-    with the regressor Y, the inertial parameters pi of B bodies, and the matrix C from joint speeds to drive speeds.
-    The measured joint torque is G (tau - offset) plus friction compensation, where G maps logged torques to joint
-    torques. The torque residual is the measured minus the modelled joint torque.
+    with the regressor Y, the inertial parameters pi of B bodies, the matrix C from joint speeds to drive speeds, and
+    the factor f by which residual terms multiply friction. The friction of a drive depends on its speed, an entry of C
+    qd, on the gravity torque that loads it, and on the bristle displacements. The measured joint torque is G (tau -
+    offset) plus friction compensation, where G maps logged torques to joint torques. The torque residual is the
+    measured minus the modelled joint torque.
 
     The residual terms of the model are evaluated once, when this object is created. `terms` are additional linear
     terms, which are eliminated by variable projection. theta (K,) is x with pi in place of the log-Cholesky parameters
@@ -139,7 +141,8 @@ class TorqueJacobian:
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the Gauss-Newton Hessian J^T W J (K, K) and the negative gradient J^T W r (K,) at x (K,).
 
-        J is the Jacobian of the modelled torque, r the torque residual, W = 1 / noise^2. noise: (n,) [Nm, N].
+        r is the torque residual at the initial motor gains (see `squared_residual`), J is minus its Jacobian, and W =
+        1 / noise^2. noise: (n,) [Nm, N].
         """
         rows: Iterable[JointRows] = self.joint_rows(x)
         if self.terms:
@@ -155,8 +158,8 @@ class TorqueJacobian:
         """Yield the torque Jacobian of each joint and each block of samples with respect to theta (K,), at x (K,).
 
         theta is x with inertial parameters in place of the bodies' log-Cholesky parameters. The Jacobian with respect
-        to inertial parameters is the regressor, so no derivatives are computed for them. `theta_jacobian` converts from
-        theta to x.
+        to inertial parameters is the regressor, plus the derivative of load-dependent friction times the regressor of
+        the gravity torque. `theta_jacobian` converts from theta to x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -237,10 +240,11 @@ class TorqueJacobian:
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The torque is linear in inertial parameters, armatures and friction coefficients, so the curve is straight in
-        these quantities. x contains log-Cholesky parameters of bodies (see `step_in_inertial_parameters`), and the
-        logarithms of armatures and friction coefficients: a step s > 0 of log c changes c to c (1 + s). The exception
-        is a step s < 0, which changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
+        The torque is linear in inertial parameters, armatures and friction coefficients, so a straight line in these
+        quantities is better than one in x. x contains log-Cholesky parameters of bodies, which are moved along such a
+        line (see `step_in_inertial_parameters`), and the logarithms of armatures and friction coefficients c. A step
+        s > 0 of log c changes c to c (1 + s), on such a line, too. A step s < 0 changes c to c exp(s), as x + step
+        does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

@@ -45,7 +45,8 @@ class JointFunction:
     scale: the parameter of the model is entries / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
-    features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
+    features: (T, P) columns after orthogonalization, without the part of the columns that rigid bodies and friction
+        would absorb. For a friction factor they are the columns, since the factor is applied to the whole friction.
     direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
@@ -161,9 +162,10 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction factors are written to the model. Position-dependent torques are returned as linear terms with the fitted
-    penalty, whose weights the next fit of the rigid-body parameters eliminates; in the model, these torques are set to
-    zero.
+    A term is fitted to the residual with its features, orthogonalized columns, which gives the weights of a joint fit
+    of the term and the rigid bodies (theorem of Frisch, Waugh and Lovell). Friction factors are written to the model.
+    Position-dependent torques are returned as linear terms with the fitted penalty, whose weights the next fit of the
+    rigid-body parameters eliminates; in the model, these torques are set to zero.
 
     Args:
         model: model with residual terms.

@@ -5,10 +5,11 @@ each joint. The cost is the negative log posterior of x,
 
     1/2 sum over joints j of |r_j(x)|^2 / s_j^2 + 1/2 (x - m)^T P (x - m),
 
-with the torque residual r_j (T,) of joint j, its noise s_j, and a Gaussian prior of mean m and precision P (see
-`ParameterPrior`). If motor gains are trained, r is the residual of the logged torque (see
-`TorqueJacobian.squared_residual`). Noise and prior widths are estimated from the logs: outer iterations alternate
-Levenberg-Marquardt steps with updates of noise and prior widths.
+with the torque residual r_j (T,) of joint j, its noise s_j, and a Gaussian prior of mean m and precision P. The prior
+of each body is Student's t, represented by a Gaussian whose width is estimated (see `ParameterPrior`). If motor gains
+are trained, r and s refer to the joint torque at the initial gains (see `TorqueJacobian.squared_residual`): the
+residual at the current gains would vanish with the gains. Noise and prior widths are estimated from the logs: outer
+iterations alternate Levenberg-Marquardt steps with updates of noise and prior widths.
 """
 
 from __future__ import annotations
@@ -85,7 +86,10 @@ class NoiseEstimator:
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for a squared residual, between a fraction of `torque_std` and `max_error`.
+        """Return the noise (n,) [Nm, N] for a squared residual.
+
+        The root mean square residual is at most `max_error`, and at least a fraction of `torque_std`, also if that
+        fraction exceeds `max_error`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
@@ -99,7 +103,7 @@ class NoiseEstimator:
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
+        """Return the noise (n,) [Nm, N] for an iteration of noise annealing, a sequence of fits with falling noise.
 
         This noise is `annealing_fraction` times the noise that is estimated from the residual.
 
@@ -321,7 +325,8 @@ class TorqueEstimate:
 def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
     """Alternate Levenberg-Marquardt steps with updates of noise and prior; return the MAP estimate.
 
-    The iterations end when the noise has converged.
+    The iterations end when an update lowers the noise of no joint by more than a few per cent, and after
+    `TUNING.iterations` at the latest. A noise that rises counts as converged, since the next residual is not larger.
 
     Args:
         problem: problem with initial noise and prior.
@@ -341,7 +346,10 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
 def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
-    """Return the estimate for other samples or linear terms, refitted with ``estimate`` as the warm start."""
+    """Return the estimate for other samples, or with residual terms, refitted with ``estimate`` as the warm start.
+
+    terms: {joint: residual terms whose weights are linear and are eliminated from the fit}.
+    """
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     # The noise of ``estimate`` is not used, since it was estimated from other samples or with other linear terms.
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
