@@ -135,10 +135,6 @@ class PositionActuators:
     drives: np.ndarray
     offset: np.ndarray
     delay: float
-    about = (
-        "position actuators on the URDF's bodies; kp, kv, armature, frictionloss, offsets and delay fitted to windows "
-        "of the training logs by mujoco.minimize, the least squares of mujoco.sysid"
-    )
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions (T, n) [rad, m] after the first row of each part of a log.

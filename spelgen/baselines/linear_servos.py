@@ -14,7 +14,6 @@ class DelayedCommand:
     """Predictor of joint positions: the position at time t is the command at time t - delay. delay: [s]."""
 
     delay: float
-    about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the delayed commands as predicted positions, (K, n) [rad, m] per segment of K sample intervals.
@@ -41,7 +40,6 @@ class LinearServos:
     delay: Sequence[float]
     offset: Sequence[float]
     late: float
-    about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions, (K, n) [rad, m] per segment of K sample intervals.

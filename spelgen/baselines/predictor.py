@@ -247,10 +247,7 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: text for users about the predictor and its fit."""
-
-    @property
-    def about(self) -> str: ...
+    """Predictor of positions under position commands."""
 
     def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment at the end of each sample interval.

@@ -13,7 +13,8 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
-from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.evaluation.tables import LIMITS, csv_text, limit_figures, summary
+from spelgen.files import write_json, write_text
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ def evaluate(
     from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
-    from spelgen.files import write_json
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
@@ -75,10 +75,10 @@ def evaluate(
     forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
     options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
     # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
-    values = {figure.name: figure.value for figure in figures(results)}
+    values = limit_figures(results)
     exceeded = []
     for name, limit_value in limits:
-        value = values.get(name)
+        value = values[name]
         if value is None or value > limit_value:
             text = "not known" if value is None else f"{value:.4g}"
             exceeded.append(f"limit exceeded: {name} is {text}, expected at most {limit_value:g}")
@@ -169,10 +169,10 @@ def report(
         options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
     from spelgen.evaluation.results import Results
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.render.report_page import write_report, write_runs
+    from spelgen.render.report_page import render_runs, write_report
 
     if len(runs) > 1:
-        say(f"wrote {write_runs(runs, output or Path('runs.html'))}")
+        say(f"wrote {write_text(output or 'runs.html', render_runs(runs))}")
         return
     path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
     if folder.evaluation.exists():

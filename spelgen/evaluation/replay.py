@@ -10,7 +10,6 @@ from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
 from spelgen.logs.filtering import velocities
@@ -48,8 +47,6 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 class ServoModel:
     """The trained model as a predictor of positions under position commands (`CommandFollower`), like the baselines."""
 
-    about = "the model"
-
     def __init__(self, model: ArmModel) -> None:
         self._model = without_idle_residuals(model)
 
@@ -83,12 +80,11 @@ def replays(
     model: ArmModel,
     logs: Sequence[Trajectory],
     baselines: Mapping[str, CommandFollower],
-    notes: list[Diagnostic],
 ) -> tuple[tuple[Replay, ...], list[PositionErrors]]:
     """Replay the commands of whole logs, and of consecutive windows of one second, with the model and the baselines.
 
     Return two results: the errors of all predictors on whole logs and on windows, and the position errors of the model
-    along each gap-free segment of the logs. A description of each baseline is appended to `notes`.
+    along each gap-free segment of the logs.
     """
     pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows = []
@@ -98,8 +94,6 @@ def replays(
         for start in range(0, len(piece) - length + 1, length - 1):
             windows.append((piece, slice(start, start + length)))
             first_qd.append(qd[start])
-    for name, baseline in baselines.items():
-        notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
     # The model is treated as one of the predictors, so that the same code measures all errors.
     predictors = {MODEL: ServoModel(model), **baselines}
     # Whole logs are replayed from zero velocity, as they begin at rest. Windows start with the velocity of the log.
