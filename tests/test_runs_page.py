@@ -1,7 +1,5 @@
-"""The pages of several runs and of an identification are complete, and evaluations are machine-readable tables."""
+"""The pages of several runs and of an identification are complete, and tables have every figure once."""
 
-import csv
-import io
 import json
 import re
 import shutil
@@ -16,7 +14,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import RunError
 from spelgen.evaluation.results import Results
-from spelgen.evaluation.tables import CSV_HEAD, csv_text
+from spelgen.evaluation.tables import result_tables
 from spelgen.identification.identify import identify
 from spelgen.logs.trajectory import Trajectory
 from spelgen.render.arm_pages import identification_page
@@ -68,15 +66,20 @@ def test_runs_of_one_name_are_distinguished_by_their_folders(run, tmp_path):  # 
 
 
 def test_the_table_holds_every_figure_once_with_its_unit():
-    head, *rows = csv.reader(io.StringIO(csv_text(Results.from_dict(EVALUATION))))
-    assert tuple(head) == CSV_HEAD
+    tables = result_tables(Results.from_dict(EVALUATION))
+    rows = [
+        (table.title, row.label, *value)
+        for table in tables
+        for row in table.rows
+        for value in row.values.items()
+    ]
     found = {tuple(row[:-1]): row[-1] for row in rows}
     assert len(found) == len(rows)
-    assert found["Position error after 1 s", "joint2 [m]", "model"] == "0.02"
-    assert found["Error of the tip's position [mm]", "1 s", "velocity stays constant"] == "26.0"
+    assert found["Position error after 1 s", "joint2 [m]", "model"] == 0.02
+    assert found["Error of the tip's position [mm]", "1 s", "velocity stays constant"] == 26.0
     relative = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-    assert found[relative, "1 s", "URDF"] == ""
-    assert found["Torque error by joint, RMSE", "joint2 [N]", "model"] == "2.0"
+    assert found[relative, "1 s", "URDF"] is None
+    assert found["Torque error by joint, RMSE", "joint2 [N]", "model"] == 2.0
 
 
 def test_the_page_of_an_identification_states_the_same_as_the_text(robots):

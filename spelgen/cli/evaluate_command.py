@@ -13,7 +13,7 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
-from spelgen.evaluation.tables import LIMITS, csv_text, limit_figures, summary
+from spelgen.evaluation.tables import LIMITS, limit_figures, summary
 from spelgen.files import write_json, write_text
 from spelgen.listing import WIDTH
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
 
 
-Format = Literal["text", "json", "csv"]
 LIMIT_EXCEEDED = 3  # Exit code if an error exceeds --limit. Code 2 is used by usage errors.
 LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
@@ -32,7 +31,7 @@ def evaluate(
     data: list[Path] | None = options.DATA,
     mapping: Path | None = options.MAPPING_FILE,
     filter: float | None = options.FILTER,
-    format: Format | None = options.result_format(),
+    format: Literal["text", "json"] | None = options.result_format(),
     output: Path | None = options.OUTPUT,
     limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
     truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
@@ -72,8 +71,7 @@ def evaluate(
     # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
-    forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
-    options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
+    options.write_result(format, output, {"text": results.text, "json": lambda: json.dumps(record)})
     # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
     values = limit_figures(results)
     exceeded = []

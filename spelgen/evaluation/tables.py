@@ -1,9 +1,7 @@
-"""Tables of an evaluation, with a column per predictor: for the terminal, notebooks, files and pages."""
+"""Tables of an evaluation, with a column per predictor: for the terminal, notebooks and pages."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
@@ -23,7 +21,6 @@ OBSERVER = (
 Numbers = Mapping[str, float | None]
 """Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
-CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 """Names of the figures that `spelgen evaluate --limit` accepts."""
 
@@ -123,17 +120,6 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
         if len(numbers) == len(runs):
             tables.setdefault(title, {})[label] = numbers
     return [table(title, rows) for title, rows in tables.items()]
-
-
-def csv_text(results: Results) -> str:
-    """Return the numbers of all tables as CSV, one line per number; an unknown number is an empty cell."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(CSV_HEAD)
-    for one_table in result_tables(results):
-        for row in one_table.rows:
-            writer.writerows((one_table.title, row.label, *value) for value in row.values.items())
-    return file.getvalue()
 
 
 def summary(results: Results) -> Listing | None:
