@@ -6,8 +6,7 @@ import os
 import signal
 import threading
 import time
-from dataclasses import asdict, replace
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +20,10 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
-from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
+from spelgen.comparison.arms import ComparedArm, Comparison, arm_inputs, load_comparison
 from spelgen.comparison.figures import spread_windows
 from spelgen.comparison.study import prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
-from spelgen.design import load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import rollout
@@ -106,16 +104,6 @@ def test_models_of_simulated_arms_know_only_the_kinematics(study):
         assert set(JOINTS) <= {joint.name for joint in known.joints}
         assert all(link.inertial is None for link in known.links)
         assert "joints" not in yaml.safe_load(job.inputs.urdf.with_suffix(".yaml").read_text())
-
-
-def test_the_ablation_changes_one_thing_at_a_time():
-    designs = [load_design(design) for design in ablation_designs().values()]
-    changes = [
-        {key for key, value in asdict(a).items() if value != asdict(b)[key]} for a, b in pairwise(designs)
-    ]
-    assert changes[:3] == [{"dissipation"}, {"input"}, {"mass"}]
-    assert changes[3] == {"potential", "encoding"}
-    assert designs[-1] == load_design("hybrid")
 
 
 def test_training_logs_are_the_first_seconds_of_other_motions_than_the_test_logs(study):
@@ -485,7 +473,6 @@ def test_the_command_compares_logs_of_one_arm(robot, logs, tmp_path, short_epoch
     ("arguments", "message"),
     [
         (["two_link.urdf", "--presets", "spell"], "the preset 'spell'"),
-        (["two_link.urdf", "--ablation", "--presets", "spel"], "--ablation: names the presets itself"),
         (["arms.yaml", "--data", "."], "in a YAML file each arm has its own"),
         (["servo.urdf"], "give logs of the arm with --data"),
     ],

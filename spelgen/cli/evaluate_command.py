@@ -192,9 +192,6 @@ def compare(
     seeds: int | None = option("", "Number of runs of each preset.", min=1),
     splits: int | None = option("", "Folds of a cross-validation over trajectories; default: 1.", min=1),
     steps: int | None = option("", "Training steps of each run on a simulated arm.", min=1),
-    ablation: bool = flag(
-        "--ablation", "Compare designs from phnode to hybrid that differ by one change each."
-    ),
     jobs: int | None = option(
         "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
     ),
@@ -205,25 +202,22 @@ def compare(
     An arm without logs is simulated by the protocol of its settings. The same command resumes an interrupted
     comparison, and reruns only changed runs.
     """
-    from spelgen.comparison.arms import ablation_designs
     from spelgen.comparison.study import prepare_study, run_study
     from spelgen.comparison.tables import arm_sections
     from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.render.comparison_page import write_comparison
     from spelgen.tasks import default_jobs
 
-    if ablation and presets is not None:
-        raise UsageError("--ablation: names the presets itself, omit --presets")
     paths = options.logs(data, extra_logs) if data or extra_logs else []
     names = options.names(presets)
     values = {
-        "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
+        "presets": names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
     # Options on the command line replace the values in the file of the comparison.
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, paths, mapping).model_copy(update=changes)
-    name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
+    name = f"{target.stem}-logs" if paths else target.stem
     # The path of the output folder must be absolute, since workers have other working directories.
     folder = (output or Path("comparisons") / name).absolute()
     # All cores are used by default, because a comparison takes hours on one core.

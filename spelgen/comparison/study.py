@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from spelgen.comparison.arms import ArmInputs, Comparison, Progress, ablation_designs, arm_inputs
+from spelgen.comparison.arms import ArmInputs, Comparison, Progress, arm_inputs
 from spelgen.comparison.figures import TUNING, step_seconds
 from spelgen.comparison.jobs import Job, RunResult, run_job
 from spelgen.design import load_design
@@ -66,7 +66,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     does not exist, and RunError if no arm can be used. If there is only one arm, its error is raised.
     """
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
-    for preset in set(comparison.presets or ()) - ablation_designs().keys():
+    for preset in comparison.presets or ():
         load_design(preset)
     jobs = []
     failures = {}
