@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -74,7 +75,7 @@ def simulated_figures(
     """Return the numbers by which models of a simulated arm are compared. truth: URDF with the true parameters."""
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
-    config = fit.config if isinstance(fit.config, Rollout) else Rollout()
+    config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only

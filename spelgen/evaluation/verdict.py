@@ -148,16 +148,19 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
     # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        is_best = error == min(errors.mean for errors in replay.errors.values())
-        (uses.good if is_best else uses.bad).append("simulation from commands")
+        if error == min(errors.mean for errors in replay.errors.values()):
+            uses.good.append("simulation from commands")
+        else:
+            uses.bad.append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
     """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
-    error = None if errors is None else errors.mean_relative_rms
-    return math.inf if error is None else error
+    if errors is None or errors.mean_relative_rms is None:
+        return math.inf
+    return errors.mean_relative_rms
 
 
 def _better_baselines(results: Results) -> list[str]:

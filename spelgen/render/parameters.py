@@ -60,7 +60,7 @@ def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None
     """
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
-    # The base parameters of bodies precede those of friction and drives, of which the URDF has no values.
+    # The base parameters of bodies are first. The URDF has no values of the base parameters of friction and drives.
     urdf = [""] * len(names)
     for k, base in enumerate(base_parameters(arm.chain)):
         if base.value is not None:
