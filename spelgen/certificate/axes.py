@@ -78,7 +78,7 @@ class Axes:
     def opposed(self, a: int, b: int) -> bool:
         """Return True if the axes of joints ``a`` and ``b`` have opposite directions; the axes must be parallel."""
         # The cosine of the angle between unit vectors that are always parallel is 1 or -1 at all configurations.
-        return max(self._cosines(a, b)) < 0
+        return bool((self._cosines(a, b) < 0).all())
 
     def same_twist(self, a: int, b: int) -> bool:
         """Return True if joints ``a`` and ``b`` have equal or opposite twists: coaxial or, if prismatic, parallel axes.
