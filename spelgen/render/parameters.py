@@ -35,17 +35,9 @@ def parameter_tables(
     elif posterior is not None:
         tables.append(posterior.listings[0])
     if isinstance(model, RigidBodyDynamics):
-        tables.append(_body_table(body_parameters(model), arm, posterior))
+        tables.append(_body_table(model.inertial_parameters.detach().numpy(), arm, posterior))
         tables.append(_joint_table(model, arm, posterior))
     return tables
-
-
-def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
-    """Return the inertial parameters of the bodies of a model, (bodies, 10) [kg, kg m, kg m^2].
-
-    They are in the order of ``Body.inertia``.
-    """
-    return np.asarray(model.inertial_parameters.detach())
 
 
 def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None) -> Listing:

@@ -17,7 +17,7 @@ from spelgen.fitting.servo.report import servo_summary
 from spelgen.labels import MODEL, UNITS, named_joints
 from spelgen.render import run_facts
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
-from spelgen.render.parameters import body_parameters, parameter_tables
+from spelgen.render.parameters import parameter_tables
 from spelgen.render.plots import growth_chart
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
 from spelgen.render.run_facts import Run
@@ -58,7 +58,7 @@ def report_data(folder: Path | str) -> Content:
     """
     run = Run(folder)
     tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
-    bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
+    bodies = run.model.inertial_parameters.tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
         "schema": SCHEMA,
         "verdict": run.results and run.results.assessment and asdict(run.results.assessment),
