@@ -74,7 +74,7 @@ def verdict(
         sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
-    joint, speed = _worst_joint(results)
+    joint, speed, proof = _worst_joint(results)
     recommendations = _recommendations(results, identified or {}, limits, independent, joint, speed)
     details = [f"worst at {joint}{speed}"] if joint else []
     details += [f"next, record {motion}" for motion in list(recommendations)[:1]]
@@ -85,8 +85,9 @@ def verdict(
             sentence += f"; {detail}"
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
-    because += [f"The model {listed(uses.proofs)}.", *_better_baselines(results), *recommendations.values()]
-    return Verdict(f"{sentence}.", " ".join(because))
+    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results)]
+    because += recommendations.values()
+    return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
 
 def _assess_torques(results: Results, uses: _Uses) -> None:
@@ -189,8 +190,8 @@ def _better_baselines(results: Results) -> list[str]:
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
-def _worst_joint(results: Results) -> tuple[str, str]:
-    """Return the name of the worst joint, and words for the speed at which its error is largest.
+def _worst_joint(results: Results) -> tuple[str, str, str]:
+    """Return the name of the worst joint, words for its worst speed, and a sentence about its motion error.
 
     The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
     joint of the largest motion error. The words are " near standstill" or " at speed" if the torque error of the joint
@@ -200,10 +201,11 @@ def _worst_joint(results: Results) -> tuple[str, str]:
     moving, motion_error = _worst_motion(results)
     only_motion = error <= 1 - TUNING.explained_for_contacts and motion_error > TUNING.close_prediction
     if moving and (only_motion or not joint):
-        return moving, ""
+        amount = share(motion_error, "the motion")
+        return moving, "", f"At {moving} the error after {results.horizons[-1].name} is {amount}."
     if not joint:
-        return "", ""
-    return joint, _slow_or_fast(results, results.joints.index(joint))
+        return "", "", ""
+    return joint, _slow_or_fast(results, results.joints.index(joint)), ""
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
