@@ -61,8 +61,8 @@ class ServoModel:
             q: (segments, n) initial positions [rad, m].
             qd: (segments, n) initial velocities [rad/s, m/s].
         """
-        # All segments form one batch, because a rollout of many takes about as long as a rollout of one. A batch has one
-        # number of integrator steps per interval: the number for the segment that needs most steps.
+        # All segments form one batch, because a rollout of many takes about as long as a rollout of one. A batch has
+        # one number of integrator steps per interval: the number for the segment that needs most steps.
         steps = max(steps_between(log) for log, _ in segments)
         lengths = [rows.stop - rows.start - 1 for _, rows in segments]
         commands, intervals = [], []
