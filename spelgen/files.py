@@ -131,9 +131,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager in which an OSError gets the file name `path`, unless it names another file.
+    """Context manager in which an OSError gets the file name `path`; an OSError that names another file is unchanged.
 
-    An error on a full disk names no file; an error in `replacing` names the hidden file.
+    The name is missing in an error on a full disk. An error in `replacing` has the name of the hidden file, which
+    contains the name of `path` and is replaced by it.
     """
     try:
         yield

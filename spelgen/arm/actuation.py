@@ -49,9 +49,9 @@ class Drives(NamedTuple):
 class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
-    couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
-    the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
-    couplings.
+    couplings: nonzero entries, joint torques per motor torque, of motors that drive several joints, if the logs contain
+    joint torques. G is then the identity for these joints, and the couplings determine only the motor speeds (see
+    `drives`). If the logs contain motor torques, these entries are in ``entries``, and ``couplings`` is empty.
     """
 
     joints: int
@@ -116,8 +116,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Entries of the input matrix G for joints that are driven by several motors are in `couplings`, whose matrices
-    # include the gears.
+    # A joint that is driven by several motors gets no entry here: its entries of the input matrix G are in `couplings`,
+    # and include the gear ratios.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

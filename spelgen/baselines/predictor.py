@@ -33,9 +33,9 @@ def roll_out_stiff(
 
     Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
     with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
-    approximation is the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry
-    friction) then need no smaller steps, and the error of an explicit method is not confused with an error of the
-    dynamics.
+    approximation is the Jacobian of friction only. Even stiff damping and bristles, which occur with light links and
+    dry friction, then need no smaller steps. An explicit method would need them; otherwise its integration error would
+    be confused with an error of the dynamics.
 
     Args:
         dynamics: dynamics of the arm, see `equations_of`.
@@ -164,8 +164,8 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS velocity error that is multiplied by `tolerance`, as a fraction of the RMS change of
-    # velocity in the windows.
+    # [1] Lower bound of the RMS error in the test of `tolerance`, divided by the RMS change of velocity in the windows:
+    # otherwise an exact model would need the largest number of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -187,7 +187,8 @@ States = tuple[Tensor, Tensor]
 class Solver:
     """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
 
-    The integrator takes the fewest steps per sample interval that are accurate in the `probe` windows.
+    dynamics: the integrated dynamics. probe: measured windows from which the number of integrator steps per sample
+    interval is chosen, see `substeps`.
     """
 
     dynamics: RigidDynamics

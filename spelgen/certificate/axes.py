@@ -81,9 +81,10 @@ class Axes:
         return bool((self._cosines(a, b) < 0).all())
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Return True if joints ``a`` and ``b`` have equal or opposite twists: coaxial or, if prismatic, parallel axes.
+        """Return True if joints ``a`` and ``b`` have equal or opposite twists.
 
-        A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
+        Two revolute joints then are coaxial, and two prismatic joints are parallel. A body that both joints carry then
+        has equal or opposite velocities for unit velocities of the two joints.
         """
         return _are_parallel(self._twists[:, a], self._twists[:, b])
 
@@ -94,15 +95,15 @@ class Axes:
         return not np.cross(w, w_b).any() and not (np.cross(w, v_b) - np.cross(w_b, v)).any()
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Return True if all points that joint ``slider`` carries have constant signed distances from a plane.
+        """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        ``hinge`` is a revolute joint, ``slider`` a prismatic joint farther from the root. The plane contains the axis
-        of ``hinge``, is parallel to the axis of ``slider``, and moves with the child link of ``hinge``. The distances
-        must be constant for any motion of the joints between ``hinge`` and the tip. The entry of M in the row of
-        ``slider`` and the column of ``hinge`` is then constant.
+        ``hinge`` is a revolute joint nearer to the root. The plane contains the axis of ``hinge``, is parallel to the
+        axis of ``slider``, and moves with the child link of ``hinge``. The distances, with their signs, must be
+        constant while any joints after ``hinge`` move. The entry of M in the row of ``slider`` and the column of
+        ``hinge`` is then constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between ``hinge`` and ``slider`` could change the direction of ``slider``.
+            return False  # A revolute joint between them can turn ``slider`` out of any such plane.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         normal = np.cross(self._directions[:, slider], self._directions[:, hinge])
         return all(_is_orthogonal(self._twists[:, joint], normal) for joint in later)

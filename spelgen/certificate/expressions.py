@@ -3,8 +3,8 @@
 The polynomials are entries of M, or V, in sines, cosines and positions of joints. For consecutive joints with parallel
 axes, products of cosines and sines are expressed as cosines and sines of sums of angles. Other simplifications (powers
 of single angles, common factors of several terms) are not used: they shorten long formulas by 20 %, but not the
-formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits; Python for SymPy has
-exact fractions.
+formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits. Python for SymPy has
+exact fractions, except for fractions with more than 17 digits.
 """
 
 import re
@@ -183,7 +183,7 @@ def latex(expression: Expr) -> str:
 
 
 def python(expression: Expr) -> str:
-    """Return an expression as Python code for SymPy; fractions with more than 17 digits are rounded."""
+    """Return an expression as Python code for SymPy, with exact fractions up to 17 digits; longer ones are decimals."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(
         _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
     )

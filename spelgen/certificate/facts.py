@@ -95,8 +95,9 @@ class _Sentences:
         # Entries without a reason are listed last.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The placeholders in the reason are replaced by the joint of each entry's column or, if this joint is
-                # prismatic, by the joint of its row.
+                # A reason names one of the two joints of an entry. Its placeholder is replaced by the other one: the
+                # joint of the column or, if this joint is prismatic, the joint of the row (see `zero_reason`,
+                # `balance_reason`).
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -225,8 +226,10 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    The bodies that the joint of the row carries have the same velocity field for unit velocities of the joints of all
-    columns. If the joint of the row carries one balanced body, the same angular velocity suffices.
+    Let c be the joint of the row. The reason is that the joints of the columns are coaxial or, if prismatic, parallel:
+    each of them gives the bodies that c carries the same velocity field, up to its sign. If c is the last joint and its
+    body is dynamically balanced, revolute joints only have to be parallel: their angular velocities are the same, up to
+    sign.
 
     entries: (row, column) of each entry, counted from 0.
     """

@@ -44,7 +44,7 @@ class Formula:
     Attributes:
         entry: (row, column) counted from 1, or "V".
         terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
-            expansion exceeds its budget.
+            expansion would exceed the permitted number of multiplications (`Expansion.budget`).
         expression: SymPy expression; None if the entry is too long.
     """
 
@@ -127,7 +127,11 @@ class Formulas:
 
     @property
     def trusted(self) -> str:
-        """Text that states for which inertial parameters the formulas are valid: any, or with the zeros of the URDF."""
+        """Text that states for which inertial parameters the formulas are valid.
+
+        Valid parameters have any values or, with ``assume="inertials"``, the zeros and symmetries of the URDF's
+        parameters.
+        """
         if self.assume == "inertials":
             return "the URDF's inertial zeros and symmetries"
         return "any inertial values"
@@ -208,7 +212,8 @@ class _Writer:
     def formula(self, entry: Entry, longest: int) -> Formula:
         """Return the closed form of an entry of M, or of V.
 
-        It has no expression if it has more than ``longest`` terms, or if its expansion exceeds the budget.
+        It has no expression if it has more than ``longest`` terms, or if its expansion to polynomials would exceed the
+        permitted number of multiplications (`Expansion.budget`).
         """
         try:
             polynomials = self._polynomials(entry)
@@ -228,7 +233,7 @@ class _Writer:
         """Return {base parameter: coefficient of this parameter in an entry of M, or in V without its constant}.
 
         A coefficient is a polynomial in sines, cosines and positions of the joints. Raises TooLarge if the expansion
-        exceeds the budget.
+        would exceed the permitted number of multiplications (`Expansion.budget`).
         """
         energies = self._expansion.energies
         element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]

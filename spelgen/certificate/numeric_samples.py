@@ -179,7 +179,8 @@ def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> 
     """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
-    (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.
+    (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
+    column. The diagonal entries of M are doubled, which has no effect on relative differences.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

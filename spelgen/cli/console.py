@@ -99,7 +99,8 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
-    # An interrupt needs no traceback. Compiled modules convert it to an ImportError while they are imported.
+    # An interrupt (Ctrl-C) is no failure, and has an exit code of its own. If it arrives while a compiled module is
+    # imported, the module raises an ImportError whose cause is the KeyboardInterrupt.
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)

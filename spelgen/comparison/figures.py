@@ -58,11 +58,12 @@ NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"
 
 @dataclass(frozen=True)
 class SimulatedFigures:
-    """Numbers by which models of a simulated arm are compared, for one model.
+    """Results of one model of a simulated arm, for the comparison with other models.
 
     Attributes:
         losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
-        sizes: {row of a table: size of a network, duration of a training step, or invariant}.
+        sizes: {row of a table: size of a network, duration of a training step, smallest eigenvalue of M, or rise of
+            energy}.
     """
 
     losses: Figures
@@ -72,7 +73,7 @@ class SimulatedFigures:
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Return the numbers by which models of a simulated arm are compared. truth: URDF with the true parameters."""
+    """Return the results of one model of a simulated arm, for a comparison. truth: URDF with the true parameters."""
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
@@ -87,8 +88,8 @@ def simulated_figures(
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
-    # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
-    # windows of 1 s.
+    # The training loss is the loss that the fit minimises. Its windows, and those for the test loss, are therefore as
+    # long as the windows of the training, and not 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]

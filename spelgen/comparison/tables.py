@@ -150,8 +150,8 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
         medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # A row with the ratio of the baseline's loss to each loss is added, because absolute losses depend on units and
-        # on the sample rate.
+        # A row with the loss of the preset `BASELINE` divided by each preset's loss is added, because absolute losses
+        # depend on units and on the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))

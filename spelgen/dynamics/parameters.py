@@ -22,10 +22,10 @@ class ParameterInfo:
     """Group and unit of a trained parameter of a model. Fits select parameters by group.
 
     Attributes:
-        kind: group of the parameter: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of
-            friction), effects (friction that varies with velocity), velocities, load_dependence, fractions (of
-            bristles), torque_splines, torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness,
-            damping, dead_zone, delay, or network.
+        kind: group of the parameter: bodies (inertial parameters), armature, gains (of motors), offset (of torque),
+            friction_compensation; of friction: sizes (magnitude), effects (dependence on velocity), velocities,
+            load_dependence, fractions (of bristles); residual terms: torque_splines, torque_ripple, friction_splines,
+            mass_residuals; of M: mass_constants; of servos: stiffness, damping, dead_zone, delay; or network.
         unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
             parameters are the logarithm of this quantity divided by a nominal value.
     """
@@ -39,9 +39,10 @@ NETWORK = ParameterInfo("network", "1")
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return {name: group and unit} of the parameters of a model and of the buffers that a fit may set.
+    """Return {name: group and unit} of the parameters of a model, and of buffers for which a fit may set a value.
 
-    These buffers are quantities that only some logs determine, for example the friction compensation of a drive.
+    A quantity is a buffer, and not a parameter, if only some logs determine it: for example, the friction compensation
+    of a drive.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():

@@ -230,8 +230,8 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
-    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode, and if autograd is disabled:
-    # autograd is therefore enabled, and reverse mode is used.
+    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode and, if autograd is disabled, in
+    # reverse mode. Reverse mode is therefore used, with autograd enabled.
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
         # Tensors of inference mode cannot be differentiated, so the arguments are cloned.

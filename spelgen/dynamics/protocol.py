@@ -83,7 +83,7 @@ def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return the matrix C, (n, n), for which C qd are the motor velocities of a trained model of rigid bodies.
+    """Return the matrix C, (n, n), of a rigid-body model: its motors have the velocities C qd.
 
     C is the identity if each motor drives its own joint.
     """
@@ -130,15 +130,17 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the optional arguments for friction of the methods of `dynamics`: (z, direction), (z,) or ().
+    """Return the last, optional arguments of the methods of `dynamics`, on which friction depends.
 
-    A caller appends them to (q, qd, ...). They are empty if z is unknown or friction has no state.
+    A caller appends them to (q, qd, ...). They are (z, direction), (z,) or, if z is unknown or friction has no state,
+    ().
 
     Args:
         dynamics: dynamics whose method is called.
         z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
-        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
-            needed only if tau was filtered: it must have passed the same filter.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles; None:
+            computed from qd. It is needed only for comparisons with low-pass filtered torques, and must have passed the
+            same filter.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()
@@ -182,5 +184,9 @@ class VelocityState:
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """Return `dynamics` with the methods that rollouts call: unchanged for a model, else wrapped in `VelocityState`."""
+    """Return `dynamics` with the methods that rollouts call.
+
+    A trained model (`PortHamiltonian`) has these methods and is returned unchanged. Other dynamics, such as baselines,
+    are wrapped in `VelocityState`.
+    """
     return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

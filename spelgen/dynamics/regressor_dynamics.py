@@ -112,11 +112,11 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
+        """Return quantities of the B bodies that depend only on q: the configuration cache, and derivatives of momenta.
 
-        q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
-        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
-        pseudo-inertia J.
+        q: (..., n) [rad, m]. The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum
+        of a body is the matrix T' J, (3, 4): T', (3, 4), is the time derivative of its homogeneous transform T without
+        the constant last row, and J, (4, 4), is its pseudo-inertia.
         """
         # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
         # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as

@@ -31,7 +31,7 @@ class ServoDrives(NamedTuple):
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    steepness: Tensor  # bristle stiffness / dry friction = fraction / break-away displacement, (K, ..., n) [1/rad, 1/m]
+    steepness: Tensor  # stiffness of a bristle / magnitude of dry friction, (K, ..., n) [1/rad, 1/m]
 
 
 class ServoState(NamedTuple):
@@ -68,7 +68,8 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # `batch`: batch dimensions of the friction constants, at least one.
+    # `batch`: batch dimensions of the friction constants. If they have none, a dimension of size 1 is added, (K, 1, n),
+    # so that the constants broadcast with states of W windows, (K, W, n).
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
@@ -76,10 +77,10 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the initial state of a rollout: q, qd, and the friction state with which the acceleration is zero.
+    """Return the initial state of a rollout: q, qd, and the friction state that balances all other torques.
 
-    An arm at rest or in steady motion has this state: dry friction balances all other torques, up to its largest
-    magnitude.
+    The acceleration is then zero, as for an arm at rest or in steady motion. If the other torques exceed the largest
+    dry friction, all bristles have their break-away displacements, and the acceleration is not zero.
 
     Args:
         drives: constants of servos and friction.
@@ -150,7 +151,8 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) is the deflection of bristle k after the
     displacement x. For a given number of sliding bristles, 0 to K, the equation is linear in x. Of the solutions of
-    these K + 1 linear equations, the one with the largest |x| is valid.
+    these K + 1 linear equations, the one with the largest |x| is valid: a bristle resists with at most its sliding
+    force, so that the true resistance is the smallest of the K + 1 linear ones.
 
     Args:
         push: force on the joint, (..., n).

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class TipKinematics:
     """Pose and Jacobian of a link in the frame of the root link, as functions of q, (..., n) [rad, m].
 
-    Mimic joints move with their coordinates; all other joints are at zero. Angles of the URDF are not rounded, unlike
-    the angles of a derived arm. Results have the dtype of q.
+    Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
+    rounded to it, unlike in a `Chain`. Results have the dtype of q.
 
     Args:
         robot: the URDF.

@@ -89,8 +89,8 @@ def flat(value: object) -> str:
 def _escaped(text: str) -> str:
     """Return a string literal for ``text``, in which characters that are not ASCII are Python's 32-bit escapes.
 
-    json.dumps is not used for these characters: it has only 16-bit escapes, and two of them for a larger code point,
-    which Python does not join.
+    json.dumps is not used for these characters: it writes a code point of more than 16 bits as two 16-bit escapes,
+    which Python reads as two characters.
     """
     return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 

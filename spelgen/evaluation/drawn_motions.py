@@ -161,7 +161,8 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
 
-    The mean acceleration is the change of qd divided by the duration of the interval.
+    At a low sample rate only the mean acceleration can be computed: the change of qd divided by the duration of the
+    interval. logs: the evaluated logs, for their preprocessing and the bristles of friction.
     """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt

@@ -154,7 +154,8 @@ def _evaluate_torques(
         truth: true arm of simulated logs, or the path of its URDF; None if unknown.
         progress: function called before each horizon, see `evaluate`.
     """
-    # All errors are divided by the motion or by the variation of the torque, so at rest they would only show noise.
+    # All errors are divided by the motion or by the variation of the torque. Logs at rest, whose errors would only show
+    # noise, are therefore rejected.
     if max(float(np.ptp(trajectory.q, axis=0).max()) for trajectory in logs) < TUNING.smallest_motion:
         got = f"no motion: all joints stay within {TUNING.smallest_motion:g} rad or m"
         raise LogError(got, expected="test logs in which joints move")

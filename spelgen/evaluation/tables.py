@@ -86,7 +86,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 
 
 def result_tables(results: Results) -> list[Table]:
-    """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
+    """Return the tables of an evaluation: errors under replayed commands, per horizon and per joint, and of torques."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
         tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))

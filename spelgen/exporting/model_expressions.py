@@ -87,8 +87,9 @@ def _expressions(
         model: the model as NumPy arrays.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1), of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: True if the expressions will be differentiated. The symbol ``first``, the derivative of M's
-            residual term with respect to q, then replaces the symbols ``rate`` and ``kinetic``.
+        derivatives: True if the expressions will be differentiated. The Coriolis torque of M's residual term then
+            depends on ``first``, the Jacobian of the term with respect to q, in place of the directional derivatives
+            ``rate`` and ``kinetic``.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)

@@ -70,7 +70,8 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
     """Return the Coriolis torque of R, the residual term of M: dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1).
 
-    derivatives: True: the result depends on the symbol ``first`` instead of ``rate`` and ``kinetic``.
+    derivatives: True if the result will be differentiated with respect to q. It then depends on ``first``, the Jacobian
+    of ``mass``, instead of the directional derivatives ``rate`` and ``kinetic``, whose Jacobians are no symbols.
     """
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
@@ -94,7 +95,8 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return pairs (symbol, Jacobian with respect to q) for the residual terms that depend on q.
 
-    A symbol is a column of k entries, (k, 1). Its Jacobian, (k, n), consists of other symbols.
+    A residual term is a symbol of k entries, (k, 1). Its Jacobian, (k, n), consists of the symbols of its derivatives,
+    for example ``stiffness`` for ``gravity``. symbols: the result of `residual_symbols`.
     """
     # A friction factor depends only on the position of its own joint: each row of `joints` selects one joint.
     joints = np.eye(model.n)[list(model.residuals.friction)]

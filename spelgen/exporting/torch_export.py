@@ -100,13 +100,14 @@ def number_type(model: PreparedModel) -> str:
 def calls(model: PreparedModel, names: Sequence[str], zeros: str, no_state: str) -> list[str]:
     """Return lines of Python for the README of an export, which call each exported program.
 
-    friction_memory is called first and friction_step last, as in a control loop.
+    As in a control loop, the program friction_memory, which returns the initial friction state z, is called first, and
+    friction_step, which updates z, is called last.
 
     Args:
         model: model that was exported.
         names: names of the programs.
         zeros: Python expression for an array of zeros, (5, n): the example has a batch of five states.
-        no_state: Python expression for z, if the program friction_memory is not exported.
+        no_state: Python expression for the initial z, used if the program friction_memory is not exported.
     """
     lines = [f"q = qd = qdd = tau = dq = {zeros}  # a batch of 5; dq: change of q since the last step"]
     if model.elements and "friction_memory" not in names:
@@ -193,6 +194,6 @@ def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
 
 
 def program_output(name: str) -> str:
-    """Return the name of the single output of a function such as inverse_dynamics: "tau"."""
+    """Return the name of the only output of a function, for example "tau" for inverse_dynamics."""
     (output,) = ENTRY_POINTS[name].outputs
     return output

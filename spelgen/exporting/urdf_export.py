@@ -60,7 +60,8 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     joints = {element.get("name"): element for element in root.findall("joint")}
     chain = choose_chain(robot, arm.joint_names, None)
     lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
-    # Some tools do not read the orientation of an <inertial>: fixed links get an <inertial> without one, too.
+    # Some tools ignore the orientation of an <inertial>. Each <inertial> is therefore rotated to the axes of its link,
+    # also at links that do not move and keep the inertia of the URDF.
     for link in robot.links:
         if link.inertial and any(link.inertial.rpy):
             mass, center, rpy, (xx, xy, xz, yy, yz, zz), _ = link.inertial

@@ -1,4 +1,4 @@
-"""Constants of drives whose 95 % intervals are in a posterior, and the straight line that approximates friction."""
+"""Constants of drives for which a posterior has 95 % intervals, and the straight line that approximates friction."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from spelgen.runtime.motors import MotorInputs
 class DriveQuantity(NamedTuple):
     """A constant of drives that has one value per joint.
 
-    unit: format string for the `UNITS` of a joint's type. positive: True if all values are positive. joints: indices of
-    the joints that have this constant.
+    unit: format string into which the units of the joint's type (`UNITS`) are inserted, for example "{0.torque}".
+    positive: True if all values are positive. joints: indices of the joints that have this constant.
     """
 
     name: str
@@ -39,8 +39,9 @@ TORQUE_UNITS = {
 def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
     """Return the constants of drives whose input is a torque, and the function that returns their values.
 
-    The function returns (4, n) for a model, or (5, n) with trained motor gains. Viscous and Coulomb friction
-    approximate the friction by least squares up to the typical speed.
+    The constants are armature, viscous friction, Coulomb friction, torque offset and, if motor gains are trained, gain.
+    The function returns (4, n) for a model, or (5, n) with gains. Viscous and Coulomb friction approximate the friction
+    by least squares up to the typical speed.
     """
     line = friction_line(model)
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
@@ -53,7 +54,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return the constants of the drives, (4, n), or (5, n) with motor gains, in the order of `TORQUE_UNITS`."""
+        """Return armature, viscous and Coulomb friction, torque offset and, if trained, gain, (4, n) or (5, n)."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))

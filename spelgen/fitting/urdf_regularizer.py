@@ -74,7 +74,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
 
     Args:
         urdf: URDF file.
-        model: model before the fit; the mean of its M is the unit of M.
+        model: model before the fit. Mass matrices are made dimensionless by the mean of its M over the positions.
         windows: windows of the logs, whose positions define the range.
 
     Raises:

@@ -71,14 +71,15 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     # explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
-        # one fault of two may look like another one: the first correction is then left open
+        # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
+        # several of the best single corrections.
         is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
         tried: list[HypothesisFit] = []
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
-        # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
-        # of other signals may be nearer than the right one
+        # To save time, orders of all joints and long drifts are searched only if no single correction explains the
+        # torques, or if the best one is a drift: the search from no delay may have found a drift of the wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -111,10 +112,10 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    A friction model with hysteresis shows the whole decrease, but also larger decreases of wrong hypotheses: on
-    recorded arms up to 32, instead of 17 without hysteresis. Its decreases are therefore halved. The larger one of the
-    decrease without hysteresis and the halved decrease is used. For a hypothesis with another delay, the smaller one of
-    both decreases (not halved) is used, since hysteresis resembles a delay.
+    With hysteresis, the whole decrease shows, but wrong hypotheses also lower the cost more: on recorded arms by up to
+    32, and without hysteresis by up to 17. The decrease with hysteresis is therefore halved, and used if it is then
+    larger than the decrease without hysteresis. For a hypothesis with another delay, the smaller one of both decreases
+    (not halved) is used, since hysteresis resembles a delay.
 
     Args:
         problem: problem without hysteresis.

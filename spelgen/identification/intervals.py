@@ -102,15 +102,16 @@ def student_scale(blocks: int) -> float:
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
-    The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
-    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps, the Hessian S of all
-    blocks and the prior, and the precision P of the prior. Errors of samples may be correlated within blocks, and their
-    variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    The first value (B, k) has, for each of the B blocks, the Newton step from the estimate to the estimate without this
+    block. The second value (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps,
+    the Hessian S of all blocks and the prior, and the precision P of the prior. Errors of samples may be correlated
+    within blocks, and their variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015,
+    CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
-        descent: (B, k) negative gradient of each block at the estimate; the sum over blocks is the gradient of the
-            prior's negative log density.
+        descent: (B, k) negative gradient of each block's cost at the estimate, where it balances the prior: the sum
+            over blocks is the gradient of the prior's negative log density.
         prior: (k, k) precision P of the prior.
     """
     count, hessian = len(curvature), curvature.sum(dim=0) + prior

@@ -74,7 +74,7 @@ class GeometryProblem:
 
         The other torques and their regressor rows become zero.
 
-        counted: mask (S, n), True for the torques that are fitted, of each joint in the unchanged log.
+        counted: mask (S, n), True for the samples and joints of the unchanged log whose torques are fitted.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -286,8 +286,9 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # The second n functionals are the powers that friction takes from the motion of each joint, qd (viscous qd +
-        # Coulomb sign(qd)), summed over the samples. The sums are entries of the Gram matrices.
+        # The first n functionals of x are the rotor inertias. The second n functionals are the powers that friction
+        # takes from the motion of each joint, qd (viscous qd + Coulomb sign(qd)), summed over the samples. The sums are
+        # entries of the Gram matrices.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -361,7 +362,7 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,).
 
-    The linear system is solved without the inverse, which takes a third of the time.
+    The linear system is solved without computing the inverse, in a third of the time.
     """
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)

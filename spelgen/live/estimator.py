@@ -185,7 +185,9 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques, as measured, for a motion with the estimated payload and friction drift, (n,) [Nm, N].
+        """Return the torques for a motion with the estimated payload and friction drift, (n,) [Nm, N].
+
+        Like the logged torques, they are torques of the joints or of the motors.
 
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
@@ -209,7 +211,8 @@ class Estimator:
                 decay = np.exp(-ahead / self.levels.drift.time_constant)
             a, d = self.drift.x.T
             if self.compensate_external:
-                # The bound is for measured torques with errors: commands are not larger than torques of the arm.
+                # Errors of measured torques may make the external torque arbitrarily large. The compensation is limited
+                # to torques that the drives can exert.
                 limit, d = self.levels.effort, self.observer.baseline - self.contact.external_torque
                 d = np.clip(d, -limit, limit)
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)

@@ -169,12 +169,12 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
-    logs are without payload, so each estimate x is an error, and the factor is the mean of x^T P^-1 x / k over trials.
-    A trial is an estimate from several consecutive blocks; x is the mass (k = 1), or mass and first moments (k = 4). A
-    prior value is included in each mean, with the weight of `prior_trials` trials. The factor is the largest mean of
-    both k and all lengths of trials: errors of the model are correlated over time, so that the mean may be larger for
-    longer trials.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. A
+    trial is an estimate x of the payload from several consecutive blocks, where x is the mass (k = 1), or mass and
+    first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
+    Its mean is computed for each k and each length of trials, with a prior value that has the weight of `prior_trials`
+    trials. The factor is the largest mean: errors of the model are correlated over time, so that the mean may be larger
+    for longer trials.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -273,11 +273,12 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
     """Return the exponential distribution of the largest peaks of all logs, as fields of `NoiseLevels`.
 
-    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. The
-    peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
-    contact thresholds are computed from all other logs. With thresholds multiplied by the factor, all held-out logs
-    together have at most the number of alarms that the default rate of false alarms allows. The factor is the same for
-    all joints, because the joint that needs the largest factor differs between logs.
+    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. For the
+    differences between logs, the peaks are multiplied by a factor, and the contact thresholds increase by the same
+    factor. Cross-validation determines it: for each log, thresholds are computed from all other logs. With these
+    thresholds times the factor, all held-out logs together have at most the number of alarms that the default rate of
+    false alarms allows. The factor is the same for all joints, because the joint that needs the largest factor differs
+    between logs.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].

@@ -112,8 +112,8 @@ class Following(NamedTuple):
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
-        offset: (n,) [rad, m] mean of u - q; 0 if the mean is less than two standard deviations of u - q, as for joints
-            that carry a load.
+        offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a
+            changing load causes smaller means.
         joints: tracking errors and lag of each joint.
     """
 

@@ -140,8 +140,8 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
-    logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
+    the settings that map the names if every joint name is the end of exactly one logged name ("j1" of "left_j1"). A
+    prefix that all joint names share may be omitted ("panda_j1" is then mapped to "fer_j1").
     """
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))

@@ -177,8 +177,8 @@ CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", fi
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, as if
-    # positions were frozen.
+    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, which would
+    # otherwise be reported as frozen signals.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",

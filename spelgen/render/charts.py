@@ -304,7 +304,7 @@ def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
     # The step is the smallest of 1, 2, 5 or 10 times a power of ten that gives at most five intervals.
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    # The tolerance 1e-9 accepts a step that is smaller than `rough` only by rounding.
+    # `rough`: step for exactly five intervals. The tolerance 1e-9 accepts a step that is smaller only by rounding.
     step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

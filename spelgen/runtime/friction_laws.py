@@ -95,7 +95,8 @@ class FrictionLaws(nn.Module):
         dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load,
 
     with v = |qd| / stribeck_velocity, r = stribeck_rounding, load = sqrt(gravity torque^2 + min_load^2) and
-    s(x, width) = x / sqrt(x^2 + width^2).
+    the smooth sign function s(x, width) = x / sqrt(x^2 + width^2). All other names except ``direction`` are
+    constants. ``saturation`` is the limit of a friction torque that rises with velocity.
 
     The trained parameters are logarithms of the constants, and logits of the bristle fractions. The factor
     ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of the joint, which

@@ -97,8 +97,9 @@ def record(
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    with the position error e = q* - q. At a joint with viscous > M_jj omega, where friction would slow the decay of e
-    down, the torque viscous omega e is added.
+    with the position error e = q* - q. Friction is compensated at the desired velocity only, so the viscous friction of
+    e' remains as additional damping. At a joint with viscous > M_jj omega, it would slow the decay of e down: the
+    torque viscous omega e is added.
 
     Args:
         dynamics: The arm, with friction.

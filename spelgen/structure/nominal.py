@@ -30,15 +30,16 @@ class Nominal:
     rounded to six digits for reproducibility across machines.
 
     Attributes:
-        output_means: mean of each varying term of M (output of the structure).
-        output_scales: standard deviation of each varying term, with a lower bound.
-        constants: value of each constant of M.
+        output_means: mean of the function f_j(q) of each varying term of M (see `structure.basis`).
+        output_scales: standard deviation of each f_j(q), with a lower bound.
+        constants: value of each constant c_k of M.
         constant_scales: magnitude of each constant, with a lower bound.
         potential_scale: standard deviation of V [J].
         joint_torque: typical torque of each coordinate [Nm, N]: sqrt(g^2 + a^2) with the root mean squares g of the
             gravity torque and a of the torque for unit acceleration.
-        mass_sensitivities: change of M with each coordinate, divided by the largest such change of all coordinates.
-        potential_sensitivities: change of V with each coordinate, divided by the largest such change.
+        mass_sensitivities: root mean square change of M if only this coordinate changes (`_mass_changes`), divided by
+            the largest value of all coordinates; at least 0.02.
+        potential_sensitivities: root mean square of dV/dq, normalised in the same way.
     """
 
     output_means: tuple[float, ...]
@@ -171,7 +172,8 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
-    # [rad, m] Step of the central differences for dV/dq. Its relative error of 1e-8 is small enough for scales.
+    # [rad, m] Step of the central differences for dV/dq. The derivative has a relative error of 1e-8, which is small
+    # enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
@@ -185,8 +187,9 @@ def _mass_changes(
 ) -> np.ndarray:
     """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
 
-    In each sample, the coordinate is replaced by its value in the preceding sample. The change of an entry of M is
-    divided by the typical magnitude of the entry, so that it has no unit. The mean is over samples and entries.
+    The coordinate changes from one random value to another: to its value in the preceding sample. The change of an
+    entry of M is divided by the typical magnitude of the entry, so that it has no unit. The mean is over samples and
+    entries.
 
     Args:
         arm: the arm.
@@ -274,9 +277,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one.
-    # The test of consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is
-    # consistent.
+    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one. J
+    # counts as inconsistent only if this ratio is below fraction^2: the ratio of a slender body may be below
+    # `fraction`, although the body is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

@@ -132,7 +132,7 @@ def coefficients(
     """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
 
     The recursion computes with vectors of 10 B numbers in place of numbers: since M and V are linear in the inertial
-    parameters, an entry for unit vectors as inertial parameters is its row of coefficients.
+    parameters, each entry becomes the row of its coefficients if unit vector k replaces the inertial parameter k.
 
     Args:
         arm: the arm.
@@ -255,7 +255,7 @@ def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
     from the moving frame to the frame at q = 0.
     """
     s, c, _ = transform.rotation[1]
-    # The rotation of a prismatic joint is the identity, which consists of integers.
+    # The rotation of a prismatic joint is the identity, the only one that consists of integers: no rotation is needed.
     if isinstance(c, int):
         return _translated(transform.translation, inertia)
     hx, hy, hz = inertia.moment

@@ -181,7 +181,7 @@ class Spans:
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        Joints are in increasing order; each has as many samples as ``floats`` has positions, 2 S.
+        Joints are in increasing order. Each joint has 2 S samples, one for each position of ``floats``.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])

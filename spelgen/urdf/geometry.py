@@ -151,7 +151,8 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
     """Return {(file, scale): mesh} of the shapes that are meshes; a mesh that cannot be read is omitted.
 
-    faces: limit of the number of triangles of all meshes together; meshes above their share are simplified.
+    faces: limit of the number of triangles of all meshes together; a mesh of more than `faces` divided by the number of
+    shapes is simplified.
     """
     paths: dict[tuple[str, tuple[float, ...]], str] = {}
     for shape in shapes:

@@ -72,7 +72,8 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, dry friction divided by its magnitude
-            (-1 to 1), torque of the bodies, and 1.
+            (-1 to 1), torque of the bodies except for the inertial torque of the joint's own acceleration
+            (`BodyLoad.bias`), and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
     matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
@@ -119,7 +120,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
             """Return the position errors [rad, m] of one joint after the burn-in, as a vector over all windows.
 
-            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo.
+            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo. column: slice of the joint.
             """
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(

@@ -189,9 +189,10 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    The ratios are kd / kp, armature / kp and friction / kp, each with its 95 % interval. The key
-    "determined" of a ratio is True if the upper end of its interval is below `ServoTuning.max_factor` times the ratio.
-    For dry friction and the dead zone, the logs must also distinguish one from the other (see `identifiable`).
+    steps: number of Levenberg-Marquardt steps of the fit. The ratios are kd / kp, armature / kp and friction / kp, each
+    with its 95 % interval. The key "determined" of a ratio is True if the upper end of its interval is below
+    `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the logs must also distinguish one
+    from the other (see `identifiable`).
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -211,7 +212,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            # A dead zone of zero was not selected at this joint, so it has no interval.
+            # If no dead zone was selected at this joint, it is zero and has no interval.
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
@@ -249,10 +250,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
-                # undetermined and in the list.
-                if column != "dead_zone":
-                    undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
+                undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     end = "All ratios are determined"

@@ -20,8 +20,9 @@ class ServoRollouts:
     """Rollouts of windows, in which each joint is integrated independently of the other joints.
 
     The joints are coupled only by the load of the bodies (gravity, inertia, Coriolis forces). Here, this load is
-    computed along a fixed motion instead of the predicted motion: once for parameters x0, and for other parameters x
-    with the term regressor (phi(x) - phi(x0)), where phi(x) (10 B,) are the inertial parameters of B bodies.
+    computed along a fixed motion instead of the predicted motion, once for parameters x0. For other parameters x, the
+    term regressor (phi(x) - phi(x0)) is added to it, where phi(x) (10 B,) are the inertial parameters of B bodies, and
+    the regressor is evaluated along the fixed motion.
 
     Since the joints are independent, one rollout with a parameter changed at all joints gives the derivatives of all
     joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
@@ -65,10 +66,11 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions, and velocities and accelerations from the rollouts with parameters x.
+        """Return the measured motion, whose velocities and accelerations are computed by rollouts with parameters x.
 
-        The velocities and accelerations are the predicted ones, plus smoothed derivatives of measured minus predicted
-        positions (see `ServoWindows.motion`).
+        Positions are the measured ones. Velocities and accelerations are the derivatives of the predicted motion plus
+        smoothed derivatives of measured minus predicted positions: smoothed derivatives of the measured positions only
+        would attenuate fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

@@ -235,11 +235,12 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the parameters (K,) after a step (K,) from x, along a curved line: a candidate of the solver.
+        """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The line is straight in the inertial parameters and in the friction coefficients, since the torque is linear in
-        them. `step_in_inertial_parameters` updates the inertial parameters. x contains the logarithm of each friction
-        coefficient c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
+        The torque is linear in inertial parameters, armatures and friction coefficients, so the curve is straight in
+        these quantities. x contains log-Cholesky parameters of bodies (see `step_in_inertial_parameters`), and the
+        logarithms of armatures and friction coefficients: a step s > 0 of log c changes c to c (1 + s). The exception
+        is a step s < 0, which changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
@@ -318,12 +319,12 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
-        have the same colour. A drive then acts on at most one joint of a colour, so that each parameter of a drive, and
-        each gravity torque on a drive, affects at most one joint of a colour. Therefore the gradient of the sum of the
-        torques of one colour contains the Jacobian rows of all joints of this colour. One reverse pass per colour (most
-        arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
-        the gradients of all samples.
+        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints on which no common drive
+        acts may have the same colour. A parameter of a drive, or the gravity torque on it, then affects the torque of
+        at most one joint of a colour. The torques of all joints of a colour are added. Each element of the gradient of
+        this sum is an element of the Jacobian row of a single joint, so that the gradient contains the rows of all
+        these joints. One reverse pass per colour (most arms have one colour) replaces n passes. Each sample has its own
+        copy of the parameters, so that a pass computes the gradients of all samples.
 
         Returns:
             The scaled residual, (T, n) [Nm, N].

@@ -36,12 +36,13 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
-    """A residual term of one joint, as a linear model of P = L + W weights on T samples.
+    """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries for the joint, for example spline coefficients; the parameter in the model is the entries
-    divided by `scale`. The last W weights of the linear model are changes of single entries. The first L weights are
-    coefficients of trends: the mean and the slope of all spline coefficients.
+    The term has W entries, for example the spline coefficients of the joint. The first L weights are coefficients of
+    trends, which change all entries together: the mean and the slope of the spline coefficients. The last W weights
+    change single entries. The entries are the sum of these changes.
 
+    scale: the parameter in the model is the entries divided by this number.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.

@@ -96,13 +96,14 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the nMSE of held-out blocks, (n,), corrected such that too small and too large values are as likely.
+    """Return the nMSE of held-out blocks, (n,), corrected to be too small and too large with equal probability.
 
     The mean of few squared errors is more often too small than too large. The sum of the squared errors of S seconds is
     assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # The correction of the nMSE is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
+    # The correction is important only for short logs: the factor is 1.27 for three seconds of motion, and 1.06 for
+    # twelve.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 
