@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, get_args, get_type_hints
 
-from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import YamlDocument, read_document
+from spelgen.errors import SettingsError, collect
+from spelgen.settings.yaml_document import YamlDocument, read_document, unknown_name
 
 Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
 """The presets of spelgen."""
@@ -98,19 +98,13 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
     ``document``: the parsed file of the values; errors state the file and the line.
     """
     file = None if document is None else document.path
-
-    lines = {name: None if document is None else document.line((name,)) for name in {*values, *CHOICES}}
-    errors = []
-    for name in values:
-        if name not in CHOICES:
-            do = suggestion(str(name), CHOICES)
-            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=lines[name], do=do))
+    lines = {name: None if document is None else document.line((name,)) for name in CHOICES}
+    unknown = [name for name in values if name not in CHOICES]
+    errors = [unknown_name((name,), "key", str(name), CHOICES, document) for name in unknown]
     for name, choices in CHOICES.items():
         if values.get(name) not in choices:
-            got, expected = (
-                repr(values[name]) if name in values else "nothing",
-                f"one of {', '.join(choices)}",
-            )
+            got = repr(values[name]) if name in values else "nothing"
+            expected = f"one of {', '.join(choices)}"
             errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
     # Errors of single values are raised before conflicts: the rules for pairs of values require valid values.
     collect(errors)

@@ -31,7 +31,8 @@ class SpelgenError(Exception):
         # `class(*args)`.
         super().__init__(self.got)
         # Callers give the file as text or as a path. `SpelgenErrors` compares the files of errors, so both become text.
-        self.file = None if self.file is None else str(self.file)
+        if self.file is not None:
+            self.file = str(self.file)
 
     def __str__(self) -> str:
         statement = _truncated(self.got)

@@ -253,18 +253,15 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: text for users about the predictor and its fit."""
+    """Predictor of positions under position commands."""
 
-    @property
-    def about(self) -> str: ...
-
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment at the end of each sample interval.
 
         Args:
-            parts: segments of logs; K is the number of sample intervals of a segment.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
+            segments: segments of logs; K is the number of sample intervals of a segment.
+            q: (segments, n) initial positions [rad, m].
+            qd: (segments, n) initial velocities [rad/s, m/s].
 
         Returns:
             One array of positions per segment, (K, n) [rad, m].

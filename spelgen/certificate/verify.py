@@ -190,14 +190,14 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     # [1] The tolerance of the comparison is 1e-9 per joint: the chain omits offsets below 1e-9 m, and the errors of its
     # rational rotations are 1e-11 rad each.
     allowed = 1e-9 * len(robot.joints)
-    for difference in differences:
+    for quantity, (difference, rounding) in differences.items():
         verdict: Verdict = "agrees"
-        if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
+        if difference > allowed or (rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(difference.difference)} of their magnitude apart"
+        result = f"at most {size_text(difference)} of their magnitude apart"
         if is_rounded:
-            result += f"; the reported roundings change them by {size_text(difference.rounding)}"
-        yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
+            result += f"; the reported roundings change them by {size_text(rounding)}"
+        yield FactCheck(f"{quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:

@@ -177,11 +177,9 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
     if not isinstance(config, Rollout):
-        summary = None
-        if fit.record.servo is not None:
-            from spelgen.fitting.servo.report import servo_summary
+        from spelgen.fitting.servo.report import servo_summary
 
-            summary = servo_summary(fit.record.servo)
+        summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
         elif not fit.record.validation_windows:

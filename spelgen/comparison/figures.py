@@ -8,15 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.emission.assemble import ArmModel
-from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
-from spelgen.evaluation.plain import Curve, finite
+from spelgen.evaluation.plain import finite
 from spelgen.evaluation.rollout import energy_rise, mass_error, smallest_eigenvalue, true_mass
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
@@ -65,14 +64,10 @@ class SimulatedFigures:
         losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
         sizes: {row of a table: size of a network, duration of a training step, smallest eigenvalue of M, or rise of
             energy}.
-        mass: Learned M at the measured positions of `example`, (T, n, n); None without an example.
-        example: A test motion and its prediction; None if no test motion lasts 1 s.
     """
 
     losses: Figures
     sizes: Figures
-    mass: Curve | None
-    example: PredictedMotion | None
 
 
 def simulated_figures(
@@ -84,7 +79,7 @@ def simulated_figures(
     """
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
-    config = fit.config if isinstance(fit.config, Rollout) else Rollout()
+    config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only
@@ -93,8 +88,6 @@ def simulated_figures(
     ranges = [x.working_range for x in load_arm(truth, joints).chain.coordinates]
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
-    example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
-    mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
@@ -108,7 +101,7 @@ def simulated_figures(
     with torch.no_grad():
         rows["smallest eigenvalue of M / mean"] = smallest_eigenvalue(model, low, high)
         rows["rise of energy, no input"] = energy_rise(model, far)
-    return SimulatedFigures(losses, rows, mass, example)
+    return SimulatedFigures(losses, rows)
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
@@ -177,22 +170,3 @@ def sizes(model: ArmModel) -> Figures:
             if masks and quantity == "mass":
                 figures["inputs of M"] = int(masks[0].flatten(1).any(dim=0).sum())
     return figures | {"parameters": parameter_count(model)}
-
-
-def predict_example(
-    predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
-) -> PredictedMotion | None:
-    """Return the measured motion in the middle of the first log that is long enough, and its prediction.
-
-    The motion has `steps` steps of `decimation` samples each. None is returned if all logs are shorter.
-    """
-    span = steps * decimation
-    for log in logs:
-        if len(log) > span:
-            # The simulated controller changes its torque only at samples that are multiples of the decimation, so the
-            # motion starts at such a sample.
-            start = (len(log) - 1 - span) // (2 * decimation) * decimation
-            piece = log[start : start + span + 1]
-            window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)
-            return predicted_motion(log.name, window, predictor.solver(window))
-    return None

@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.integrate import cumulative_trapezoid
 
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
@@ -75,15 +74,12 @@ class TorqueTrace(DrawnMotion):
         predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
         parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the
             model.
-        energy: {name of a term: energy since the first sample, (T,) [J]}, for the work of the drives, the stored
-            energy, the work of friction, and the work of the torque residual.
     """
 
     qd: Curve
     measured: Curve
     predicted: dict[str, Curve]
     parts: dict[str, Curve]
-    energy: dict[str, Curve]
 
 
 Drawn = TypeVar("Drawn", bound=DrawnMotion)
@@ -113,7 +109,7 @@ def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
     return replace(motion, **curves)
 
 
-def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
+def predicted_motion(trajectory: str, windows: Windows, states: States, k: int) -> PredictedMotion:
     """Return the measured and the predicted motion of window k, for a chart.
 
     trajectory: name of the log. windows: measured motion of W windows. states: predicted q and qd of the windows after
@@ -176,7 +172,7 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques and energies along `samples` that charts show: all predictors, and the terms of the model.
+    """Return the torques along `samples` that charts show: of all predictors, and the terms of the model.
 
     dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`.
     """
@@ -198,29 +194,16 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
     # Logs contain motor torques. They are converted to joint torques, because the terms of the model are joint torques.
     measured = _at_joints(inputs, samples.tau)
-    # The samples are evenly spaced, so the times are computed from the sample rate.
-    t = np.arange(len(samples.q)) / samples.rate
-    # The inertia, Coriolis and gravity torques change the stored energy. The work of friction is computed from the
-    # rest of the model's torque, so it includes the work of the constant torque offset.
-    stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
-    works = {
-        "work of the drives": measured,
-        "stored": stored,
-        "friction": predicted[MODEL] - stored,
-        "not explained": measured - predicted[MODEL],
-    }
-    power = {name: (torque * samples.qd).sum(axis=-1) for name, torque in works.items()}
-    energy = {name: cumulative_trapezoid(values, t, initial=0) for name, values in power.items()}
     return TorqueTrace(
         trajectory=samples.name,
         error=mean_nmse(predicted[MODEL] - measured, measured),
-        t=t,
+        # The samples are evenly spaced, so the times are computed from the sample rate.
+        t=np.arange(len(samples.q)) / samples.rate,
         q=samples.q,
         qd=samples.qd,
         measured=measured,
         predicted=predicted,
         parts=curves,
-        energy=energy,
     )
 
 

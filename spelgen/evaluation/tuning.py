@@ -55,8 +55,8 @@ class EvaluationTuning:
     started_states: int = 8
     # [1] Largest number of words of the first sentence of an assessment.
     headline: int = 20
-    # [samples] Length of the windows from which the number of integration steps is chosen, for a model that was not
-    # fitted to windows.
+    # [samples] Length of the windows from which the number of integration steps is chosen: the default length of the
+    # windows of a fit.
     model_window: int = 5
     # [s] Length of the windows that are replayed from a measured state.
     replay_window: float = 1.0

@@ -149,16 +149,19 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
     # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        is_best = error == min(errors.mean for errors in replay.errors.values())
-        (uses.good if is_best else uses.bad).append("simulation from commands")
+        if error == min(errors.mean for errors in replay.errors.values()):
+            uses.good.append("simulation from commands")
+        else:
+            uses.bad.append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
     """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
-    error = None if errors is None else errors.mean_relative_rms
-    return math.inf if error is None else error
+    if errors is None or errors.mean_relative_rms is None:
+        return math.inf
+    return errors.mean_relative_rms
 
 
 def _better_baselines(results: Results) -> list[str]:
@@ -188,7 +191,7 @@ def _better_baselines(results: Results) -> list[str]:
 
 
 def _worst_joint(results: Results) -> tuple[str, str, str]:
-    """Return the name of the worst joint, words for its worst speed, and a sentence about its error.
+    """Return the name of the worst joint, words for its worst speed, and a sentence about its motion error.
 
     The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
     joint of the largest motion error. The words are " near standstill" or " at speed" if the torque error of the joint
@@ -202,9 +205,7 @@ def _worst_joint(results: Results) -> tuple[str, str, str]:
         return moving, "", f"At {moving} the error after {results.horizons[-1].name} is {amount}."
     if not joint:
         return "", "", ""
-    speed = _slow_or_fast(results, results.joints.index(joint))
-    amount = share(math.sqrt(error), "the torque's standard deviation")
-    return joint, speed, f"At {joint} the torque residual is {amount}."
+    return joint, _slow_or_fast(results, results.joints.index(joint)), ""
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:

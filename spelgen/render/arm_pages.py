@@ -23,7 +23,6 @@ from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
 from spelgen.render.charts import TUNING
 from spelgen.render.parameters import base_table
 from spelgen.render.plots import JointRow, Panel, stacks
-from spelgen.structure.structure import derive
 from spelgen.templates import render_page
 
 if TYPE_CHECKING:
@@ -57,9 +56,9 @@ def inspection_page(
 
 
 def identification_page(identification: Identification, arm: Arm) -> str:
-    """Return the page about an identification: base parameters with intervals, the arm, and the torque residual.
+    """Return the page about an identification: base parameters with intervals, and the torque residual.
 
-    identification: result of least squares. arm: the arm, for its picture and the values of its URDF.
+    identification: result of least squares. arm: the arm, for the values of its URDF.
     """
     record: Content = identification.to_dict()
     # The page is made from the content of the JSON output, so that page and JSON agree.
@@ -73,9 +72,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
         count=len(words),
         never=never,
         residuals=identification.listings()[0],
-        parameters=base_table(None, arm, record),
-        cells=matrix(arm.chain, derive(arm.chain)),
-        arm=arm_section(arm.chain, arm.robot.path),
+        parameters=base_table(arm, record),
         heading=identification.heading(),
         notes=identification.diagnostics,
     )
