@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -26,7 +27,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
 _SECTIONS = ("worldbody", "equality", "tendon", "actuator")
-_CONTACTS = {
+_CONTACTS: dict[Literal["visual", "collision"], dict[str, str]] = {
     "visual": {"group": "2", "contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
@@ -284,9 +285,7 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
     omitted: dict[str, None] = {}
     poses = link_poses(arm)
     for kind, attributes in _CONTACTS.items():
-        shapes = link_shapes(
-            arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
-        )
+        shapes = link_shapes(arm.robot.path, kind, names, TUNING.faces)
         omitted |= dict.fromkeys(shapes.unread)
         for shape in shapes.shapes:
             if shape.mesh is not None and _is_flat(shape.mesh[0]):
