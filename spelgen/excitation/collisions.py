@@ -11,14 +11,12 @@ from math import ceil
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
-from spelgen.arm.arm import Chain, lump_links
-from spelgen.arm.chain import choose_chain
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_arm import kinematic_model
+from spelgen.dynamics.tip_frame import link_poses
 from spelgen.excitation.bounds import MotionBounds, Surroundings
 from spelgen.excitation.trajectory import Motion
 from spelgen.excitation.tuning import TUNING
@@ -66,21 +64,20 @@ class Collisions:
             raise LookupError(f"no collision shape can be read: {self.unread}")
         if not shapes.shapes:
             raise LookupError("the URDF has no collision geometry")
-        frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
         self._bodies: list[int] = []  # The index of the body that carries each object; -1 is the root link.
         # For each body: the largest distance of a point of its shapes from the origin of its frame, (bodies,) [m].
         self._extents = np.zeros(len(chain.bodies))
+        poses = link_poses(arm, arm.angle_tolerance)
         for shape in shapes.shapes:
-            frame = frames[shape.link]
-            pose = _pose(frame.rotation, frame.position) @ shape.pose
-            self._add(shape.link, frame.body, pose, _geometry(shape))
+            body, pose = poses[shape.link]
+            self._add(shape.link, body, pose @ shape.pose, _geometry(shape))
         links = len(self._bodies)
         if surroundings.floor is not None:
             self._add(FLOOR, -1, np.eye(4), coal.Halfspace(np.array([0.0, 0.0, 1.0]), surroundings.floor))
         for name, box in surroundings.boxes.items():
-            pose = _pose(rotation_from_rpy(box.rpy), box.xyz)
+            pose = pin.SE3(pin.rpy.rpyToMatrix(*box.rpy), np.array(box.xyz)).homogeneous
             self._add(f"box {name!r}", -1, pose, coal.Box(*box.size))
         self._surroundings = " and surroundings" if len(self._bodies) > links else ""
         for first, second in self._pairs(chain, links):
@@ -261,20 +258,12 @@ class Collisions:
         return tuple(reversed(names))
 
 
-def _pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
-    """Return the homogeneous matrix (4, 4) of a rotation (3, 3) and a position (3,) [m]."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
-
-
 def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
     """Return the Coal geometry of a shape; a mesh is replaced by its convex hull."""
     if shape.mesh is None:
         kinds = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
         return kinds[shape.kind](*shape.size)
     points = coal.StdVec_Vec3s()
-    for vertex in shape.mesh[0]:
-        points.append(vertex)
+    points.extend(list(shape.mesh[0]))
     # Options of Qhull: Qt makes triangular facets. QJ perturbs the vertices slightly, so that flat meshes have a hull.
     return coal.Convex.convexHull(points, False, "Qt QJ")

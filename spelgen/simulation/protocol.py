@@ -9,7 +9,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.excitation.bounds import SPEEDS, MotionBounds, range_error
+from spelgen.excitation.bounds import SPEEDS, MotionBounds, largest_bounds
 from spelgen.excitation.trajectory import ExcitationTrajectory, Motion
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
@@ -70,17 +70,8 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
 
     Raises ArmError if neither the settings nor the URDF specify a range for a joint.
     """
-    positions = settings.simulation.positions or {}
-    ranges, errors = [], []
-    for joint in arm.coordinates:
-        limits = (-np.pi, np.pi) if joint.continuous else joint.limits
-        # Limits of 0 and 0 are treated as unknown, because exporters of URDFs write them for an unknown range.
-        if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
-            errors.append(range_error(joint.name, limits))
-        ranges.append(positions.get(joint.name, limits))
-    collect(errors)
-    lowest, highest = np.array(ranges, dtype=float).T
-    return lowest, highest
+    bounds = largest_bounds(arm, ranges=settings.simulation.positions)
+    return bounds.low, bounds.high
 
 
 def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
@@ -101,11 +92,10 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # The motion uses only the middle part of each range and a moderate speed, as one does with an unknown arm.
-        middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = [
             min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
         ]
-        bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
+        bounds = MotionBounds(low, high, np.array(speeds)).narrowed(SIMULATION.used_range)
         motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
