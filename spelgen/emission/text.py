@@ -275,11 +275,6 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
                 values[ast.unparse(node.targets[0])] = node.value.value
     except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
         raise _no_module(problem, file) from None
-    if "FACTS" in values:
-        raise ModuleError(
-            "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
-            do="build it again with `spelgen build`, and train it again",
-        )  # fmt: skip
     if "SPEC" not in values:
         raise _no_module(None, file)
     return spec_from_json(str(values["SPEC"]), file)

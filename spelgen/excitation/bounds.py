@@ -52,23 +52,6 @@ def motion_bounds(
         arm: The arm.
         range_fraction: Fraction of each position range; the middle of the range is unchanged.
         speed_fraction: Fraction of each velocity limit.
-        joints, ranges: See `largest_bounds`.
-
-    Raises ArmError for a joint without a range, or with limits that are not increasing.
-    """
-    largest = largest_bounds(arm, joints, ranges)
-    return replace(largest, speed=speed_fraction * largest.speed).narrowed(range_fraction)
-
-
-def largest_bounds(
-    arm: Chain,
-    joints: Mapping[str, UrdfJoint] | None = None,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
-) -> MotionBounds:
-    """Return the position ranges and the velocity limits of an arm as bounds.
-
-    Args:
-        arm: The arm.
         joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits. None:
             limits of mimic joints are ignored.
         ranges: {name of a joint: position range}, in place of the limits in the URDF. A continuous joint without a
@@ -98,7 +81,7 @@ def largest_bounds(
         if not low < high:
             errors.append(range_error(coordinate.name, None if np.isnan(low) else (low, high)))
     collect(errors)
-    return MotionBounds(limits[:, 0], limits[:, 1], speeds)
+    return MotionBounds(limits[:, 0], limits[:, 1], speed_fraction * speeds).narrowed(range_fraction)
 
 
 def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:

@@ -73,9 +73,8 @@ def export(
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # The exporter is imported here, because packages of other formats may not be installed.
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
-        Trained(trained, arm, tuple(entries), intervals, float32, levels)
-    )
+    export_model = pkgutil.resolve_name(f"spelgen.exporting.{to}_export:export_{to}")
+    exported: Exported = export_model(Trained(trained, arm, tuple(entries), intervals, float32, levels))
     if path is not None:
         exported.write(path, force=force)
     return exported

@@ -5,7 +5,7 @@ Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002,
 with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -52,11 +52,13 @@ class RigidBodies:
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
         # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
-        self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
+        parts = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
             # The ten parameters are mass, first moment (3), and the tensor's xx, xy, xz, yy, yz, zz.
             tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
-            self.inertias.append((ten[0], ten[1:4], tensor))
+            parts.append((ten[0], ten[1:4], tensor))
+        # Per body, parents first: the body; mass, first moment (3, 1) and inertia tensor (3, 3); frame.
+        self._rows = list(zip(self.bodies, parts, self.frames, strict=True))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
@@ -69,7 +71,7 @@ class RigidBodies:
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
             speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
@@ -108,7 +110,7 @@ class RigidBodies:
         # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
         momenta = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, v = twists[body.parent + 1]
             w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
             speed = _Z * (float(body.multiplier) * qd[body.coordinate])
@@ -125,10 +127,6 @@ class RigidBodies:
             momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
-
-    def _rows(self) -> Iterator[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
-        return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _accumulate(self, wrenches: list[Wrench]) -> None:
         """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.

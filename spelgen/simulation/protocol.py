@@ -9,7 +9,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.friction import DriveFriction, joint_friction
 from spelgen.errors import SettingsError, SpelgenError, collect
-from spelgen.excitation.bounds import SPEEDS, MotionBounds, largest_bounds
+from spelgen.excitation.bounds import SPEEDS, MotionBounds, range_error
 from spelgen.excitation.trajectory import ExcitationTrajectory, Motion
 from spelgen.excitation.tuning import TUNING as EXCITATION
 from spelgen.logs.trajectory import Trajectory, trajectory_listing
@@ -70,8 +70,17 @@ def initial_range(arm: Chain, settings: Settings) -> tuple[np.ndarray, np.ndarra
 
     Raises ArmError if neither the settings nor the URDF specify a range for a joint.
     """
-    bounds = largest_bounds(arm, ranges=settings.simulation.positions)
-    return bounds.low, bounds.high
+    positions = settings.simulation.positions or {}
+    ranges, errors = [], []
+    for joint in arm.coordinates:
+        limits = (-np.pi, np.pi) if joint.continuous else joint.limits
+        # Limits of 0 and 0 are treated as unknown, because exporters of URDFs write them for an unknown range.
+        if joint.name not in positions and (limits is None or limits[0] >= limits[1]):
+            errors.append(range_error(joint.name, limits))
+        ranges.append(positions.get(joint.name, limits))
+    collect(errors)
+    lowest, highest = np.array(ranges, dtype=float).T
+    return lowest, highest
 
 
 def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
