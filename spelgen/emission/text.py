@@ -69,7 +69,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     if standalone:
         from spelgen.emission.standalone import bundle
 
-        return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
+        return render("standalone.py.jinja", **bundle(arm, model), **context)
     # A module imports only the names that occur in its text.
     used = names_in(ast.parse(f"{arm}\n{model}")) & _public_names()
     # The imported names have ruff's order: classes first.

@@ -9,7 +9,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
+from spelgen.exporting.exported import EXPORTERS, WITH_FLOAT32, WITH_FUNCTIONS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
@@ -60,13 +60,12 @@ def export(
         if trained.checkpoint.posterior:
             intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
-    exporter = EXPORTERS[to]
-    if entries and not exporter.choice:
-        formats = [name for name, row in EXPORTERS.items() if row.choice]
-        raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
-    if float32 and not exporter.float32:
-        formats = [name for name, row in EXPORTERS.items() if row.float32]
-        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(formats)}; C has -DNAME_FLOAT")
+    if entries and to not in WITH_FUNCTIONS:
+        raise RunError(
+            f"functions for --to {to}", expected=f"--to {listed(WITH_FUNCTIONS)}, which have a choice"
+        )
+    if float32 and to not in WITH_FLOAT32:
+        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(WITH_FLOAT32)}; C has -DNAME_FLOAT")
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)

@@ -25,26 +25,26 @@ class Exporter:
     Attributes:
         title: last words of the README's title.
         suffix: file name extension; empty for a format that is a folder.
-        choice: whether a user can select functions.
-        float32: whether the exported programs can compute in float32.
     """
 
     title: str
     suffix: str = ""
-    choice: bool = False
-    float32: bool = False
 
 
 EXPORTERS = {
     "urdf": Exporter("as a URDF", suffix=".urdf"),
     "mjcf": Exporter("for MuJoCo", suffix=".xml"),
-    "c": Exporter("in C99", choice=True),
-    "casadi": Exporter("in CasADi", choice=True),
-    "onnx": Exporter("in ONNX", choice=True, float32=True),
-    "torch": Exporter("in torch", choice=True, float32=True),
+    "c": Exporter("in C99"),
+    "casadi": Exporter("in CasADi"),
+    "onnx": Exporter("in ONNX"),
+    "torch": Exporter("in torch"),
     "ros2": Exporter("for ROS 2"),
 }
 """The formats, by the values of --to. The function `export_NAME` of the file `NAME_export` makes the export."""
+WITH_FUNCTIONS = ("c", "casadi", "onnx", "torch")
+"""The formats that consist of functions, which a user can select."""
+WITH_FLOAT32 = ("onnx", "torch")
+"""The formats whose programs can compute in float32."""
 # A file name specifies a format only if the format is a single file: folders have no suffix.
 _BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 

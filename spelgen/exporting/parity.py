@@ -13,6 +13,7 @@ from spelgen.arm.arm import Coordinate
 from spelgen.dynamics.prepared import PreparedModel, batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
+from spelgen.excitation.bounds import SPEEDS
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
@@ -148,10 +149,9 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the velocity limits of the joints in the URDF, (n,) [rad/s, m/s], to scale random velocities.
 
-    Joints without a limit get a nominal speed.
+    Joints without a limit have the speed limit of exciting motions.
     """
-    nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
-    return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
+    return np.array([joint.velocity or SPEEDS[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
