@@ -95,10 +95,10 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
     """
     from spelgen.emission.text import read_source, require_unedited
 
-    is_text = isinstance(module, str) and "\n" in module
-    file = None if is_text else Path(module)
-    text = str(module) if file is None else read_source(file)
-    return assemble(require_unedited(text, file), seed)
+    if isinstance(module, str) and "\n" in module:
+        return assemble(require_unedited(module), seed)
+    file = Path(module)
+    return assemble(require_unedited(read_source(file), file), seed)
 
 
 def spec_of(model: object) -> ModelSpec | None:

@@ -107,10 +107,10 @@ def check_parity(
 
     Raises RunError if a difference is above the tolerance.
     """
-    inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
-    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
     exact = PreparedModel(copy.deepcopy(trained.model).cpu(), tip_kinematics(trained.arm))
+    inputs = random_inputs(trained.arm.chain.coordinates, states, exact.n * exact.elements)
+    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     differences = {}
     for name in names:
         outputs = called(name, inputs)

@@ -58,7 +58,7 @@ def program_names(trained: Trained) -> list[str]:
 
     Raises RunError for unknown names.
     """
-    available = [name for name in PROGRAMS if trained.memory or name not in FRICTION_STATE]
+    available = [name for name in PROGRAMS if trained.model.elements or name not in FRICTION_STATE]
     return select_names(trained.entries, available)
 
 

@@ -87,8 +87,8 @@ class Intake:
         # After `TUNING.restart` consecutive samples that are refused as "reversed" or "jump", a permanent change of the
         # clock or of the positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
-        restarts = self.ignored >= TUNING.restart
-        refusal = "gap" if restarts else refusal
+        if self.ignored >= TUNING.restart:
+            refusal = "gap"
         if refusal not in IGNORED:
             begins = refusal == "gap" or self.t == -np.inf
             if begins:
