@@ -37,16 +37,14 @@ class ArmModel(PortHamiltonian):
 
         def __getattr__(self, name: str) -> Any: ...
 
-    def prepared(
-        self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
-    ) -> PreparedModel:
-        """Return a copy with constant parameters for many calls, as in control loops; see ``PreparedModel``.
+    def prepared(self, tip: TipKinematics | None = None) -> PreparedModel:
+        """Return a copy in double precision with constant parameters for many calls, as in control loops.
 
-        tip: kinematics of the tip, for its pose and Jacobian. dtype: type of the parameters and states.
+        tip: kinematics of the tip, for its pose and Jacobian.
         """
         from spelgen.dynamics.prepared import PreparedModel
 
-        return PreparedModel(self, tip, dtype=dtype)
+        return PreparedModel(self, tip)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
         # pickle does not find the model's class by name, since a function makes the class: pickle calls the function.
