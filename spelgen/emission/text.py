@@ -1,7 +1,7 @@
 """Conversion of a ``ModelSpec`` to the source of a module, and back. Equal specifications give equal bytes.
 
-Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. To read the
-specification of a module, its source is parsed, but not executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. The specification of
+a module is found in its text, which is not executed.
 """
 
 import ast
@@ -43,6 +43,8 @@ _EXAMPLE = """\
 # [bytes] Largest file that is read as a module: ten times the size of the largest module that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
+# The statement of a module with its specification. JSON has no three quotes in a row.
+_SPEC = re.compile(r'^SPEC = r"""(.*)"""', re.MULTILINE)
 
 
 def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
@@ -233,11 +235,11 @@ def _sum(sums: parts.Sums, names: list[str]) -> str:
     text = ""
     for factor, index in sums:
         term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"
-        if text:
-            text += f" - {term}" if factor < 0 else f" + {term}"
-        else:
-            text = f"-{term}" if factor < 0 else term
-    return text or "0"
+        text += f" - {term}" if factor < 0 else f" + {term}"
+    # The first term has no plus sign, and no blanks around its minus sign.
+    if text.startswith(" - "):
+        return f"-{text[3:]}"
+    return text.removeprefix(" + ") or "0"
 
 
 def _number(value: float) -> str:
@@ -255,7 +257,7 @@ def read_source(path: Path) -> str:
     try:
         return content.decode("utf-8").replace("\r\n", "\n")
     except ValueError as problem:
-        raise _no_module(problem, path) from None
+        raise _no_module(f" ({type(problem).__name__})", path) from None
 
 
 def read_spec(path: Path | str) -> ModelSpec:
@@ -268,16 +270,10 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
     Raises ModuleError if the text has no specification. file: path of the module for the error.
     """
-    values = {}
-    try:
-        for node in ast.parse(text).body:
-            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                values[ast.unparse(node.targets[0])] = node.value.value
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
-        raise _no_module(problem, file) from None
-    if "SPEC" not in values:
-        raise _no_module(None, file)
-    return spec_from_json(str(values["SPEC"]), file)
+    found = _SPEC.search(text)
+    if found is None:
+        raise _no_module("", file)
+    return spec_from_json(found[1], file)
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
@@ -293,8 +289,7 @@ def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
     )  # fmt: skip
 
 
-def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
-    reason = f" ({type(problem).__name__})" if problem is not None else ""
+def _no_module(reason: str, file: Path | None) -> ModuleError:
     got, do = f"no specification of spelgen in it{reason}", "build it again, or check the path"
     if file is not None and file.suffix in (".urdf", ".xacro", ".xml"):
         got, do = "a robot description", f"`spelgen build {file}` writes its module"

@@ -66,6 +66,7 @@ class Collisions:
             raise LookupError("the URDF has no collision geometry")
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
+        self._names: list[str] = []  # The name of each object.
         self._bodies: list[int] = []  # The index of the body that carries each object; -1 is the root link.
         # For each body: the largest distance of a point of its shapes from the origin of its frame, (bodies,) [m].
         self._extents = np.zeros(len(chain.bodies))
@@ -137,7 +138,7 @@ class Collisions:
         nearest = int(distances.argmin()) if self.pairs else 0
         if not self.pairs or distances[nearest] >= self.clearance:
             return None
-        return Contact(time, float(distances[nearest]), *self._names(nearest))
+        return Contact(time, float(distances[nearest]), *self._names_of(nearest))
 
     def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the penalty on distances below a margin at positions q (T, n), and its gradient (T, n).
@@ -181,21 +182,20 @@ class Collisions:
 
     def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
         """Add an object that is fixed to a body. pose: pose of the object in the frame of the body, (4, 4)."""
-        unique = f"{len(self._bodies)} {name}"
-        placed = pin.GeometryObject(unique, body + 1, pin.SE3(pose), geometry)
+        placed = pin.GeometryObject(str(len(self._bodies)), body + 1, pin.SE3(pose), geometry)
         self._geometry.addGeometryObject(placed)
         self._bodies.append(body)
+        self._names.append(name)
         if body >= 0:
             geometry.computeLocalAABB()
             center = pose[:3, :3] @ geometry.aabb_center + pose[:3, 3]
             extent = float(np.linalg.norm(center) + geometry.aabb_radius)
             self._extents[body] = max(self._extents[body], extent)
 
-    def _names(self, pair: int) -> tuple[str, str]:
+    def _names_of(self, pair: int) -> tuple[str, str]:
         """Return the names of the two objects of a pair."""
         objects = self._geometry.collisionPairs[pair]
-        first, second = (self._geometry.geometryObjects[k].name for k in (objects.first, objects.second))
-        return first.partition(" ")[2], second.partition(" ")[2]
+        return self._names[objects.first], self._names[objects.second]
 
     def _pairs(self, chain: Chain, links: int) -> Iterator[tuple[int, int]]:
         """Yield the indices of the two objects of each pair to be compared.
@@ -252,7 +252,7 @@ class Collisions:
             # A pair with the floor or a box is removed only if it is too close at all positions, as for a base on the
             # floor: otherwise the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
-                names[" and ".join(self._names(pair))] = None
+                names[" and ".join(self._names_of(pair))] = None
                 self._geometry.removeCollisionPair(objects)
         self._found = pin.GeometryData(self._geometry)
         return tuple(reversed(names))

@@ -34,7 +34,7 @@ class DelayLine:
             samples.append((t, values))
         while len(samples) > 2 and samples[1][0] <= past:
             del samples[0]
-        (begin, first), (end, second) = samples[0], samples[-1 if len(samples) == 1 else 1]
+        (begin, first), (end, second) = samples[0], samples[:2][-1]
         if past <= begin:
             return first
         weight = (past - begin) / (end - begin)
