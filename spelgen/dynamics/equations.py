@@ -59,7 +59,10 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     prepared: parameter cache, from ``model.prepare()``.
     """
     pose = model.configuration(q, prepared)
-    friction = partial(_friction, model, pose)
+
+    def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
+        return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
@@ -72,21 +75,17 @@ def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
     """Return the equations of motion of W rollouts at positions q, (W, n), for any ``RigidDynamics``."""
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
+    def friction(qd: Tensor, z: Tensor | None) -> Tensor:
+        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
+        return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
+
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
         """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
         # `RigidDynamics` has no method that returns the force M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return applied(mass, qdd)
 
-    return MotionEquations(mass, force, partial(_friction, dynamics, q))
-
-
-def _friction(dynamics: Any, at: object, qd: Tensor, z: Tensor | None) -> Tensor:
-    """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z.
-
-    at: positions or configuration cache, the first argument of the method ``friction_torque``.
-    """
-    return torch.as_tensor(dynamics.friction_torque(at, qd, *known_past(dynamics, z)))
+    return MotionEquations(mass, force, friction)
 
 
 def runge_kutta(

@@ -47,18 +47,18 @@ def bundle(arm: str, model: str) -> dict[str, object]:
             used |= new
             pending += new
     # The tables of the arm consist of instances of the classes in rows.py, which must be defined before the tables.
-    rows, others, contents = [], [], []
+    rows, definitions, contents = [], [], []
     for name, definition in runtime.definitions.items():
         if name in used and definition.file == "rows":
             rows.append(definition)
         elif name in used:
-            others.append(definition)
+            definitions.append(definition)
             if definition.is_block:
                 contents.append(name)
     return {
         "imports": _imports(used, runtime),
         "rows": _joined(rows),
-        "runtime": _joined(others),
+        "runtime": _joined(definitions),
         "contents": contents,
     }
 

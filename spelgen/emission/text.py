@@ -270,10 +270,10 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
     Raises ModuleError if the text has no specification. file: path of the module for the error.
     """
-    found = _SPEC.search(text)
-    if found is None:
+    statement = _SPEC.search(text)
+    if statement is None:
         raise _no_module("", file)
-    return spec_from_json(found[1], file)
+    return spec_from_json(statement[1], file)
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:

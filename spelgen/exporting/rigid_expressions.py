@@ -52,13 +52,13 @@ class RigidBodies:
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
         # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
-        parts = []
+        parameters = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
             # The ten parameters are mass, first moment (3), and the tensor's xx, xy, xz, yy, yz, zz.
             tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
-            parts.append((ten[0], ten[1:4], tensor))
+            parameters.append((ten[0], ten[1:4], tensor))
         # Per body, parents first: the body; mass, first moment (3, 1) and inertia tensor (3, 3); frame.
-        self._rows = list(zip(self.bodies, parts, self.frames, strict=True))
+        self._rows = list(zip(self.bodies, parameters, self.frames, strict=True))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
