@@ -125,8 +125,8 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # Pinocchio represents a continuous joint by (cos q, sin q). Planar and floating joints are not coordinates: they
-        # remain at Pinocchio's neutral configuration.
+        # Pinocchio represents a continuous joint by (cos q, sin q). Planar and floating joints are not coordinates and
+        # remain at the neutral configuration.
         neutral = pin.neutral(self.model)
         return self._batched(lambda model, _, position: pin.integrate(model, neutral, position), q)
 

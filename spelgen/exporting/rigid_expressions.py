@@ -192,8 +192,4 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 def _rotation_about_z(angle: ca.SX) -> ca.SX:
     """Return the matrix of the rotation about z, (3, 3), by an angle, (1, 1) [rad]."""
     c, s = ca.cos(angle), ca.sin(angle)
-    rotation = ca.SX(3, 3)
-    rotation[0, 0] = rotation[1, 1] = c
-    rotation[1, 0], rotation[0, 1] = s, -s
-    rotation[2, 2] = 1
-    return rotation
+    return ca.diagcat(ca.blockcat([[c, -s], [s, c]]), 1)
