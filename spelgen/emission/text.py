@@ -132,8 +132,7 @@ def description(spec: ModelSpec) -> str:
 
 def module_name(spec: ModelSpec) -> str:
     """Return the default name of the module of a URDF, without folder and suffix: `ur5_spel` for ur5.urdf."""
-    stem = spec.urdf.rpartition("/")[2].rpartition(".")[0]
-    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem) or "arm"
+    name = re.sub(r"[^0-9A-Za-z_]+", "_", Path(spec.urdf).stem) or "arm"
     return f"{'_' if name[0].isdigit() else ''}{name}_spel"
 
 

@@ -61,7 +61,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
     for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
         for link in body.links:
-            _remove(links[link.name], "inertial")
+            etree.strip_elements(links[link.name], "inertial")
         name = body.joint.child
         # `rotation` maps from the body frame, whose z axis is the joint axis, to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
@@ -72,7 +72,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         # Existing <dynamics> of a joint are removed: with two of them, some tools read the first and some the last.
-        _remove(element, "dynamics")
+        etree.strip_elements(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n"
@@ -157,11 +157,6 @@ def _inertial(mass: float, center: np.ndarray, tensor: np.ndarray) -> etree._Ele
     moments = map(_number, tensor[np.triu_indices(3)])
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
     return inertial
-
-
-def _remove(element: etree._Element, tag: str) -> None:
-    for child in element.findall(tag):
-        element.remove(child)
 
 
 def _number(value: float) -> str:
