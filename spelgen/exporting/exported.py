@@ -133,13 +133,14 @@ def with_readme(
         example: lines of Python that run in the folder of the README.
     """
     exporter, arm = EXPORTERS[to], trained.arm.chain
+    tip = trained.arm.tip or trained.arm.robot.last_link(arm.joint_names)
     # Before examples and tables, the README has only the five lines that a user needs for the first call; details are
     # in docs/deploy.md.
     head = [
         f"# Dynamics of {arm.name} {exporter.title}",
         use,
         f"Joints, in this order: {', '.join(arm.joint_names)}.",
-        f"{UNITS}; the tip is the link {trained.tip}; {about}",
+        f"{UNITS}; the tip is the link {tip}; {about}",
         f"{'; '.join(summary)}.",
     ]
     # Names come from an untrusted URDF, so characters that are not printable are replaced.
