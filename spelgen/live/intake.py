@@ -100,9 +100,7 @@ class Intake:
             position = self.aligned[0]
             start = position if begins else self.path
             path = np.clip(start, position - self.levels.encoder, position + self.levels.encoder)
-            moved = path - start
-            if self.bristles.motors is not None:
-                moved = self.bristles.motors @ moved
+            moved = self.bristles.of_drives(path - start)
             self.bounds = np.clip(self.bounds + moved[:, None], -self.limit, self.limit)
             self.path, self.t, self.q, self.ignored = path, t, q, 0
         self.counts[refusal] += 1
