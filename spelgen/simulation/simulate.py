@@ -86,7 +86,7 @@ def simulate(
     test_fraction: float | None = None,
     seed: int | None = None,
     motions: Sequence[Motion] = (),
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> SimulatedLogs:
     """Return simulated logs of the arm: all trajectories, and their split into `train` and `test`.
 
@@ -113,6 +113,7 @@ def simulate(
     values = arm.settings.simulation.model_dump(exclude_unset=True) | changes
     changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
+    progress = progress or silent
     if settings.input == "position":
         if motions:
             raise SettingsError(
