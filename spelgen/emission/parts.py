@@ -340,4 +340,4 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     for output in outputs:
         for row, column, value in output.basis:
             mean[row, column] += output.mean * value
-    return np.array([[rounded(value) for value in row] for row in mean])
+    return np.vectorize(rounded)(mean)

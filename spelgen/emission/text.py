@@ -17,7 +17,7 @@ from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, name
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
-from spelgen.spec import ModelSpec, spec_from_json
+from spelgen.spec import ConstantSpec, ModelSpec, OutputSpec, spec_from_json
 from spelgen.templates import render
 
 _COMMENTS = {
@@ -175,29 +175,26 @@ def _quoted(name: str) -> str:
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
     """Return the source of the tables ``JOINTS``, ``LINKS``, ...: a statement each, below comments about units."""
     statements = []
+    terms = {"FUNCTIONS": spec.outputs, "CONSTANTS": spec.constants}
     for name, rows in assembly.rows.items():
-        about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
-        letter = name[0].lower()
         lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
-        for number, row in enumerate(rows, start=1):
-            end = f"  # {letter}{number}: {about[f'{letter}{number}']}" if about else ""
+        for k, row in enumerate(rows):
+            end = ""
+            if name in terms:
+                end = f"  # {name[0].lower()}{k + 1}: {_term_description(spec, terms[name][k])}"
             lines.append(f"    {filled('', row, 4, len(end))},{end}")
         statements.append("\n".join([*lines, f"){SKIP}"]))
     return statements
 
 
-def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return {name of a term of M: description}: entries of M that contain the term, and unit of the first entry."""
-    descriptions = {}
-    bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
-    for name, basis in zip(parts.term_names(spec), bases, strict=True):
-        entries = [entry_name(row, column) for row, column, _ in basis]
-        row, column, _ = basis[0]
-        # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
-        slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
-        suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
-        descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
-    return descriptions
+def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
+    """Return the description of a term of M: the entries of M that contain it, and the unit of the first entry."""
+    entries = [entry_name(row, column) for row, column, _ in term.basis]
+    row, column, _ = term.basis[0]
+    # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
+    slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
+    suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
+    return f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
 
 
 def _mass_entries(spec: ModelSpec) -> str:
