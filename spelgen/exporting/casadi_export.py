@@ -92,7 +92,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
         # A loop over states calls the exported function itself; CasADi's `map` would make another function.
-        results = [function.call(list(map(ca.DM, state))) for state in states]
+        results = [function.call([ca.DM(value.ravel()) for value in state]) for state in states]
         outputs = {}
         for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
             array = np.array([value.full() for value in values])

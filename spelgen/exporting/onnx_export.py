@@ -178,9 +178,7 @@ def called_by_onnx(files: Mapping[str, bytes]) -> Called:
     def called(name: str, inputs: Values) -> Values:
         session = sessions[name]
         types = {"tensor(float)": np.float32, "tensor(double)": np.float64}
-        arrays = {}
-        for node in session.get_inputs():
-            arrays[node.name] = inputs[node.name].astype(types[node.type]).reshape(-1, *node.shape[1:])
+        arrays = {node.name: inputs[node.name].astype(types[node.type]) for node in session.get_inputs()}
         (output,) = session.run(None, arrays)
         return {torch_export.program_output(name): output}
 

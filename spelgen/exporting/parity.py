@@ -21,7 +21,10 @@ from spelgen.exporting.tuning import TUNING
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
-"""Function (name of an entry point, {input: (states, n)}) -> {output: (states, ...)}, computed by an export."""
+"""Function (name of an entry point, {input: (states, n)}) -> {output: (states, ...)}, computed by an export.
+
+The input z is (states, n, K) for K bristles per joint.
+"""
 
 
 PROGRAMS: dict[str, Callable[..., Tensor]] = {
@@ -111,6 +114,7 @@ def check_parity(
     exact = PreparedModel(copy.deepcopy(trained.model).cpu(), tip_kinematics(trained.arm))
     inputs = random_inputs(trained.arm.chain.coordinates, states, exact.n * exact.elements)
     inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
+    inputs["z"] = inputs["z"].reshape(states, exact.n, exact.elements)
     differences = {}
     for name in names:
         outputs = called(name, inputs)
@@ -170,12 +174,10 @@ def _expected(model: PreparedModel, name: str, inputs: Values) -> Values:
     Args:
         model: the torch model in double precision.
         name: name of the function (entry point).
-        inputs: {input: array (states, n)}.
+        inputs: {input: array (states, n)}, and (states, n, K) for the friction state z of K bristles per joint.
     """
     entry = ENTRY_POINTS[name]
-    tensors = {key: torch.from_numpy(value) for key, value in inputs.items()}
-    tensors["z"] = tensors["z"].reshape(len(tensors["q"]), model.n, model.elements)
-    arguments = [tensors[key] for key in entry.inputs]
+    arguments = [torch.from_numpy(inputs[key]) for key in entry.inputs]
     function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
     if name.endswith("_derivatives"):
         outputs = batched_jacobians(function, len(entry.outputs), *arguments)

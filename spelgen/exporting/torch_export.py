@@ -130,11 +130,9 @@ def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:
-        tensors = {key: torch.from_numpy(value).to(model.dtype) for key, value in inputs.items()}
-        if model.elements:
-            tensors["z"] = tensors["z"].reshape(-1, model.n, model.elements)
+        tensors = [torch.from_numpy(inputs[key]).to(model.dtype) for key in program_inputs(model, name)]
         with torch.no_grad():
-            output = programs[name](*(tensors[key] for key in program_inputs(model, name)))
+            output = programs[name](*tensors)
         return {program_output(name): output.numpy()}
 
     return called
