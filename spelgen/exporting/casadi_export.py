@@ -10,7 +10,6 @@ from scipy.interpolate import BSpline
 
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import (
-    ENTRY_POINTS,
     EntryPoint,
     Residuals,
     SigmoidNetwork,
@@ -34,8 +33,9 @@ def export_casadi(trained: Trained) -> Exported:
     """
     model = trained.described
     # The derivatives of C are not exported, since CasADi differentiates its functions itself.
-    names = select_names(trained.entries, entry_points(model))
-    functions = casadi_functions(model, {name: ENTRY_POINTS[name] for name in names})
+    entries = entry_points(model)
+    names = select_names(trained.entries, entries)
+    functions = casadi_functions(model, {name: entries[name] for name in names})
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}"
     use = (
