@@ -31,12 +31,15 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of a model: how each quantity of the equations of motion (M, V, friction, G) is represented.
 
+    V is the potential energy, G the input matrix. The types of the fields list the values of each quantity.
+
     ``derived``: the structure of the arm determines which entries of the quantity are zero, are constant, or depend on
-    which joints; networks learn only the entries that vary. ``dense``: a network learns the whole quantity without
-    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024). The suffix
-    ``3n``: the quantity has three rows per joint, one for each axis of the joint's frame. ``closed-form``: rigid bodies
-    with trained inertial parameters, and networks for residual terms, if any. ``constants``: a friction model with
-    trained constants.
+    which joints; networks learn only the entries that vary. ``dense``, ``dense-n``: a network learns the whole quantity
+    without knowledge of the arm. ``dense-3n``: a network learns rows for all three axes of each joint's frame, as in
+    the publications of such models, although a joint moves only about or along one axis (Wang et al., Sci Rep 15:33179,
+    2025, and Duong et al., IEEE T-RO 40:3695, 2024). ``closed-form``: rigid bodies with trained inertial parameters,
+    and networks for residual terms, if any. ``per-joint``: friction of each joint with a network. ``constants``: a
+    friction model with trained constants.
 
     Raises SettingsError for an inconsistent combination.
     """

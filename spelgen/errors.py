@@ -159,5 +159,5 @@ class Diagnostic:
         return f"{self.severity}: {self.where}: {self.message}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the five fields of the diagnostic as a JSON object; their order is part of the public interface."""
+        """Return severity, code, where, line, message as a JSON object; this order is part of the public interface."""
         return asdict(self)

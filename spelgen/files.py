@@ -23,7 +23,10 @@ MAX_BYTES = 2**25
 
 
 def require_regular_file(path: Path, error: type[SpelgenError], expected: str | None = None) -> None:
-    """Raise ``error`` unless a path is a regular file: reading a pipe or a device may not end."""
+    """Raise ``error`` unless a path is a regular file: reading a pipe or a device may not end.
+
+    expected: description of the expected file, for the message.
+    """
     if not path.is_file():
         raise error("no regular file", file=path, expected=expected)
 
@@ -131,9 +134,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager in which an OSError gets the file name `path`, unless it names another file.
+    """Context manager in which an OSError gets the file name `path`; an OSError that names another file is unchanged.
 
-    An error on a full disk names no file; an error in `replacing` names the hidden file.
+    The error on a full disk names no file. An error in `replacing` names the hidden file; since this name contains the
+    name of `path`, it is replaced by `path`.
     """
     try:
         yield
@@ -256,6 +260,8 @@ def _fetch(address: str) -> Path:
 
 def _inside(folder: Path, name: str, address: str) -> Path:
     """Return the path of the key `name` in a folder. Raises SpelgenError if the path is outside the folder.
+
+    address: address of the archive or object store, for the error.
 
     Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """

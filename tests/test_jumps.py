@@ -200,6 +200,19 @@ def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
     assert errors([decoded], arm) == ""
 
 
+def test_the_line_of_a_period_keeps_the_stated_periods_of_other_signals(arm, tmp_path):
+    columns, joint = motion(arm, 0), arm.chain.joint_names[0]
+    load, counts = (
+        np.round(columns[f"tau_{joint}"] * 100 / 3),
+        np.round(columns[f"q_{joint}"] * 4096 / (2 * np.pi)),
+    )
+    words = columns | {f"tau_{joint}": load % 65536, f"q_{joint}": counts % 65536}
+    base = {"gain": 0.03, "counts_per_turn": 4096, "units": {"q": "counts"}, "period": {"tau": 65536}}
+    (log,) = read_logs(written(words, tmp_path / "log.csv"), arm.chain.joint_names, {"joints": {joint: base}})
+    line = advised(errors([log], arm)).joints[joint].model_dump(exclude_unset=True)
+    assert line["period"] == {"tau": 65536.0, "q": 65536.0}
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("quantity", ["q", "qd", "tau"])
 def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, form, quantity):

@@ -49,9 +49,10 @@ class Drives(NamedTuple):
 class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
-    couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
-    the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
-    couplings.
+    A motor that drives several joints has an entry, joint torque per motor torque, for each of these joints. If the
+    logs contain motor torques, these entries are in ``entries``, with all other entries of G. If the logs contain joint
+    torques, G is the identity for the driven joints; these entries are in ``couplings`` and determine only the motor
+    speeds (see `drives`).
     """
 
     joints: int
@@ -116,8 +117,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Entries of the input matrix G for joints that are driven by several motors are in `couplings`, whose matrices
-    # include the gears.
+    # A joint that is driven by several motors gets no entry here: its entries of the input matrix G are in `couplings`,
+    # and include the gear ratios.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

@@ -56,7 +56,7 @@ class AngleRounding:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the position (3,) [m] and rotation (3, 3) of an <origin>; the rotation is None if all angles are zero.
 
-        where, line: name and line of the element in diagnostics.
+        xyz, rpy: attributes of the element [m, rad]. where, line: name and line of the element in diagnostics.
         """
         written = np.array(list(map(exact, xyz)))
         offset = self.position(written)
@@ -103,7 +103,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
+        """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
         # [m] Bound of the rounding errors that composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
@@ -124,7 +124,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text for a message, with six digits per component."""
+    """Return a vector (3,) as text for a message, with six significant digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
@@ -230,11 +230,11 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return a joint's position (3,) [m] in the parent body, with rounding errors in both frames replaced by 0.
+        """Return a joint's position (3,) [m] in the parent body, without tiny components due to rounding errors.
 
-        A position may have components that should be 0 in the frame of the parent body, or in the joint's own frame.
         Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly parallel to the rational
-        approximation of the axis. The result is ``position`` if the components cannot be 0 in both frames.
+        approximation of the axis. Tiny components are set to 0 in the joint's frame, then in the body's frame. If the
+        second step changes the components in the joint's frame again, ``position`` is returned unchanged.
 
         Args:
             rotation: exact rotation (3, 3) of the joint's frame in the frame of the parent body.
@@ -249,10 +249,11 @@ class Placement:
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the exact rotation (3, 3) of a frame relative to a body, from its rotation in float64.
 
-        Relative to each body of the segment (see the docstring of the module), the rotation may have zero elements: two
-        axes are normal to each other. A rational approximation relative to one body preserves its zeros, but may lose
-        the zeros relative to another body. The rotation is therefore approximated relative to each body of the segment
-        in turn, and the approximation that loses the fewest zeros is used.
+        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. Such zeros may
+        occur relative to each body of the segment (see the docstring of the module). A rational approximation of the
+        rotation relative to one body preserves the zeros relative to this body only. The rotation is therefore
+        approximated relative to each body of the segment in turn, and the approximation that makes the fewest zeros
+        nonzero is used.
 
         Args:
             body: index of the body, -1 for the root link.

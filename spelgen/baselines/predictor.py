@@ -33,9 +33,9 @@ def roll_out_stiff(
 
     Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
     with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
-    approximation is the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry
-    friction) then need no smaller steps, and the error of an explicit method is not confused with an error of the
-    dynamics.
+    approximation is the Jacobian of friction only. Even stiff damping and bristles, which occur with light links and
+    dry friction, then need no smaller steps. An explicit method would need them; otherwise its integration error would
+    be confused with an error of the dynamics.
 
     Args:
         dynamics: dynamics of the arm, see `equations_of`.
@@ -113,8 +113,8 @@ def _stepper(
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u) with the approximate Jacobian A: the next state is u + step (3 k1 + k2) / 2, where (1 - h
-        # A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for u' = F(u) with the approximate Jacobian A and h = GAMMA * step: the next state is u + step (3 k1 +
+        # k2) / 2, where (1 - h A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -135,8 +135,13 @@ def _friction_slopes(
     """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
 
     D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
-    a joint depends only on the motion of the joint. Friction depends on position through the bristles. width: (n,)
-    finite-difference steps of velocity [rad/s, m/s].
+    a joint depends only on the motion of the joint. Friction depends on position through the bristles.
+
+    Args:
+        dynamics: dynamics of the arm.
+        pose: mass matrix and forces at the positions.
+        qd, z: velocities (W, n) [rad/s, m/s] and friction state (W, n, K) [rad, m] of K bristles.
+        width: finite-difference steps of velocity, (n,) [rad/s, m/s].
     """
     # Central differences are used, because dry friction changes steeply at standstill.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
@@ -164,8 +169,8 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS velocity error that is multiplied by `tolerance`, as a fraction of the RMS change of
-    # velocity in the windows.
+    # [1] Lower bound of the RMS error in the test of `tolerance`, divided by the RMS change of velocity in the windows:
+    # otherwise an exact model would need the largest number of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -187,7 +192,8 @@ States = tuple[Tensor, Tensor]
 class Solver:
     """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
 
-    The integrator takes the fewest steps per sample interval that are accurate in the `probe` windows.
+    dynamics: the integrated dynamics. probe: measured windows from which the number of integrator steps per sample
+    interval is chosen, see `substeps`.
     """
 
     dynamics: RigidDynamics
@@ -207,10 +213,10 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of integrator steps per sample interval, chosen at the first use: evaluations of torques need none.
+        """Number of integrator steps per sample interval; it is computed when motion is predicted for the first time.
 
-        A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
-        less than `TUNING.tolerance` times the error of the predictions.
+        The number is doubled until twice as many steps change the predictions of the `probe` windows by less than
+        `TUNING.tolerance` times the error of the predictions.
         """
         windows = thinned(self.probe, TUNING.probed_windows)
         motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)

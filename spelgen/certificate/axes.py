@@ -1,8 +1,8 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results prove reasons for the structure of M and V. A relation, such as parallel axes, is tested in exact arithmetic
-at two random rational configurations. A relation that is not true at all configurations fails this test with a
-probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results prove reasons for the structure of M and the potential energy V. A relation, such as parallel axes, is
+tested in exact arithmetic at two random rational configurations. A relation that is not true at all configurations
+fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -80,9 +80,10 @@ class Axes:
         return max(self._cosines(a, b)) < 0
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Return True if joints ``a`` and ``b`` have equal or opposite twists: coaxial or, if prismatic, parallel axes.
+        """Return True if joints ``a`` and ``b`` have equal or opposite twists.
 
-        A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
+        Two revolute joints then are coaxial, and two prismatic joints are parallel. A body that both joints carry then
+        has equal or opposite velocities for unit velocities of the two joints.
         """
         return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
 
@@ -95,15 +96,15 @@ class Axes:
         return True
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Return True if all points that joint ``slider`` carries have constant signed distances from a plane.
+        """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        ``hinge`` is a revolute joint, ``slider`` a prismatic joint farther from the root. The plane contains the axis
-        of ``hinge``, is parallel to the axis of ``slider``, and moves with the child link of ``hinge``. The distances
-        must be constant for any motion of the joints between ``hinge`` and the tip. The entry of M in the row of
-        ``slider`` and the column of ``hinge`` is then constant.
+        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
+        ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
+        the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
+        constant.
         """
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between ``hinge`` and ``slider`` could change the direction of ``slider``.
+            return False  # A revolute joint between them can turn ``slider`` out of any such plane.
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         for axes, twists in self._configurations:
             normal = np.cross(axes[slider], axes[hinge])

@@ -32,7 +32,7 @@ class Inspection:
 
     Attributes:
         arm: the arm.
-        structure: structure of M and V.
+        structure: structure of the mass matrix M and the potential energy V.
         actuation: entries of the input matrix G.
         diagnostics: remarks of the reading of the URDF, such as rounded angles.
         input: "torque", or "position" for an arm with position servos.
@@ -46,11 +46,11 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """Facts about the structure of M and V as sentences, with geometric reasons."""
+        """Facts about the structure of M and the potential energy V as sentences, with geometric reasons."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
-        """Return M and V, or one entry, as SymPy expressions.
+        """Return M and the potential energy V, or one entry of M, as SymPy expressions.
 
         Args:
             entry: (row, column) of an entry of M, counted from 1, or "V"; None: all entries and V.
@@ -133,8 +133,8 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # Logs of torques determine all base parameters. Logs of position servos determine only ratios of parameters, so
-        # the undetermined parameters are listed.
+        # Logs of torques determine all base parameters. Logs of position servos determine some parameters only in ratio
+        # to kp or together with others, so their JSON object lists these parameters, too.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -208,7 +208,7 @@ class Inspection:
     def needs(self) -> dict[str, str]:
         """Return {quantity: text for users about the functions and constants that a model needs for it}.
 
-        The quantities are "M(q)", "V(q)", "G" (the inputs) and "base" (the number of base inertial parameters).
+        The quantities are "M(q)", "V(q)", "G" (the input matrix) and "base" (the number of base inertial parameters).
         """
         structure = self.structure
         # Outputs (varying terms of M) are counted per set of joints, because one network computes all outputs that

@@ -193,7 +193,9 @@ def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> 
     """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
-    (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.
+    (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
+    column. M is the sum of its upper triangle and the transpose of this triangle: its diagonal entries are doubled, as
+    is permitted because each entry is compared relative to its own magnitude.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -28,7 +28,7 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """Result of the numerical verification of one derived fact about M or V.
+    """Result of the numerical verification of one derived fact about M or the potential energy V.
 
     Attributes:
         fact: name of the fact, such as "zero entries".
@@ -201,9 +201,9 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield the facts which entries of M are zero, and on which joints each entry depends.
+    """Yield two facts about the entries of M: the zero entries, if any, and the joints on which each entry depends.
 
-    Each fact has the numbers that test it: the entries in `samples`, and their changes if only one joint moves.
+    The first fact is tested by the entries in `samples`, and the second by their changes if only one joint moves.
     """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
@@ -237,8 +237,8 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         functional = row_of(term.functional, n)
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
-        # The value of a term, f_j or c_k, is a linear functional of M. Changes of the value are divided by the sum of
-        # the magnitudes of the functional's summands.
+        # The value of a term, f_j or c_k, is a weighted sum of the entries of M, with the weights `functional`. Changes
+        # of the value are divided by the sum of |weight| times scale of the entry, the magnitude of rounding errors.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
         # Changes of a term caused by its own joints are allowed; only changes by other joints contradict the fact.
         changes[list(term.joints)] = 0.0
@@ -252,18 +252,20 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
 
 
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix of samples.
+    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
 
-    The numbers are: outputs (terms that vary with q); outputs and constants; and, for k = 0, 1, ..., the outputs that
-    do not depend on the first k joints.
+    The columns of the matrices are the entries of M. Outputs are terms that vary with q. Their number must be the rank
+    of the changes of the entries if single joints move, one row per change. The number of outputs and constants must be
+    the rank of the entries at random configurations, one row per configuration. For each k, the number of outputs that
+    depend on any of the first k joints must be the rank of the changes if one of these joints moves.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The outputs are derived such that, for each k, the largest possible number of outputs does not depend on the first
-    # k joints. This number is verified for each k.
+    # The derivation maximises, for each k, the number of outputs that do not depend on the first k joints. This number
+    # is verified for each k.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
@@ -276,7 +278,7 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that V depends on the derived joints only, with the numbers that test it.
+    """Return the fact that the potential energy V depends only on the derived joints, with the numbers that test it.
 
     The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
     """

@@ -72,7 +72,11 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
+    """Return the text of the inspection in a format, with a line end.
+
+    closed: closed forms of M and of the potential energy V. proof: verification of the structure. urdf: path of the
+    URDF, whose shapes an HTML page shows.
+    """
     if closed:  # SymPy is slow to import, so it is imported only if formulas are written.
         from spelgen.certificate import formula_files
     if format == "html":

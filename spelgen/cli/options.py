@@ -55,12 +55,12 @@ def flag(name: str, text: str) -> Declared:
 
 
 def argument(metavar: str, text: str, default: object = ...) -> Declared:
-    """Return the declaration of a positional argument of a command; without a default it is required."""
+    """Return the declaration of a positional argument, `metavar` in the help; without a default it is required."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 
 def output_option(metavar: str, text: str, default: object = None) -> Declared:
-    """Return the option `-o` of a command, which names the output file or folder."""
+    """Return the option `-o` of a command, the output file or folder; `metavar` is its value in the help."""
     return option(metavar, text, "-o", "--output", default=default)
 
 
@@ -132,7 +132,7 @@ def names(text: str | None) -> list[str] | None:
 
 
 def numbers(text: str | None, option: str) -> list[float] | None:
-    """Return the numbers in a text such as `0, 1.5`, and None for None. Raises a usage error for any other text."""
+    """Return the numbers in a text such as `0, 1.5`; None for None. Other texts: a usage error about `option`."""
     try:
         return None if text is None else [float(number) for number in text.split(",")]
     except ValueError:

@@ -34,8 +34,9 @@ class UsageError(typer.BadParameter):
 class Assignments(TrainingSettings):
     """The keys of the option `--set`: the training settings of a robot, and options of a single fit.
 
-    adapt: parameters of a fitted model to update (load, friction or unit). device, threads: device and number of
-    threads of torch. progress: whether a progress bar is shown.
+    adapt: change to which a fitted model is adapted: "load" (a payload), "friction" (another day), or "unit" (another
+    arm of the same type). device, threads: device and number of threads of torch. progress: whether a progress bar is
+    shown.
     """
 
     adapt: Adaptation | None = None

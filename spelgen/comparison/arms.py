@@ -77,7 +77,11 @@ class Comparison(Group):
 
 
 def ablation_designs() -> dict[str, str | Design]:
-    """Return {name: design} from phnode to hybrid; each design differs from the one before in one property."""
+    """Return {name: design} of the ablation, from the preset phnode (dense networks) to hybrid (rigid bodies).
+
+    Each design adds structure to the one before: friction per joint; known inputs; an M with the fewest outputs; V with
+    the fewest inputs and the encoding per joint (minimal); rigid bodies, bristles and residual terms (hybrid).
+    """
     friction = replace(load_design("phnode"), dissipation="per-joint")
     inputs = replace(friction, input="derived")
     return {
@@ -182,6 +186,7 @@ def arm_inputs(
     """Return the input files of the runs on an arm: URDF, mapping and logs.
 
     If the arm has no logs, logs are simulated and written to ``folder``, together with the URDF that models may use.
+    splits: number of folds; LogError if there are too few trajectories. progress: argument of `simulate`.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """

@@ -59,11 +59,12 @@ NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"
 
 @dataclass(frozen=True)
 class SimulatedFigures:
-    """Numbers by which models of a simulated arm are compared, for one model.
+    """Results of one model of a simulated arm, for the comparison with other models.
 
     Attributes:
         losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
-        sizes: {row of a table: size of a network, duration of a training step, or invariant}.
+        sizes: {row of a table: size of a network, duration of a training step, smallest eigenvalue of M, or rise of
+            energy}.
         mass: Learned M at the measured positions of `example`, (T, n, n); None without an example.
         example: A test motion and its prediction; None if no test motion lasts 1 s.
     """
@@ -77,7 +78,10 @@ class SimulatedFigures:
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Return the numbers by which models of a simulated arm are compared. truth: URDF with the true parameters."""
+    """Return the results of a model of a simulated arm, whose true parameters are in the URDF ``truth``.
+
+    training: logs for the training loss and the duration of a step. testing: logs for all other results.
+    """
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = fit.config if isinstance(fit.config, Rollout) else Rollout()
@@ -94,8 +98,8 @@ def simulated_figures(
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
-    # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
-    # windows of 1 s.
+    # The training loss is the loss that the fit minimises. Its windows, and those for the test loss, are therefore as
+    # long as the windows of the training, and not 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]
@@ -108,7 +112,10 @@ def simulated_figures(
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
-    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included."""
+    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included.
+
+    config: length of the windows and size of the batch. decimation: log samples per sample of a window.
+    """
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
     # Parameters of loaded models are frozen, but a training step needs gradients.
@@ -153,8 +160,8 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[f
 def sizes(model: ArmModel) -> Figures:
     """Return {row of a table: size of the model}.
 
-    The rows are the number of outputs of each network (of M, D, G and V, residual networks included), the number of
-    inputs of the network of M, and the number of trained parameters.
+    The rows are the number of outputs of each network (of M, damping D, input matrix G and potential energy V, residual
+    networks included), the number of inputs of the network of M, and the number of trained parameters.
     """
     figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
     # The damping D has one output per joint if it is not computed by a network.

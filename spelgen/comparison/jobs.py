@@ -65,8 +65,8 @@ class RunResult:
 class Job(Group):
     """A run of a comparison, finished or not.
 
-    design: name of a preset or of an ablation design, or path of a YAML file. protocol: settings of fits to simulated
-    logs.
+    design: name of a preset or of an ablation design, or path of a YAML file. training: settings of fits to logs of the
+    user. protocol: settings of fits to simulated logs, which are the same for all models.
     """
 
     arm: str
@@ -220,7 +220,8 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 def _errors(results: Results) -> Errors:
     """Return {label of an error measure, with its unit: {predictor: error}}.
 
-    The order is: position errors of replays, relative errors per prediction horizon, nMSE of torques.
+    The order is: position errors under replayed commands (of position servos), relative errors per prediction horizon,
+    nMSE of torques.
     """
     errors: Errors = {}
     for replay in results.replays:

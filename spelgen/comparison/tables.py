@@ -138,7 +138,7 @@ def _ranking(runs: Runs) -> Table:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error}, sorted by error; errors that are not finite are last."""
+    """Return {model or baseline: median error by ``measure``}, sorted by error; errors that are not finite are last."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -154,12 +154,12 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
         medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # A row with the ratio of the baseline's loss to each loss is added, because absolute losses depend on units and
-        # on the sample rate.
+        # A row with the loss of the preset `BASELINE` divided by each preset's loss is added, because absolute losses
+        # depend on units and on the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
-    # Rows of published figures contain only presets that the publication evaluates.
+    # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}

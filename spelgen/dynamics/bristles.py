@@ -22,8 +22,8 @@ class BristleReach:
         values: break-away displacements, (n, K) [rad, m]; K is 0 without bristles.
         motors: matrix C, (n, n): the velocities of the drives are C qd (see ``Actuation.motor_speeds``); None: each
             drive moves its own joint.
-        smoothing_velocity: velocity at which the smooth sign of velocity, which replaces bristles at drives without
-            bristles, is 0.7, (n,) [rad/s, m/s]; None: unknown.
+        smoothing_velocity: velocity v_s of the smooth sign v / sqrt(v^2 + v_s^2), on which the dry friction of a drive
+            without bristles depends, (n,) [rad/s, m/s]; None: unknown.
     """
 
     values: np.ndarray
@@ -62,7 +62,8 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
     """Return the deflections of K bristles per drive after a displacement of the drives, (..., n, K) [rad, m].
 
-    The result is exact if the displacement has no reversals. Dimensions may have another order, if they broadcast.
+    The result is exact if the displacement has no reversals. The dimension of the bristles may also be the first one of
+    all arguments, (K, ..., n).
 
     Args:
         z: deflections before the displacement, (..., n, K) [rad, m].

@@ -124,10 +124,11 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return the factor t = 1, (...), for mass matrices M, (..., n, n).
+    """Return the factor t = 1, (...), for mass matrices M, (..., n, n): M is not corrected.
 
-    ``mass_as_learned`` puts this function in place of ``DerivedMass.fraction``, which returns t < 1 for an indefinite
-    M: M is then not corrected to be positive definite.
+    ``DerivedMass`` replaces M by C + t (M - C), with a constant C; ``DerivedMass.fraction`` returns t < 1 for an
+    indefinite M, so that the result is positive definite. ``mass_as_learned`` puts this function in place of that
+    method.
     """
     return mass.new_ones(mass.shape[:-2])
 

@@ -98,14 +98,15 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 class FrictionModel:
     """Torques of drives that are linear in coefficients, as columns of the regressor of a least-squares fit.
 
-    Each effect is a torque per drive: armature, viscous and Coulomb friction, torque offset, and optional ones.
+    Each effect is a torque per drive: armature, viscous and Coulomb friction, torque offset, and the effects that
+    ``stribeck`` and ``polynomial`` add.
 
     Attributes:
         coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s].
         stribeck: True: add dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
         polynomial: True: add the effects qd |qd| and qd^3.
-        memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with an
-            effect per bristle. False: it depends on the tanh of the velocity.
+        memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), and each
+            bristle is an effect with its own coefficient. False: it depends on the tanh of the velocity.
     """
 
     coulomb_smoothing_velocity: float = 0.01

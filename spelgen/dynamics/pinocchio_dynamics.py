@@ -146,14 +146,14 @@ class PinocchioDynamics:
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of an arm as Pinocchio reads them from its URDF: a reference for spelgen's own parser.
 
-    The URDF defines inertials, damping and friction. The settings file defines gravity and the input matrix. Raises
-    the errors of Pinocchio if it cannot read the file.
+    The URDF defines inertials, damping and friction. The settings file of the URDF defines gravity and the input
+    matrix. Raises the errors of Pinocchio if it cannot read the URDF.
 
     Args:
         urdf: path of the URDF.
         joints: names of the coordinates; their mimic joints move, too, and all other joints are locked at zero.
-        drives: True: use the rotor inertias of the settings, and their friction, if any, in place of the friction of
-            the URDF.
+        drives: True: for joints in the settings file, use rotor inertia and friction of the drive from this file, in
+            place of damping and friction of the URDF.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     # Pinocchio parses the file itself, so the result is an independent reference for spelgen's own parser.

@@ -122,7 +122,7 @@ class PreparedModel:
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each."""
+            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; ``speed`` is qd."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -165,7 +165,8 @@ class PreparedModel:
 
         A is the derivative with respect to the state (q, qd), B with respect to the inputs tau. Without dt, A and B are
         derivatives of the rate (qd, qdd) at constant z (continuous time). With dt [s], A and B are derivatives of q and
-        qd after ``step`` (discrete time).
+        qd after ``step`` with ``substeps`` Runge-Kutta steps (discrete time). z: friction state, by default
+        ``memory(qd)``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -229,8 +230,8 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
-    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode, and if autograd is disabled:
-    # autograd is therefore enabled, and reverse mode is used.
+    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode and, if autograd is disabled, in
+    # reverse mode. Reverse mode is therefore used, with autograd enabled.
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
         # Tensors of inference mode cannot be differentiated, so the arguments are cloned.

@@ -112,11 +112,11 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
+        """Return the configuration cache of the B bodies at q, (..., n) [rad, m], and the derivatives of their momenta.
 
-        q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
-        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
-        pseudo-inertia J.
+        The momentum of a body is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and the time
+        derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of the
+        momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
         """
         # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
         # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as
@@ -134,7 +134,10 @@ class RegressorDynamics:
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n).
+
+        z: friction state, (..., n, K) [rad, m]; None: unknown.
+        """
         equations = self.equations_at(q)
         # `solve` broadcasts the batch dimensions of M and tau only if the force is a matrix with one column.
         force = equations.force(qd, tau, z).unsqueeze(-1)
@@ -144,7 +147,8 @@ class RegressorDynamics:
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n).
 
-        A passive joint has no input: its element is the torque that a motor at the joint would need.
+        A passive joint has no input: its element is the torque that a motor at the joint would need. z: friction state,
+        (..., n, K) [rad, m]; None: unknown.
         """
         passive = (self.inputs == 0).all(dim=1).double()
         # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.

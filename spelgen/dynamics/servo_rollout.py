@@ -1,12 +1,13 @@
 """Rollouts of arms with position servos: positions under logged commands, by an implicit integration method.
 
 Servos act as springs, kp times the position error. These springs and dry friction are stiff. Both are integrated
-implicitly, so that a few steps between samples are stable for any kp. Springs are linearised at the start of a step
-(Rosenbrock method with the weights of the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed
-for each step: decaying motion then has its true rate of decay to third order (exponential fitting; Liniger and
-Willoughby, SIAM J. Numerical Analysis 7:47, 1970). Theta is 1/2 for slow motion, without numerical damping, and tends
-to 1 for motion that is too fast for the step. The friction state is not integrated, but computed from the displacement
-in the step. It is (K, ..., n) for K bristles per joint, in states as in `ServoDrives`.
+implicitly, so that a few steps between samples are stable for any kp. Springs are nonlinear (dead zone, torque limit),
+and are linearised at the start of a step (Rosenbrock method with the weights of the theta method; Hairer and Wanner,
+Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step from its duration x in units of the time
+constant of decay: it is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for
+the step. The computed decay is then exact to third order in x (exponential fitting; Liniger and Willoughby, SIAM J.
+Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step. It
+is (K, ..., n) for K bristles per joint, in states as in `ServoDrives`.
 """
 
 from typing import NamedTuple
@@ -23,16 +24,17 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 class ServoDrives(NamedTuple):
-    """Constants of servos and friction of an arm, (..., n), in the layout that rollouts of this module use.
+    """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
 
-    Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
+    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): a
+    rollout takes two thirds of the time that it takes with (..., n, K).
     """
 
     servo: ServoConstants
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    steepness: Tensor  # bristle stiffness / dry friction = fraction / break-away displacement, (K, ..., n) [1/rad, 1/m]
+    steepness: Tensor  # stiffness of a bristle / magnitude of dry friction, (K, ..., n) [1/rad, 1/m]
 
 
 class Load(NamedTuple):
@@ -58,7 +60,8 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # `batch`: batch dimensions of the friction constants, at least one.
+    # `batch`: batch dimensions of the friction constants. If they have none, a dimension of size 1 is added, (K, 1, n),
+    # so that the constants broadcast with states of W windows, (K, W, n).
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
@@ -66,10 +69,11 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
 
 
 def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> State:
-    """Return the initial state of a rollout: q, qd, and the friction state with which the acceleration is zero.
+    """Return the initial state of a rollout: q, qd, and the friction state that balances all other torques.
 
-    An arm at rest or in steady motion has this state: dry friction balances all other torques, up to its largest
-    magnitude.
+    The acceleration is then zero, as for an arm at rest or in steady motion. All bristles of a joint are deflected by
+    the same fraction of their break-away displacements. If the other torques exceed the largest dry friction, the
+    fraction is 1 and the acceleration is not zero.
 
     Args:
         drives: constants of servos and friction.
@@ -138,9 +142,10 @@ def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
     """Return the displacement x of each joint that balances a force against a spring and K bristles, (..., n).
 
-    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) is the deflection of bristle k after the
-    displacement x. For a given number of sliding bristles, 0 to K, the equation is linear in x. Of the solutions of
-    these K + 1 linear equations, the one with the largest |x| is valid.
+    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
+    deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
+    linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
+    resists with at most its sliding force, so that the true resistance is the smallest of the K + 1 linear ones.
 
     Args:
         push: force on the joint, (..., n).

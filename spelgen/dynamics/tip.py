@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class TipKinematics:
     """Pose and Jacobian of a link in the frame of the root link, as functions of q, (..., n) [rad, m].
 
-    Mimic joints move with their coordinates; all other joints are at zero. Angles of the URDF are not rounded, unlike
-    the angles of a derived arm. Results have the dtype of q.
+    Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
+    rounded to it, unlike in a `Chain`. Results have the dtype of q.
 
     Args:
         robot: the URDF.
@@ -65,7 +65,7 @@ class TipKinematics:
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of the joints on the path to the link at q, (..., n): (states, joints) [rad, m]."""
+        """Return the positions of all joints on the path to the link, (S, joints) [rad, m]; q: (..., n), S states."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 

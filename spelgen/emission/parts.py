@@ -68,7 +68,8 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # The functions of the residual terms of M have bounds in place of mean and scale: rows have only the joints.
+        # The residual terms compute bounds of their functions in M from the armature, and need no mean and scale: a row
+        # of the table has only the joints of a function.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -221,8 +222,8 @@ def _mass_network(spec: ModelSpec) -> Call:
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
-    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. The factors
-    are the sensitivities of M to the coordinates.
+    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. Both rows
+    are equal: the root mean square change of M if only one coordinate changes, divided by the largest such change.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
@@ -245,8 +246,8 @@ def _friction(spec: ModelSpec) -> Call:
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    # Dense friction of the published model (Duong et al., IEEE T-RO 40:3695, 2024) has three axes per joint, about or
-    # along one of which the joint moves.
+    # Dense friction of the published model (Duong et al., IEEE T-RO 40:3695, 2024) has rows for all three axes of each
+    # joint frame, although a joint moves about or along one axis only.
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -328,7 +329,7 @@ def term_names(spec: ModelSpec) -> list[str]:
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
+    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], rounded.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
     outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.

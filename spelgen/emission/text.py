@@ -114,7 +114,7 @@ def header(spec: ModelSpec) -> str:
 
 
 def description(spec: ModelSpec) -> str:
-    """Return sentences about a model: robot, bodies or networks, the joints that V depends on, and inputs."""
+    """Return sentences about a model: robot, bodies or networks, joints of the potential energy V, and inputs."""
     kind = class_summary(spec)
     lines = [f"Robot {_quoted(spec.robot)}. {kind[0].upper()}{kind[1:]}"]
     if spec.links and spec.design.net != "none":
@@ -173,7 +173,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
-    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: a statement each, below comments about units."""
+    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: one assignment each, after comments on its units."""
     statements = []
     terms = {"FUNCTIONS": spec.outputs, "CONSTANTS": spec.constants}
     for name, rows in assembly.rows.items():

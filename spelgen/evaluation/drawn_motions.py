@@ -53,9 +53,9 @@ class PredictedMotion(DrawnMotion):
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         u: Commands of position servos, (T, n) [rad, m]; None for a window.
-        error: For a window: relative error at the last sample of the window, the RMS over the relative errors of q and
-            qd of all joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a
-            replayed log: RMS position error [rad, m].
+        error: For a window: the RMS over q and qd of all joints of the error at the last sample, divided by the RMS
+            change of the same quantity from the first to the last sample, over all windows. For a replayed log: RMS
+            position error [rad, m].
     """
 
     start: float | None = None
@@ -165,7 +165,8 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
 
-    The mean acceleration is the change of qd divided by the duration of the interval.
+    At a low sample rate only the mean acceleration can be computed: the change of qd divided by the duration of the
+    interval. logs: the evaluated logs, for their preprocessing and the bristles of friction.
     """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt

@@ -142,19 +142,20 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of an arm under torques: inverse dynamics, and motion predicted under the logged torques.
+    """Return the errors of model and baselines for torque logs: of inverse dynamics, and of motion under these torques.
 
     Args:
         tested: the model with the data of its fit.
         logs: test logs with torques.
-        notes: notes about the logs and the evaluation, to which notes are appended.
+        notes: list of remarks about the logs and the evaluation; further remarks are appended.
         used: preprocessing of the logs.
         baselines: {name: dynamics} of further baselines.
         ahead: prediction horizons, in samples and in seconds.
         truth: true arm of simulated logs, or the path of its URDF; None if unknown.
         progress: function called before each horizon, see `evaluate`.
     """
-    # All errors are divided by the motion or by the variation of the torque, so at rest they would only show noise.
+    # All errors are divided by the motion or by the variation of the torque. Logs at rest, whose errors would only show
+    # noise, are therefore rejected.
     if max(float(np.ptp(trajectory.q, axis=0).max()) for trajectory in logs) < TUNING.smallest_motion:
         got = f"no motion: all joints stay within {TUNING.smallest_motion:g} rad or m"
         raise LogError(got, expected="test logs in which joints move")

@@ -255,7 +255,8 @@ def predict(
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # The rollouts without and with the disturbance form one batch: two batches would need twice as many operations.
+        # The rollouts without and with the disturbance form one batch: two batches would need twice the number of calls
+        # of torch.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)

@@ -89,7 +89,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 
 
 def result_tables(results: Results) -> list[Table]:
-    """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
+    """Return the tables of an evaluation: errors of replayed logs, of predictions per horizon, of torques, and of M."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
         tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))
@@ -250,10 +250,11 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
 
 @dataclass(frozen=True)
 class Figure:
-    """One of the few figures that summarise an evaluation.
+    """One of the numbers that summarise an evaluation, such as the nMSE of torques.
 
-    unit: unit of the value. The value of unit "variance" is a fraction of the variance of the torque; the value of unit
-    "motion" is a fraction of the RMS change of q and qd over the horizon.
+    name: key of the number, such as "torque.nmse". label: its name for users. unit: unit of ``value``. The value of
+    unit "variance" is a fraction of the variance of the torque; the value of unit "motion" is a fraction of the RMS
+    change of q and qd over the horizon.
     """
 
     name: str
@@ -269,7 +270,7 @@ class Figure:
 
 
 def figures(results: Results) -> list[Figure]:
-    """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
+    """Return known numbers of the model: nMSE of torques, errors of longest rollout and of replayed commands."""
     candidates = []
     if MODEL in results.torque:
         torque = results.torque[MODEL]

@@ -1,7 +1,7 @@
 """The curves from which the figures of an evaluation are computed: for pages, and `traces` in evaluation.json.
 
 All curves are arrays in SI units [rad, m, s, Nm, N, kg m^2, J], with NaN for unknown numbers. In JSON, numbers have
-five digits.
+five significant digits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,7 +43,7 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Growth of the prediction error with the time since the start of a prediction.
+    """Growth of the prediction error (an RMS over q and qd of all joints) with the time since the start.
 
     Attributes:
         seconds: Times since the start of a prediction, (T,) [s].

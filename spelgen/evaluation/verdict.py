@@ -67,7 +67,7 @@ def verdict(
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
         # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small.
-        # Therefore the sentence begins with this limit, and not with "Good enough".
+        # Therefore the verdict begins with this limitation, and not with "Good enough".
         band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
         sentence = f"Not valid near the resonance of an elastic joint{band}"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):

@@ -56,7 +56,10 @@ class Collisions:
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
-        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read."""
+        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
+
+        bounds: position limits of the random positions from which ``ignored`` is found, and of prismatic joints.
+        """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
         self.unread = shapes.unread_text

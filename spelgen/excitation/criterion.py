@@ -93,7 +93,7 @@ class Criterion:
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor of the torque for states (3, T, n), (T, n, K), with K parameters.
+        """Return the regressor of the torques, (T, n, K) for K parameters; ``states``: q, qd and qdd, (3, T, n).
 
         The parameters are the inertial parameters of the bodies, then armature and friction (`FRICTION.columns`).
         """

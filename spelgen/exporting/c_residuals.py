@@ -35,7 +35,8 @@ _CALLS = (
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms.
 
-    The statements are the first ones in the C function of an entry point. names: names of `residual_symbols`.
+    The C function of an entry point begins with these lines, since its other statements depend on the residual terms.
+    names: keys of `residual_symbols`.
     """
     uncomputed = set(names)
     symbols = residual_symbols(model)

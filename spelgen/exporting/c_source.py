@@ -160,9 +160,9 @@ def _parameter(model: TrainedModel, name: str, size: str) -> str:
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables and the statements of a C function, one statement per CasADi instruction.
 
-    The C arrays are row-major; their names are the names of the inputs of `function` and ``outputs``. Outputs are
-    dense, so that each number is written exactly once. Each variable is a slot of CasADi's work vector, which holds
-    several intermediate results in turn.
+    The C arrays are row-major; their names are the names of the inputs of `function` and ``outputs``. The outputs of
+    `function` are dense, so that each entry of an array is assigned exactly once. A variable is a slot of CasADi's work
+    vector: it is assigned several intermediate results in turn.
     """
     inputs = function.name_in()
     # CasADi numbers the entries of a matrix in column-major order, the C arrays are row-major.

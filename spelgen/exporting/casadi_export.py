@@ -154,7 +154,11 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint; outside of the knots it is constant."""
+    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint.
+
+    Outside of the knots it is the value at the nearest end: zero for a torque or friction spline, a constant for an
+    energy.
+    """
     knots, degree = spline.t, spline.k
     # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])

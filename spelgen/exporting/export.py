@@ -41,7 +41,7 @@ def export(
         entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
         float32: whether onnx and torch programs compute in float32, for accelerators; default: float64.
 
-    Raises RunError without an arm, for a preset or a path that the format does not allow, if the comparison fails, and
+    Raises RunError without an arm, for a model or a path that the format does not allow, if the comparison fails, and
     if a file exists without ``force``.
     """
     if to not in EXPORTERS:

@@ -128,7 +128,8 @@ def with_readme(
         to: name of the format.
         files: contents by file name.
         use: first line after the title, how the export is used.
-        about: conventions of the format, the end of the README's line with the units and the name of the tip.
+        about: conventions of the format, which are appended to the line of the README that states the units and the
+            tip.
         summary: results of the checks, one text without a full stop each.
         example: lines of Python that run in the folder of the README.
     """

@@ -103,7 +103,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the unrounded angles of the URDF, which the MJCF has, too."""
+    """Return the rigid-body model with the URDF's angles of joint origins, as in the MJCF: not rounded to pi/2."""
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
@@ -159,9 +159,10 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
 def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     """Return the content of the MJCF file of rigid bodies, and the names of links whose shapes are omitted.
 
-    Shapes that are flat or cannot be read are omitted. The file has the unrounded angles of the URDF, so that the tip
-    has the same pose as in other tools that read the URDF. The actuators are one motor per nonzero column of G or, for
-    position servos, one position actuator per joint.
+    Shapes that are flat or cannot be read are omitted. The angles of joint origins are the URDF's, such as 1.5708, and
+    not rounded to pi/2 as in the model, so that the tip has the same pose as in other tools that read the URDF. The
+    actuators are one motor per nonzero column of the input matrix G (joint torques per motor torque) or, for position
+    servos, one position actuator per joint.
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
@@ -231,7 +232,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
-    """Add a MuJoCo motor for each column of G: at a joint, or at a tendon if the motor acts on several joints.
+    """Add a MuJoCo motor for each nonzero column of the input matrix G: at a joint, or at a tendon for several joints.
 
     actuators, tendons: elements of the MJCF to which motors and tendons are added.
     """

@@ -79,16 +79,15 @@ def _expressions(
 ) -> Outputs:
     """Return {name: expressions} of all entry points except derivatives, and of ``force``.
 
-    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the measured torque ``offset``
-    at zero torque and the torque ``compensation`` that the drives add. ``force`` is M qdd + h + friction -
-    compensation, (n, 1).
+    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the input matrix G, the
+    measured torque ``offset`` at zero torque, and the torque ``compensation`` that the drives add. ``force`` is M qdd +
+    h + friction - compensation, (n, 1).
 
     Args:
         model: the model as NumPy arrays.
         inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1), of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: True if the expressions will be differentiated. The symbol ``first``, the derivative of M's
-            residual term with respect to q, then replaces the symbols ``rate`` and ``kinetic``.
+        derivatives: True if the expressions will be differentiated: argument of `coriolis`.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -213,7 +212,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return the values (n, 1) of n motors repeated for each of their K bristles, (n K, 1)."""
+    """Return the values (n, 1) of n motors repeated for each of their K bristles, (n K, 1); ``breakaway``: (n, K)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 

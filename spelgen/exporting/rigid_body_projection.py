@@ -180,8 +180,8 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     torques = model.friction_torque(positions, qd).numpy()  # torques: (positions, speeds, n)
     rows = []
     for joint, speed in enumerate(speeds.T):
-        # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
-        # negative.
+        # Torques are multiplied by the sign of the velocity. Friction that opposes the motion is then positive in both
+        # directions, as `nnls` requires, whose coefficients are non-negative.
         torque = torques[..., joint] * np.sign(speed)
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))

@@ -1,8 +1,9 @@
 """Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by ``structure.recursion``.
 
 Quantities of a body are expressed in its joint's frame, whose z is the joint axis (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits operations
-with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
+Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). V is the potential
+energy. CasADi omits operations with structural zeros, such as zeros of the geometry. If qd is ``ca.SX(n, 1)``, a vector
+of structural zeros, all operations with velocities are omitted.
 """
 
 from collections.abc import Sequence
@@ -103,8 +104,9 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd, (n, 1), and d/dq of the kinetic energy, (n, 1), both without armature.
 
-        Both are projections of the spatial momentum of all bodies that a joint carries: M qd onto the joint axis S, the
-        gradient onto dS/dt = twist x S.
+        Let h be the spatial momentum of all bodies that a joint carries, S the unit twist of the joint, and v the twist
+        (spatial velocity) of its child body. The entry of M qd is S . h. The entry of the gradient is (dS/dt) . h, with
+        dS/dt = v x S.
         """
         # `twists` has the twist of the base, then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
@@ -149,10 +151,11 @@ def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1), by ``structure.recursion``."""
+    """Return M, (n, n), and potential energy, (1, 1) [J], of rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # Angles of mimic joints are integer multiples of (angle of the leader) / `base`.
+        # `base` is chosen such that angles of mimic joints are integer multiples of q / `base`: their cosines and sines
+        # are then polynomials in cos(q / `base`) and sin(q / `base`).
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)

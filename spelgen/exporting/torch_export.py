@@ -92,7 +92,8 @@ def example_lines(
 ) -> list[str]:
     """Return lines of Python for the README of an export, which call each exported program.
 
-    friction_memory is called first and friction_step last, as in a control loop.
+    As in a control loop, the program friction_memory, which returns the initial friction state z, is called first, and
+    friction_step, which updates z, is called last.
 
     Args:
         model: model that was exported.
@@ -173,6 +174,6 @@ def program_inputs(model: PreparedModel, name: str) -> tuple[str, ...]:
 
 
 def program_output(name: str) -> str:
-    """Return the name of the single output of a function such as inverse_dynamics: "tau"."""
+    """Return the name of the only output of a function, for example "tau" for inverse_dynamics."""
     (output,) = ENTRY_POINTS[name].outputs
     return output

@@ -127,7 +127,7 @@ class _EagerLBFGS(torch.optim.LBFGS):
 class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
-    The argument ``steps`` is the maximum number of evaluations of the loss; the learning rate is not used.
+    In `run`, ``steps`` is the maximum number of evaluations of the loss, and the learning rate is not used.
     weight_decay: factor of the penalty, which is half the sum of squares of all matrices and is added to the loss.
     """
 

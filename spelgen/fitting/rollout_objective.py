@@ -184,7 +184,7 @@ class RolloutObjective(MomentumObjective):
         return self._end() is None
 
     def _roll_back(self, weights: Content, optimizer: Content, step: int) -> None:
-        """Restore the state before a diverged epoch, and halve all further learning rates.
+        """Restore weights, optimizer and step number from before a diverged epoch; halve all later learning rates.
 
         Raises RunError after too many diverged epochs.
         """

@@ -68,8 +68,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json is the first attribute and is removed first: if the removal is interrupted, the folder is not
-        # treated as a run.
+        # config.json, which marks the folder as a run, is removed first, since it is the first file in `__init__`: if
+        # the removal is interrupted, the folder is not treated as a run.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)

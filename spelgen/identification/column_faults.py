@@ -97,7 +97,7 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Base class of faults that factors on the motion and on the torques correct: signals of another sense or unit.
+    """Base class of faults that are corrected by factors on motion and torques: signals of another sense or unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
@@ -130,7 +130,7 @@ class WrongScale(Fault):
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings that correct the scale of a joint's signals, as far as they change.
+        """Return the settings that correct the scale of a joint's signals; unchanged settings are omitted.
 
         These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
         """
@@ -161,7 +161,7 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault of a log: positions and velocities of a joint have the opposite sense, with or without torque."""
+    """Kind of fault of a log: a joint's positions and velocities, and perhaps its torques, have the opposite sense."""
 
     code = "joint-sense"
 
@@ -201,8 +201,8 @@ class TorqueUnit(WrongScale):
     """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
     The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
-    candidate need not lower the cost much, unlike other faults: the fit without it explains torques that are too small
-    by light bodies.
+    candidate need not lower the cost much, unlike other faults: the fit without it may explain torques that are too
+    small with bodies that are too light.
     """
 
     code = "torque-unit"
@@ -213,22 +213,24 @@ class TorqueUnit(WrongScale):
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
         """Define the candidates.
 
-        factors: factors (n,) on the torques. is_open: (n,) True for joints whose torque may have another unit.
-        is_milli: (n,) True for joints whose torques are declared in mNm.
+        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
+        may have another unit. is_milli: (n,) True for joints whose torques are declared in mNm.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
+        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        A fit with a separate factor for each joint is added if it is better.
+        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
+        yielded, too.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
         if is_open.all():
-            # Under a hypothesis with other senses or orders, the gravity in the torques has another magnitude. A factor
-            # that was found with a wrong sense is corrected.
+            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
+            # torque to the URDF's. The factor is therefore determined again; this also corrects one that was found with
+            # a wrong sense.
             fitted, of_urdf = problem.gravity_torques(base)
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
@@ -255,9 +257,9 @@ class TorqueUnit(WrongScale):
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
         # Three conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost
-        # a little: one factor must be as large as of another unit, and the cost decrease must be significant. Torques
-        # of another fault, such as torques without sign, are not explained by any factor, so the relative residual of
-        # each joint must be small.
+        # a little: therefore at least one factor must be large enough for another unit, and the cost decrease must be
+        # significant. The relative residual of each joint must be small, since no factor explains torques with another
+        # fault, such as a lost sign.
         is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
         is_explained = best.errors.max() <= GEOMETRY.unexplained
         if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
@@ -301,7 +303,10 @@ class TorqueUnit(WrongScale):
 
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
+    """Return True for ratios of torques to the URDF's gravity that wrong inertials do not explain.
+
+    These ratios are at least `GEOMETRY.other_unit`, or at most its inverse; the sign is ignored.
+    """
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
 
@@ -312,7 +317,7 @@ def rounded_factor(factor: float) -> float:
     changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # The bound is wide, since the factor is only as exact as the masses of the URDF.
+        # The tolerance of 1.5 is wide, since the factor is only as exact as the masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")

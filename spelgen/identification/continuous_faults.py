@@ -63,7 +63,8 @@ class ZeroOffset(Fault):
             exact = problem.fit(shifted(right))
             if right.any() and exact.cost < best.cost + GEOMETRY.right_angle:
                 candidates.append(exact)
-        # an uncertain angle may be far from a multiple of 90 degrees of about the same cost: both are possible
+        # If the best offset is far from a multiple of 90 degrees of about the same cost, the log does not determine
+        # which is right: both are candidates.
         if not candidates or abs(offset - right)[0] > GEOMETRY.serious_angle:
             candidates.append(problem.fit(shifted(offset.round(4))))
         # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only
@@ -114,7 +115,7 @@ class Delay(Fault):
 
         Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
         omitted. Nothing is yielded if the hypothesis of the fit `base` has a delay already, or if the samples lack the
-        preceding and following signals, with which they can be shifted in time.
+        signals before and after them, from which delayed signals are interpolated.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
@@ -194,10 +195,11 @@ class JointClock(Fault):
             yield from self._near(problem, base)
 
     def _near(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the best fit with delays near 0 at both ends that differ, if a step towards them lowers the cost.
+        """Yield the best fit in which some signals have a drifting delay, if a step from no delay lowers the cost.
 
-        The step needs the derivative of the residual with respect to the delay of each signal only: the derivative with
-        respect to the delay at the end of a recording is this derivative times the relative time.
+        A Gauss-Newton step gives the delays at the start and end of a recording. The derivatives of the residual with
+        respect to them are 1 - t and t times the derivative with respect to a constant delay, with the relative time t
+        from 0 to 1.
         """
         reading, parameters = base.hypothesis, base.parameters
         residual, columns = problem.residual(reading, parameters), []
@@ -218,7 +220,11 @@ class JointClock(Fault):
                 yield from self._best(problem, reading, start, signals)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
+        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time.
+
+        Each set of signals (`_delayed_signals`) and each final delay `GEOMETRY.clock_starts` is an initial guess; the
+        three guesses of lowest cost are refined. unchanged: fit of the unchanged log.
+        """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -235,8 +241,8 @@ class JointClock(Fault):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fit in which some signals have the best delays at the start and end of a recording.
 
-        Nothing is yielded if both delays are about equal. start: (2,) [s] initial delays of the descent. signals: (2,
-        n) mask of the delayed motions and torques.
+        Nothing is yielded if both delays are about equal. reading: hypothesis without these delays. start: (2,) [s]
+        initial delays of the descent. signals: (2, n) mask of the delayed motions and torques.
         """
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
@@ -253,7 +259,8 @@ class JointClock(Fault):
     ) -> Hypothesis:
         """Return the hypothesis in which the delay of some signals changes linearly during a recording.
 
-        delays: (2,) [s] at the start and the end. signals: (2, n) mask of the delayed motions and torques.
+        reading: hypothesis without these delays. delays: (2,) [s] at the start and the end. signals: (2, n) mask of the
+        delayed motions and torques.
         """
         first, last = delays
         drift = (last - first) / float(problem.samples.times.max())
@@ -272,9 +279,10 @@ class JointClock(Fault):
 
 
 def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:
-    """Return True if a fit with other times explains much more of a joint's torque than the base.
+    """Return True if delayed signals explain the torque of at least one joint much better than the fit `base`.
 
-    Friction with a history also resembles a delay: the residual must be smaller with both friction models.
+    The joint's squared torque residual in `fit` must be less than `GEOMETRY.delay_gain` times the residual in `base`.
+    Hysteresis of friction resembles a delay, so this must hold for friction models with and without hysteresis.
     """
     stateful = problem.with_hysteresis()
     is_better = fit.errors < GEOMETRY.delay_gain * base.errors
@@ -310,9 +318,10 @@ class Compensation(Fault):
     rarity = 3
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the torques with the best fraction of gravity, or without gravity.
+        """Yield the least-squares fit of torques that contain only a fraction of the gravity torque, or none of it.
 
-        The fraction is between -0.5 and 0.5. The fit without gravity is preferred if its cost is about equal.
+        The best fraction between -0.5 and 0.5 is used; it is negative if gravity is compensated too strongly. The fit
+        without gravity is preferred if its cost is about equal.
         """
         present = np.array(base.hypothesis.gravity)
         if not present.any():
@@ -352,7 +361,8 @@ class Gravity(Compensation):
         """Yield the least-squares fit of the torques with the best direction of gravity.
 
         Directions along the axes of the root link are preferred. Nothing is yielded if the direction differs from the
-        present one by less than errors of the mounting, or if the torques may contain no gravity.
+        present one by less than errors of the mounting (`GEOMETRY.min_tilt`), or if a gravity compensation explains the
+        torques as well.
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
@@ -381,8 +391,8 @@ class Gravity(Compensation):
             )
         new, best = min(descents, key=lambda x: x[1].cost)
         # Torques without gravity are explained equally well by gravity parallel to the axes of all joints. Of these
-        # directions only -z is accepted; instead of any other direction, a gravity compensation is the more likely
-        # explanation.
+        # directions only -z is accepted without further evidence. Otherwise a gravity compensation is more likely,
+        # unless the direction has a lower cost than torques without gravity.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
         if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())

@@ -51,7 +51,10 @@ class Coupling:
 
 
 def friction_compensated(values: str) -> Diagnostic:
-    """Return the warning about torques that decrease with velocity. values: friction or compensation per joint."""
+    """Return the warning about torques that decrease with velocity.
+
+    values: text with joint names and their negative viscous friction, or their coefficient of friction compensation.
+    """
     message = (
         f"the measured torque decreases with velocity: {values}; friction falls with speed (Stribeck effect), or the "
         "drive compensates friction: check the signs of the torques, and whether the controller subtracts friction"

@@ -71,14 +71,15 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     # explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
-        # one fault of two may look like another one: the first correction is then left open
+        # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
+        # several of the best single corrections.
         is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
         tried: list[HypothesisFit] = []
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
-        # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
-        # of other signals may be nearer than the right one
+        # To save time, orders of all joints and long drifts are searched only if no single correction explains the
+        # torques, or if the best one is a drift: the search from no delay may have found a drift of the wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -111,14 +112,15 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    A friction model with hysteresis shows the whole decrease, but also larger decreases of wrong hypotheses: on
-    recorded arms up to 32, instead of 17 without hysteresis. Its decreases are therefore halved. The larger one of the
-    decrease without hysteresis and the halved decrease is used. For a hypothesis with another delay, the smaller one of
-    both decreases (not halved) is used, since hysteresis resembles a delay.
+    Let a be the decrease of the cost from `base` to a hypothesis without hysteresis, and b the decrease with
+    hysteresis. That residual does not hide a part of b, but b is larger for wrong hypotheses, too: on recorded arms up
+    to 32, and a up to 17. The new cost is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay
+    than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a delay.
 
     Args:
         problem: problem without hysteresis.
-        fits: fits of `problem`; only the best ones, with a cost below the cost of `base`, get other costs.
+        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
+            with hysteresis.
         base: fit of `problem` with which the costs are compared.
     """
     stateful, best = problem.with_hysteresis(), sorted(fits, key=RANK)

@@ -1,4 +1,4 @@
-"""Hypotheses about a log: which signals of the joints and which gravity its columns represent."""
+"""Hypotheses about a log: joint, scale, zero and delay of its columns, and the direction of gravity."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Hypothesis:
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
 
-        samples: logged samples. The result has signals only at the samples, and not around them.
+        samples: logged samples. The result has no signals before and after each sample: E = 1 in `MotionSamples`.
         """
         delays = _per_signal(self.delay)
         if self.drift.any():
@@ -90,7 +90,10 @@ def _per_signal(values: np.ndarray) -> np.ndarray:
 
 
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E) with the motion of joint source[0, k] and the torque of source[1, k] at joint k."""
+    """Return signals (S, n, 4, E), with the motion of joint source[0, k] and the torque of joint source[1, k] at k.
+
+    values: (S, n, 4, E), see `MotionSamples`.
+    """
     return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
 
 

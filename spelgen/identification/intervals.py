@@ -91,10 +91,10 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the ratio of the 95 % quantiles of Student's t distribution and of the normal distribution.
+    """Return the ratio of the 97.5 % quantiles of Student's t and normal distribution (two-sided 95 % intervals).
 
-    Standard deviations that are estimated from few blocks are multiplied by this ratio, so that 1.96 standard
-    deviations are half the width of a 95 % interval.
+    Student's t distribution has ``blocks`` - 1 degrees of freedom. Standard deviations that are estimated from few
+    blocks are multiplied by this ratio, so that 1.96 standard deviations are half the width of a 95 % interval.
     """
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
@@ -102,15 +102,16 @@ def student_scale(blocks: int) -> float:
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
-    The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
-    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps, the Hessian S of all
-    blocks and the prior, and the precision P of the prior. Errors of samples may be correlated within blocks, and their
-    variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    The first value (B, k) has, for each of the B blocks, the Newton step from the estimate to the estimate without this
+    block. The second value (k, k) is the covariance V + S^-1 P S^-1, with the jackknife covariance V of these steps,
+    the Hessian S of all blocks and the prior, and the precision P of the prior. Errors of samples may be correlated
+    within blocks, and their variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015,
+    CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
-        descent: (B, k) negative gradient of each block at the estimate; the sum over blocks is the gradient of the
-            prior's negative log density.
+        descent: (B, k) negative gradient of each block's cost at the estimate. The sum over the blocks is the gradient
+            of the prior's negative log density, because the total gradient is zero at the estimate.
         prior: (k, k) precision P of the prior.
     """
     count, hessian = len(curvature), curvature.sum(dim=0) + prior

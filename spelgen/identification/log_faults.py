@@ -82,6 +82,8 @@ class Fault(ABC):
         needed: smallest cost decrease of an accepted hypothesis.
         evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
         advice: remedy of a fault that no setting corrects.
+
+    The methods that take a `Correction` return texts and settings for its hypothesis, which has a fault of this kind.
     """
 
     code: str

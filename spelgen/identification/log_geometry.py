@@ -74,7 +74,7 @@ class GeometryProblem:
 
         The other torques and their regressor rows become zero.
 
-        counted: mask (S, n), True for the torques that are fitted, of each joint in the unchanged log.
+        counted: mask (S, n), True for the samples and joints of the unchanged log whose torques are fitted.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -131,7 +131,10 @@ class GeometryProblem:
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N]."""
+        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N].
+
+        The logged torques and the motion are first corrected by ``hypothesis``.
+        """
         torque = self.equations(hypothesis)[0] @ parameters
         return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
@@ -255,9 +258,10 @@ class GeometryProblem:
     def _beyond_limits(self, q: np.ndarray) -> float:
         """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
 
-        Limits of a URDF may be wrong, and zeros may be calibrated badly: the penalty is proportional to the distance
-        beyond the limits up to half of the range between them. Revolute joints may be logged a whole turn beyond their
-        limits.
+        The penalty of a joint is 15 min(1, 2 d / range), with the largest distance d of its positions beyond the limits
+        and the range between the limits. It is not infinite, because limits of a URDF may be wrong and zeros may be
+        calibrated badly. Positions of a revolute joint may be logged with another number of turns: d is the smallest
+        distance of the positions and of the positions plus or minus one turn.
         """
         penalty = 0.0
         for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
@@ -286,8 +290,9 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # The second n functionals are the powers that friction takes from the motion of each joint, qd (viscous qd +
-        # Coulomb sign(qd)), summed over the samples. The sums are entries of the Gram matrices.
+        # The first n functionals of x are the rotor inertias. The second n functionals are the powers that friction
+        # takes from the motion of each joint, qd (viscous qd + Coulomb sign(qd)), summed over the samples. The sums are
+        # entries of the Gram matrices.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -353,7 +358,7 @@ def _variance(tau: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive definite matrix (K, K), inverted with a unit diagonal."""
+    """Return the inverse of a symmetric positive definite matrix (K, K), which is first scaled to a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
@@ -361,7 +366,7 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,).
 
-    The linear system is solved without the inverse, which takes a third of the time.
+    The linear system is solved without computing the inverse, in a third of the time.
     """
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)

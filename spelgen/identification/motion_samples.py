@@ -75,9 +75,9 @@ class MotionSamples(NamedTuple):
     def at(self, delays: np.ndarray) -> np.ndarray:
         """Return the signals (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: the signals around each sample
-        are interpolated. Or (S, n, 4), of any magnitude: the signals around another sample are interpolated, the one
-        that is nearest to the delayed time.
+        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: interpolated from the signals
+        stored with each sample. Or (S, n, 4), of any magnitude: interpolated from the signals stored with the sample
+        nearest to the delayed time.
         """
         if not delays.any():
             return self.central

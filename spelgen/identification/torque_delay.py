@@ -39,7 +39,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling, with which no delay is estimated; [] without both."""
+        """Message about the delay, or about the motor coupling that prevents its estimation; [] if there is neither."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (

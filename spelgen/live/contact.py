@@ -37,10 +37,11 @@ class ContactObserver:
 
     Attributes:
         low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
-            p of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of
-            the payload.
+            p of the arm; 5 to 14: regressor of the payload. Row 4 is filtered at twice the bandwidth of the observer,
+            all other rows at this bandwidth.
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
-        jerk: Low-pass filtered squared change of dp/dt, (n,) [Nm^2, N^2].
+        jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
+            the change of dp/dt, (n,) [Nm^2, N^2].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -76,9 +77,10 @@ class ContactObserver:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Update the filters with a sample; return the torque residual, (n,) [Nm, N], and its variance, (n,).
 
-        The residual is the low-pass filtered measured torque minus the torques of the model, of the payload and of the
-        drift: minus the external torque. The variance has three terms: for changing accelerations, for an unknown
-        friction state and for the uncertain payload. The caller adds the noise variance of the observer.
+        The residual is the low-pass filtered difference between the measured torque and the sum of the torques of
+        model, payload and drift. It estimates the external torque with a reversed sign. The variance has three terms:
+        for changing accelerations, for an unknown friction state and for the uncertain payload. The caller adds the
+        noise variance of the observer.
 
         t, at, payload, drift: see `step`.
         """
@@ -120,7 +122,8 @@ class ContactObserver:
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
         # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
         # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
-        # the variance of the residual therefore contains `jerk` and its low-pass filtered square.
+        # the variance of the residual therefore contains the square of `jerk`, and this square after the filter
+        # (`self.jerk`).
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

@@ -28,7 +28,8 @@ class Balance(NamedTuple):
 
     Attributes:
         momentum: Momentum p of the arm, (T, n).
-        torque: G (tau - offset) + friction compensation of the drives + dL/dq, (T, n).
+        torque: G (tau - offset) + dL/dq in the equation of the module, plus the friction compensation of the drives,
+            (T, n).
         friction: Mean of the friction torques at the two bounds of the friction state, (T, n).
         uncertainty: Half the difference of the friction torques at the two bounds, (T, n).
         load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).

@@ -52,8 +52,9 @@ class LiveTuning:
     uncertainty: float = 3.0
 
     # [1] Fraction of the variance of torque errors that recurs if the motion recurs. More motion does not reduce this
-    # part: the variance of a payload's torque remains at least this fraction. Without it, the normalised squared error
-    # of a payload of zero grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
+    # part: the variance of the torque of the estimated payload does not fall below this fraction of the variance of
+    # torque errors. Without this bound, the normalised squared error of the payload estimated for an arm without
+    # payload grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
     recurring: float = 0.03
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).

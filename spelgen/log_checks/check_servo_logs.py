@@ -47,9 +47,11 @@ SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
     """Return a finding if the positions of servos have another unit than `unit`, "deg" or "rad"; else None.
 
-    The quantisation steps of the encoders show the unit: see the comment at `NORMALISED_RANGE`. Positions without steps
-    were not in degrees if all joints move by less than 0.1 rad when the positions are read in degrees, and a joint
-    moves by more than 0.5 rad when they are read in radians. Normalised positions have another step at each joint.
+    1. In one of both units, the positions have the quantisation steps of encoders (see the comment at
+       `NORMALISED_RANGE`): this is their unit.
+    2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by 0.5 rad or more, but
+       not by over two turns: the unit is "rad".
+    3. `unit` is "deg", and each joint has another step: the positions are normalised.
 
     Args:
         joints: statistics of all joints, converted to radians from `unit`.
@@ -112,8 +114,8 @@ class Following(NamedTuple):
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
-        offset: (n,) [rad, m] mean of u - q; 0 if the mean is less than two standard deviations of u - q, as for joints
-            that carry a load.
+        offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a
+            changing load causes smaller means.
         joints: tracking errors and lag of each joint.
     """
 
@@ -129,7 +131,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     """Return the tracking of the commands of n position servos over all recordings: delay, correlation, errors.
 
     None is returned if no recording is long enough. saturation: (n,) [rad, m] distance of a position from its command
-    at which the servo's torque is at its limit; infinity if the limit is unknown.
+    at which the servo's torque is at its limit, for the fraction of saturated samples; infinity if it is unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -294,7 +296,7 @@ def _exchange_error(
     """Return the error about joints whose commands are tracked by other joints.
 
     The error names the setting with the right column of each joint. exchanged: indices of the joints from
-    `_exchanged_commands`. joints: names of all joints.
+    `_exchanged_commands`. joints: names of all joints. mapping: mapping of the logs.
     """
     entries = {}
     for k in exchanged:
@@ -335,7 +337,11 @@ def _command_error(k: int, report: JointReport, following: Following, of_sum: fl
 def _command_warning(
     k: int, report: JointReport, following: Following, logs: Sequence[Trajectory]
 ) -> Iterator[Diagnostic]:
-    """Yield the warning that the logged command of joint k may not be the command that its servo tracks."""
+    """Yield a warning if the logged command of joint k may not be the command that its servo tracks.
+
+    The command equals the position in all `logs`, hardly changes, is not tracked, has a constant distance from the
+    position, or comes after it.
+    """
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
         # commands equal to positions: the logger wrote measured positions in place of commands

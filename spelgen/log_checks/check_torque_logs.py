@@ -1,4 +1,4 @@
-"""Checks of logs of torques against the model of the arm: geometry, torque limits and stops, couplings of motors."""
+"""Checks of logs of torques against the model of the arm: columns, torque limits and stops, couplings of motors."""
 
 from __future__ import annotations
 
@@ -106,9 +106,9 @@ class TorqueLogs:
             message = f"no samples for identify and for fits of torques: they need {NEEDED}"
             summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
         if is_sound:
-            # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
-            # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
-            # samples.
+            # Hypotheses about the columns are not tested if motor gains are unknown, since a wrong hypothesis about the
+            # log may then have the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested
+            # with unfiltered samples.
             problem = None if unscaled else self._problem(motion if moving is None else moving)
             is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
             if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
@@ -146,8 +146,8 @@ class TorqueLogs:
             return []
         message = (
             "currents or parts of a torque with a gain of 1: write 'gain', Nm per unit at the joint, the gear "
-            "included, under 'logs' in the robot's YAML; until then, senses, order and zeros of the joints are not "
-            "tested"
+            "included, under 'logs' in the robot's YAML, or, if it is unknown, 'torque: motor' and for each joint "
+            "'gain: trained' under 'joints'; until then, senses, order and zeros of the joints are not tested"
         )
         return [Diagnostic("warning", CURRENT, f"joint {', '.join(map(repr, names))}", None, message)]
 
@@ -199,7 +199,8 @@ class TorqueLogs:
         """
         motion = problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
-        # Units that the mapping states wrongly make motions small, so they are tested nevertheless.
+        # A motion may only seem small because the mapping states a wrong unit of positions. Logs with a stated unit are
+        # therefore tested even if their motion is small.
         if not is_stated and np.ptp(motion, axis=0).max() < TUNING.smallest_motion:
             message = (
                 f"all joints stay within {TUNING.smallest_motion:g} rad or m: too little motion to test senses, order, "
@@ -230,7 +231,8 @@ class TorqueLogs:
         faults = better[0].hypothesis.faults
         if {fault.code for fault in faults} <= accepted:
             return True
-        # the evidence for another unit of one torque is gravity, which a wrong link of the URDF may change as well
+        # The only evidence for another unit of one torque is the magnitude of its gravity torque, which a wrong link of
+        # the URDF changes as well: wrong links are reported, too.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             summary.notes.extend(_link_notes(problem, unchanged))
@@ -247,10 +249,10 @@ class TorqueLogs:
         return False
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test, with candidates for wrong units of torques and positions.
+        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for wrong units.
 
         The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
-        that the mapping states is not changed, unless it is mNm.
+        that the mapping states is assumed to be right, except mNm: such torques may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -305,8 +307,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
     """Yield a warning for each link whose mass or first moment, by least squares, is far from its value in the URDF.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference must change the torque of a joint by half of the torque's standard deviation, since parameters of bodies
-    that hardly affect the torques are uncertain.
+    difference between both values must change the torque of a joint by at least half of its standard deviation, since
+    parameters with a small effect on the torques are uncertain.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)

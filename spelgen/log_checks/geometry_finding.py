@@ -54,9 +54,10 @@ def find_unexplained(
 ) -> Diagnostic | LogError | None:
     """Return the finding that neither the unchanged log nor a hypothesis about it explains the torques, or None.
 
-    The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a
-    large residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without
-    such a hypothesis, the finding is a warning, since torques of noise or of friction may be right.
+    The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a large
+    residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without such
+    a hypothesis, the finding is a warning: torques that are mostly noise or friction are unexplained even in a log
+    without faults.
 
     best: fit of the best hypothesis; None if no hypothesis is significantly better.
     """
@@ -86,8 +87,10 @@ def find_unexplained(
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
     """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
 
-    A joint counts in proportion to the variance of its torque, since the torque of a joint at rest may be noise only. A
-    joint counts by itself if it moves, and if the URDF's torque is about as large as the logged one.
+    1. If the mean relative residual of all joints is above `no_torque`: the joints with a residual above `no_advice`,
+       and the mean. It is weighted with the variances of the torques: the torque of a joint at rest may be only noise.
+    2. Otherwise: the joints with a residual above `no_torque` that move and whose torque by the URDF is at least half
+       as large as logged, and the largest residual of these joints.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)

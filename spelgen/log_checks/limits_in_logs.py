@@ -77,8 +77,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
 
     The torques get the signs of the model's torques, and the model is fitted again, in a few alternations. A joint is
-    named if this lowers its residual much, and if both signs occur: the load of a joint with only one sign may indeed
-    have always the same direction.
+    named if this lowers the joint's squared residual much, and if both signs occur. If only one sign occurs, the load
+    of the joint may indeed always have the same direction.
     """
     problem = problem.thinned(GEOMETRY.confirming_samples)
     signals = problem.unchanged.signals(problem.samples)
@@ -121,7 +121,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
-    # the model is fitted only to samples outside flat tops, which are not at a limit
+    # The model is fitted only to samples outside flat tops: at these samples, neither torque nor position is at a
+    # limit.
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.residual(problem.unchanged, fit.parameters)
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)

@@ -197,8 +197,8 @@ def joint_report(
 ) -> JointReport:
     """Return the statistics of the joint number `index` over all trajectories, without gravity and tracking.
 
-    measured: statistics of each trajectory. products: (2n, 2n) sum of the results of `velocity_products` for all
-    trajectories, from which qd is compared with dq/dt.
+    measured: statistics of each trajectory. products: (2n, 2n) Gram matrix of increments of q and of the integral of
+    qd, summed over all trajectories (see `velocity_products`).
     """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:

@@ -36,8 +36,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [rad, m] Largest range of positions of a log in which friction before sliding may determine the torques: the
-    # geometry is not tested. At 0.02, wrong hypotheses are the best ones on simulated arms; at 0.1, none is.
+    # [rad, m] Largest range of positions of a log in which friction before sliding may determine the torques:
+    # hypotheses about the log are not tested. At 0.02, wrong hypotheses are the best ones on simulated arms; at 0.1,
+    # none is.
     smallest_motion: float = 0.05
     # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
     # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
@@ -110,7 +111,7 @@ def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 class JointEvidence(NamedTuple):
     """A joint of the URDF and its statistics over all trajectories: the input of each check in `CHECKS`.
 
-    offset: offset of the logged position in the mapping [rad, m].
+    coordinate: the joint. report: its statistics. offset: zero offset of its positions in the column mapping [rad, m].
     """
 
     coordinate: Coordinate
@@ -177,8 +178,9 @@ def torque_factors(
 
     Args:
         joints: the joints with their fits of gravity.
-        undeclared: (n,) True for joints whose torque has no unit in the mapping.
-        loaded: (n,) True for joints that gravity loads enough.
+        undeclared: (n,) True for joints whose torque may have another unit: none in the mapping, or mNm. A candidate
+            for all joints requires True for all joints.
+        loaded: (n,) True for joints that gravity loads enough. Only joints that are True in both masks have an r.
     """
     seen: list[float] = []
     factors = []
@@ -201,7 +203,7 @@ def torque_factors(
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Return a message if torques exceed the joint's effort limit 20 times, so that their unit is wrong; else None."""
+    """Return a message if torques exceed 20 times the joint's effort limit, so that their unit is wrong; else None."""
     # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     # The bound is 20 times the limit: torques in mNm are 1000 times as large as in Nm, and no drive gives 20 times its

@@ -140,8 +140,8 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
-    logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
+    the settings that map the names if every joint name is the end of exactly one logged name ("j1" of "left_j1"). If
+    not, it is tried again without the prefix that all joint names share ("panda_j1" is then mapped to "fer_j1").
     """
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
@@ -204,7 +204,10 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
 
 
 def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of a bag, read with `rosbags`. Raises LogError if there are none."""
+    """Yield the encoded joint states on all topics of a bag, which the function `open_bag` of `rosbags` opens.
+
+    Raises LogError if there are none.
+    """
     with open_bag(path) as reader:
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
         if not connections:

@@ -54,8 +54,8 @@ class Check(Generic[Subject]):
         code: name of the check in reports; the option `--accept CODE` omits the check.
         severity: logs with a finding of severity "error" cannot be trained on.
         find: function of the checked object that returns a message about the fault, or None if there is no fault.
-        unless: codes of earlier checks; if one of them has a finding, which explains this fault, too, this check is
-            omitted.
+        unless: codes of earlier checks whose findings would explain this fault, too: if one of them has a finding, this
+            check is omitted.
         everywhere: if True, a fault is reported only if it occurs in all trajectories.
         expected: expected content of the log, for the error message.
         do: advice for correcting the fault, for the error message.
@@ -177,8 +177,8 @@ CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", fi
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, as if
-    # positions were frozen.
+    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, which would
+    # otherwise be reported as frozen signals.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",

@@ -237,10 +237,10 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
             q = signals.q[~is_lost(signals.signal("u"))]
             if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
                 return None
-        # The advised settings include the sign bits of the other signals, so that they can replace the line in the
-        # mapping.
-        stated = {x: mapping.word("sign_bit", x, signals.joint) for x in signals.trajectory.quantities}
-        words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
+        # The advised line replaces the joint's line of the same key, `sign_bit` or `period`, in the mapping, and
+        # therefore repeats the values of its other signals.
+        stated = {x: mapping.word(word.key, x, signals.joint) for x in signals.trajectory.quantities}
+        words = {x: plain_number(y, 9) for x, y in stated.items() if y}
         keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
         if turn == 360.0 and unit is None:
             unit, units = "deg", {name: "deg"}
@@ -252,8 +252,8 @@ def _find_words(signals: JointSignals, name: str) -> Advice | None:
         what = (
             "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
         )
-        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
-        # words of a signal may be 0, and would be removed as lost samples.
+        # Jumps are counted on the logged signal, without the samples that are outliers of the decoded signal. Outliers
+        # of the logged signal are no criterion: among sign-magnitude words, a 0 looks like a lost sample.
         raw = (signals.signal(name) - offset) / scale
         decoded = signed(raw, word.value) if word.key == "sign_bit" else unwrapped(raw, word.value)
         count = jump_count(raw[~is_outlier(decoded, smooth=name == "q")], word.value)

@@ -6,7 +6,7 @@ are the raw integers of a drive's register: they overflow at a period, or have a
 """
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,12 @@ FINEST_WORD = 4e-6
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
-    """Return the number of wraps of a signal (T,): steps between samples whose magnitude exceeds half a period."""
+    """Return the number of wraps of a signal (T,): jumps of more than half a period between two samples."""
     return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return a signal (T,) that wraps at a period without its jumps of whole periods; its first value is unchanged."""
+    """Return the continuous signal for a signal (T,) that wraps at a period; the first value is unchanged."""
     if not jump_count(values, period):
         return values
     turns = np.diff(values, prepend=values[:1]) / period
@@ -157,9 +157,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
-    at the end of the block is then about as large as k steps of the following motion. Equal rows of an arm at rest are
-    not repeats. The exception is a logger that writes each row m times during motion (m is the number of copies, else
-    1): at rest, too, one of m rows is original, and the others are repeats.
+    at the end of the block is then about as large as k steps of the following motion. The number m of copies is the
+    median length of these blocks, since a logger may write each row m times; m is 1 if there are none. In all other
+    blocks, the arm was at rest: every m-th row is original, and the others are repeats (no row for m = 1).
 
     positions: number of leading columns that are positions.
     """
@@ -202,7 +202,7 @@ class Word(NamedTuple):
         values: (T,) decoded signal in the unit of the log.
     """
 
-    key: str
+    key: Literal["period", "sign_bit"]
     value: float
     values: np.ndarray
 
@@ -260,14 +260,15 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit of register words: 2^k revolutions, and 2^k quantisation steps.
+    """Return candidates for the period or sign bit of register words (see `Word`): 2^k revolutions or 2^k steps.
 
-    values: signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not rotate.
+    The steps are the quantisation steps of ``values``, the signal (T,) in the unit of the log. turn: one revolution in
+    this unit; None if the joint does not rotate.
     """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # Smaller differences between values are rounding errors, since the values were converted to SI units and back.
+    # Differences below `FINEST_WORD` of the range are rounding errors: the values were converted to SI units and back.
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())

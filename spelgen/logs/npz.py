@@ -35,8 +35,8 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # The size of an array that the archive states bounds the memory even if it is wrong: zipfile reads no more
-            # bytes.
+            # The memory is bounded by the sizes that the archive states for its arrays. A wrong size is no risk:
+            # zipfile reads no more bytes than the archive states.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, limit = (
@@ -57,7 +57,7 @@ class NpzArrays:
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the array of this name."""
+        """Return an error about the array of this name; other arguments as for `LogError`."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def is_vector(self, name: str) -> bool:
@@ -150,7 +150,8 @@ def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Column
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
 
-    pattern: name of the columns, such as `q_{joint}`. names: names of the arm's joints in the log.
+    pattern: name of the columns in the mapping, such as `q_{joint}`, which also determines the name of the matrix (q).
+    names: names of the arm's joints in the log.
     """
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:

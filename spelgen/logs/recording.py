@@ -211,7 +211,7 @@ def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, 
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
     A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
-    torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
+    torque. A torque with the last value of the recording is not stale: the motor may be off while the joint moves.
 
     Args:
         quantity: name of the signal, "q", "qd" or "tau".
@@ -241,8 +241,9 @@ def _order_in_time(rows: Rows) -> None:
     """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
     Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
-    kept. If many of them differ, the resolution of the clock is too low, and evenly spaced times are reconstructed.
-    Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
+    kept. If many rows have the time of the row before but other values, the resolution of the clock is too low: all
+    rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that restarts, and for times
+    that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of

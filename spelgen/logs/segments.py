@@ -40,7 +40,7 @@ class Segment(NamedTuple):
     start: float
 
     def continued_by(self, other: "Segment") -> bool:
-        """Return True if another file continues this one: times and positions proceed by a step that is no gap."""
+        """Return True if `other`, of another file, continues this segment without a gap in times and positions."""
         mine, others, count = self.layout, other.layout, 1 + len(self.layout.joints)
         if mine.file == others.file or (mine.columns, mine.mapping) != (others.columns, others.mapping):
             return False

@@ -55,7 +55,10 @@ class Layout:
     header: int | None = None
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the value in a row (from 0) and column; for a text file it also states the line."""
+        """Return an error about the value in a row (from 0) and column; for a text file it also states the line.
+
+        got, expected, do: arguments of `LogError`.
+        """
         line = int(row) + 1 + self.header if self.header is not None else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -115,7 +118,7 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
     Raises LogError if a column is missing or occurs twice.
 
     Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
-    position), the accepted checks and the wraps of angles apply to them.
+    position), the codes of checks to omit (``accept``) and the wraps of angles apply to them.
     """
     schema, mapping = log.schema, log.mapping
     metadata = schema.metadata or {}

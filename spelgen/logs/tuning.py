@@ -88,5 +88,5 @@ def shows_accelerations(rate: float) -> bool:
 
 
 def is_dense(rate: float) -> bool:
-    """Return True if linear interpolation between samples suffices at this sample rate [Hz]."""
+    """Return True if linear interpolation between samples suffices at this sample rate [Hz]: at least 50 Hz."""
     return rate * FAST >= TUNING.dense_rate

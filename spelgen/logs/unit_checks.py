@@ -73,7 +73,8 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-    # Of combinations of units whose distances differ by rounding only, the first is used: its units are most frequent.
+    # `distance`: implausibility of a combination of units. Of combinations whose distances differ by rounding only, the
+    # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     if distance > log(1.25):
@@ -89,11 +90,11 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield (distance, settings of the joint) for all units of q and qd that the column mapping permits.
 
-    The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
-    dq/dt to qd in these units, plus a penalty for units other than SI.
+    The smaller the distance, the more plausible are the settings. The distance is |log r|, with r the ratio of dq/dt to
+    qd in these units, plus a penalty for units other than SI.
 
-    is_far: True if q of a revolute joint with limits has no stated unit and, as logged, a range above 4 pi (two turns
-    in rad): units in which |q| would exceed two turns are then omitted.
+    is_far: True if q of a revolute joint has no stated unit and spans more than two turns if read in rad. Units in
+    which |q| exceeds two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
@@ -158,7 +159,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 def _rate_by_velocities(signals: JointSignals) -> float | None:
     """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
 
-    Return None if the times may be right, or if another unit of the times, such as ms, explains the factor.
+    Return None if the times may be right, or if the ratio of dq/dt to qd is the ratio of two units of time, such as
+    1000.
     """
     factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
@@ -204,8 +206,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # A log of at most ten samples has a single increment, whose correlation is always 1 or -1: too little for
-        # advice.
+        # Increments are changes over ten samples. A log of at most ten samples has only one, the change from its first
+        # to its last sample, whose correlation is always 1 or -1: too little for advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
@@ -258,8 +260,8 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # The delay must explain 75 % of the squared difference between q and the integral of qd, since noise also causes
-    # one.
+    # The delay must explain 75 % of the squared difference between q and the integral of qd: noise also results in an
+    # apparent delay, but explains little of the difference.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 

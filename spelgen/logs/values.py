@@ -91,9 +91,9 @@ def is_split(data: np.ndarray) -> bool:
 
 
 def clock_start(table: pa.Table, layout: Layout) -> tuple[pa.Scalar | None, float]:
-    """Return the first logged time, as logged and [s], to be subtracted from all times, if the times are dates.
+    """Return the first logged time, as logged and in seconds, if the times are dates; else (None, 0.0).
 
-    The result is (None, 0.0) for relative times.
+    The first time is subtracted from all times, since dates have too few digits as floating-point numbers.
     """
     first_row = table.slice(0, 1)
     times, unit = _clock(first_row, layout)
@@ -171,8 +171,9 @@ def _numbers(texts: Column) -> np.ndarray:
 def _column(table: pa.Table, name: str) -> Column:
     """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
-    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. Row
-    numbers replace absent times, which the mapping's `sample_rate` makes superfluous.
+    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. If
+    the log has no times and the mapping has a `sample_rate`, row numbers are returned as the column of times, and the
+    caller converts them to times.
     """
     stored = stored_names(name, table.schema.names)
     if len(stored) != 1:

@@ -41,7 +41,7 @@ def inspection_page(
 
     Args:
         inspection: The derived structure.
-        closed: Closed-form formulas of the entries of M and V; None: the page has no formulas.
+        closed: Closed-form formulas of the mass matrix M(q) and the potential energy V(q); None: the page has none.
         proof: Verification of the structure; None: the structure was not verified.
         urdf: URDF of the arm, from which the picture of the arm is drawn; None: the page has no picture.
     """

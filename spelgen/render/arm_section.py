@@ -63,8 +63,8 @@ class AnimatedMotion:
 class AnimatedArm:
     """The animated picture of an arm.
 
-    data: JSON for the script. motions: labels of the motions to choose from. tubes: sentence about links without
-    meshes, which are drawn as tubes.
+    data: JSON for the script, the shapes of the links and the motions. motions: labels of the motions to choose from.
+    tubes: sentence about links without meshes, which are drawn as tubes.
     """
 
     data: Markup
@@ -148,7 +148,7 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 def _colour(error: np.ndarray) -> np.ndarray:
     """Return colours (T, n) of the links of the animated arm, as numbers, for relative errors (T, n) of its joints.
 
-    0: no error, 1: an error of 0.5 or -0.5.
+    A colour is proportional to the magnitude of the error (divided as in `evaluated_motions`); 1: an error of 0.5.
     """
     return np.asarray((np.abs(error) / 0.5).round(3))
 

@@ -97,8 +97,8 @@ def base_table(
     columns = {"parameter": names, "URDF": list(map(_number, nominal))}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # The posterior has only base parameters of bodies and armatures, because the friction model of the fit differs
-        # from the friction model of least squares. The other cells of this column are empty.
+        # The posterior has only base parameters of bodies and armatures, because the fit and least squares have
+        # different friction models. In the rows of friction, the column of the model is empty.
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)

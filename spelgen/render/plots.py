@@ -118,8 +118,9 @@ def growth_panels(
 def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
     """Return the limits of the axis of prediction errors, so that errors of diverged baselines do not extend it.
 
-    The limits include the medians of all predictors and the quantiles of the model. None is returned if `errors`, {name
-    of a line: quantiles}, has no entry of the model, or no positive error.
+    The limits include the quantiles of the model, and the medians of all predictors except values above
+    `TUNING.outlier` times the largest quantile of the model. None is returned if `errors`, {name of a line: quantiles},
+    has no entry of the model, or no positive error.
     """
     # A page of several runs has one line per run and no baselines, so its axis is not limited.
     if labels.MODEL not in errors:

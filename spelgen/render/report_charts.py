@@ -45,7 +45,10 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of the charts of a predicted motion or a replayed log; the title contains the error."""
+    """Return the title of the charts of a predicted motion or a replayed log.
+
+    It states the relative error of a prediction, or the RMS position error of a replayed log [mrad, mm].
+    """
     which = example.which.capitalize()
     if example.start is None:
         distance = None if example.error is None else 1000 * example.error

@@ -78,7 +78,7 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # The tables of the posterior state the torque delay, by which the fit has shifted the logged torques.
+        # `delay`: the fit has shifted the logged torques by this time, which the tables of the posterior state.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
 
@@ -196,8 +196,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
-        # The command contains a mapping that is stored in the run folder: it has replaced the mapping of the robot's
-        # settings.
+        # A mapping in the run folder has replaced the mapping in the settings of the robot, so the command must specify
+        # it.
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

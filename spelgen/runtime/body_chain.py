@@ -36,8 +36,8 @@ class BodyChain(nn.Module):
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four point
     masses that have the same pseudo-inertia P: the columns (position, 1) * sqrt(mass) of a matrix Q with Q
     Q^T = P. Only the frames are computed recursively. A sum over the bodies that a joint carries, or over the
-    joints that carry a body, is one product with a mask: for small arms the time is proportional to the
-    number of tensor operations.
+    joints that carry a body, is one product with a matrix of zeros and ones: for small arms the time depends
+    on the number of tensor operations, not on their size.
     """
 
     def __init__(
@@ -162,8 +162,8 @@ class BodyChain(nn.Module):
         # Angular momentum about the origin of the base, and linear momentum, of each point mass.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
         # The derivative with respect to a joint's displacement is the scalar product of the momentum of all
-        # bodies that the joint carries and the time derivative of the joint's axis. The rotation of the
-        # points' velocities contributes nothing: (a x v) . v = 0.
+        # bodies that the joint carries and the time derivative of the joint's axis. A rotation about the axis
+        # a also rotates the velocity v of each point, which contributes nothing: (a x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 
@@ -207,8 +207,8 @@ def body_factor(parameters: Tensor) -> Tensor:
 def pseudo_inertia(link: Link) -> Tensor:
     """Return the pseudo-inertia [[S, m c], [(m c)^T, m]] of a link in the link's joint frame, (4, 4).
 
-    With the mass m [kg], the center of mass c [m] and the inertia tensor I about c [kg m^2],
-    S = tr(I)/2 1 - I + m c c^T is the matrix of the second moments of mass.
+    With the mass m [kg], the center of mass c [m], the inertia tensor I about c [kg m^2] and the identity
+    matrix E, S = tr(I)/2 E - I + m c c^T is the matrix of the second moments of mass.
     """
     xx, xy, xz, yy, yz, zz = link.inertia
     inertia = torch.tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=torch.float64)

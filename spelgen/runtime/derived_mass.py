@@ -100,12 +100,13 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    The result is positive definite for all q and all parameters. C denotes M at the nominal means of the
-    functions, without armature. If M - margin C is not positive definite, M is replaced by
-    M' = C + t (M - C). The factor t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The
-    norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise
-    constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the linear relations
-    between entries of M are valid for C, and therefore for M', too.
+    The result is positive definite for all q and all parameters: M (with armature) may be replaced by M' = C
+    + t (M - C). The matrix C has no armature; it is ``entries`` with the nominal mean of each function
+    (``Function.mean``) and the initial constants. ``margin``, below 1, is a lower bound of M relative to C: t
+    is 1 if M - margin C is positive definite, otherwise the largest of 1/2, 1/4, 1/8, ... with t |M - C| +
+    margin <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t
+    is piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the
+    linear relations between entries of M are valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -127,9 +128,9 @@ class DerivedMass(LinearMass):
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # The norm |X| of a matrix X is the Frobenius norm of D X D divided by the smallest eigenvalue of
-        # D C D, with D = diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T, C = L L^T.
-        # `unit`, (n, n), has the factors of the entries of X in |X| / (1 - margin).
+        # The norm |X| of a matrix X is the Frobenius norm of D X D divided by the smallest eigenvalue of D C
+        # D, with D = diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T, C = L L^T. `unit`,
+        # (n, n): the Frobenius norm of the elementwise product of `unit` and X is |X| / (1 - margin).
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -154,8 +155,9 @@ class DerivedMass(LinearMass):
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return the mass matrix M'(q), (..., n, n), and intermediate values for its derivatives.
 
-        encoded: encoding of q, (..., 2 n). layers: parameter cache. The intermediate values are the values of
-        the network's layers, and the factor t of M' = C + t (M - C), (...).
+        M' = C + t (M - C) is the corrected mass matrix, see ``DerivedMass``. The intermediate values are the
+        values of the network's layers, and t, (...). encoded: encoding of q, (..., 2 n). layers: parameter
+        cache.
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -206,7 +208,7 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of a nominal large matrix.
+    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of the nominal value of a large matrix.
 
     The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
     axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
@@ -214,7 +216,8 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
     Args:
         joints: joints of the arm, whose nominal armature is added to M.
-        mean: lower triangle, by rows, of the nominal mean of M without armature [kg m^2, kg m, kg].
+        mean: lower triangle, by rows, of the mean of M over random positions, for the nominal bodies and
+            without armature [kg m^2, kg m, kg].
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -228,13 +231,14 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """A mass matrix M(q), (..., n, n), without structure: a block of a large matrix with 3 axes per joint.
+    """A mass matrix M(q), (..., n, n), without structure: a block of a matrix with three axes per joint.
 
-    The inverse of the large matrix, (..., 3 n, 3 n), is C U diag(e) U^T C^T. C is constant: the Cholesky
-    factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
+    The large matrix, (..., 3 n, 3 n), has a row and a column for the x, y and z axis of each joint, as in the
+    model of Duong et al. (IEEE T-RO 40:3695, 2024). Its inverse is C U diag(e) U^T C^T. C is constant: the
+    Cholesky factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
     triangular with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints
-    rotate about or move along their z axes only, so M is the block of the z axes:
-    (U^-1 A)^T diag(1 / e) U^-1 A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
+    rotate about or move along their z axes only, so M is the block of the z axes: (U^-1 A)^T diag(1 / e) U^-1
+    A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -300,7 +304,10 @@ class DenseMass(nn.Module):
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n)."""
+        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n).
+
+        The encoding is defined in ``JointEncoding``. intermediates: second result of ``forward`` at q.
+        """
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)

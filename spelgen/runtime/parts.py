@@ -33,10 +33,16 @@ class Mass(Protocol):
         """
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding, (..., 2 n); qd: (..., n)."""
+        """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding of q, (..., 2 n).
+
+        qd: velocities, (..., n). intermediates: second result of ``forward`` at q.
+        """
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+
+        intermediates: second result of ``forward`` at q.
+        """
 
 
 class Inputs(Protocol):

@@ -1,7 +1,7 @@
 """Residual terms: corrections that are added to M(q), V(q) and friction of a rigid-body model.
 
-Torque and friction terms depend on the position of one joint each (splines and harmonics); the terms of M(q),
-and one of V(q), are networks that depend on the positions of several joints.
+Splines and harmonics of one joint's position add torques to dV/dq and change friction. Networks that depend
+on the positions of several joints add terms to M(q) and V(q).
 """
 
 import math
@@ -62,9 +62,10 @@ class ResidualTerms(nn.Module):
     sum of splines in the joint's position. The splines fall to zero within three knot spacings beyond the
     range.
 
-    Mass: R is ``entries(*functions, *constants)``, with ``entries`` a function in the emitted module. A
-    function is a bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a
-    trained parameter. The ``bounds`` make armature + R positive definite for all q and all parameters.
+    Mass: R is linear in learned functions of q and in trained constants: ``entries(*functions, *constants)``,
+    where ``entries`` places them in the matrix according to the structure of the arm's M. A function is a
+    bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a trained
+    parameter. The ``bounds`` make armature + R positive definite for all q and all parameters.
 
     Potential: ``potential_scale`` [J] times the output of the network ``potential`` is added to V.
 
@@ -115,16 +116,18 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # `inverse`: 1 / |coefficient| of each function and constant in each entry of M, (functions +
-        # constants, n, n). It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores it.
+        # R is linear in its functions and constants. `inverse`, (functions + constants, n, n): 1 /
+        # |coefficient| of each of them in each entry of R. It is 1e30 for a zero coefficient, so that the
+        # minimum in `bounds` ignores it.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. `part` is the share of each function and constant: 0.9
-        # divided by the largest number of functions and constants in one row of M.
+        # R may reduce the armature by at most 90 %, which all terms in a row of R use in equal parts: `part`
+        # is 0.9 divided by the largest number of terms (a function or constant times its coefficient) in one
+        # row of R.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution to R of each function and constant of R, (functions + constants, n, n).
+        """Return the part of R due to each of its functions and constants, (functions + constants, n, n).
 
         sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
         """
@@ -134,11 +137,14 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). If no function
-        or constant exceeds its bound, A + R is positive definite: it is the sum of A - diag(d) and
-        diag(d) + R, with d = 1 / (row sums of |A^-1|). By diagonal dominance, the first matrix is positive
-        semi-definite, and the second is positive definite if all row sums of |R| / sqrt(d d^T) are less
-        than one.
+        R is the residual term of M, linear in its functions and constants (see the class). A + R is positive
+        definite if no function or constant exceeds its bound: ``part`` times the minimum of sqrt(d_i d_j) /
+        |coefficient in R_ij| over the entries of R, with d = 1 / (row sums of |A^-1|).
+
+        Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
+        dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
+        sqrt(d_i d_j) are less than one. The second matrix, scaled to a unit diagonal, is therefore strictly
+        diagonally dominant.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.
@@ -193,9 +199,10 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the sum of the residual terms of V, (...) [J]; cache: configuration cache at q.
+        """Return the sum of the residual terms of the potential energy V, (...) [J].
 
-        The energy of a B-spline is the integral of its torque from the middle of the spline to q.
+        cache: configuration cache at q. The energy of a B-spline is the integral of its torque from the
+        middle of the spline to q.
         """
         distance = self._distances(cache.q)
         size = distance.abs()
@@ -247,7 +254,9 @@ class ResidualTerms(nn.Module):
     def waves(self, q: Tensor) -> Tensor:
         """Return cos(f q) for all ripple frequencies f of each joint, then sin(f q).
 
-        The shape is (..., n, 2 HARMONICS + 4). A sum of these functions is the torque ripple of a joint.
+        The shape is (..., n, 2 HARMONICS + 4). f is the number of periods per revolution of the joint: 1, 2,
+        ..., HARMONICS + 2. If the gear ratio exceeds HARMONICS, the last two are the gear ratio and twice the
+        gear ratio. A weighted sum of these functions is the torque ripple of a joint.
         """
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)

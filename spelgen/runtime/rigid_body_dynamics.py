@@ -17,7 +17,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """Parameter cache of ``RigidBodyDynamics``: quantities that depend on trained parameters only."""
 
-    points: Tensor  # point masses of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
+    points: Tensor  # point masses: block diagonal of Q of all bodies, (4 bodies, 4 bodies), see ``BodyChain``
     armature: Tensor  # rotor inertia on the joint side, added to M, (n, n)
     friction: FrictionConstants
     residual: Parameters = None  # parameter cache of the residual terms
@@ -129,11 +129,11 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Coefficient k of a torque k qd that drives add to the measured torque, (n,) [Nm s/rad, N s/m]."""
+        """Coefficient k of the drives' torque k qd that the measured torque lacks, (n,) [Nm s/rad, N s/m]."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache: point masses, armature and friction constants.
+        """Return the parameter cache: point masses (see ``BodyChain``), armature and friction constants.
 
         It depends on the trained parameters only, and is valid until a parameter changes.
         """

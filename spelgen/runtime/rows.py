@@ -63,7 +63,7 @@ class Link(NamedTuple):
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # displacement of the link at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # motion of the link; None: type of `joint`
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: as `joint`
 
 
 class Function(NamedTuple):

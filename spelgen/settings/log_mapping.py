@@ -120,15 +120,15 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Periods or sign bits of the logged values of one joint, in logged units; default: values are plain numbers.
+    """Periods, or sign bits, of the logged signals of one joint, in logged units; default: values are plain numbers.
 
     A period is the interval after which logged values wrap around.
 
     Attributes:
-        q: Position.
-        qd: Velocity.
-        tau: Torque.
-        u: Commanded position.
+        q: Period or sign bit of positions.
+        qd: Period or sign bit of velocities.
+        tau: Period or sign bit of torques.
+        u: Period or sign bit of commanded positions.
     """
 
     q: Positive | None = None
@@ -141,9 +141,9 @@ class JointDelays(Group):
     """Delays of the logged values of one joint relative to the other signals [s]; negative for early values.
 
     Attributes:
-        q: Position.
-        qd: Velocity.
-        tau: Torque, in addition to `torque_delay`.
+        q: Delay of positions.
+        qd: Delay of velocities.
+        tau: Delay of torques, in addition to `torque_delay`.
     """
 
     q: Delay = 0.0
@@ -293,7 +293,10 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with other names of columns. columns: {joint: {quantity: name of the column}}."""
+        """Return the mapping with other names of columns.
+
+        columns: {joint: {quantity: name of the column}}; None: the name in `columns` for all joints.
+        """
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -320,16 +323,16 @@ class LogMapping(Group):
 
         `input` and `accept` are unchanged. The positions of a joint with a period have the period of one turn.
         """
-        # A file that spelgen writes may also contain positions that wrap around after one turn. Joints with a period of
-        # positions therefore have a period in the new mapping.
+        # Positions of a joint that wrap around in the log may also wrap around, after one turn, in a file that spelgen
+        # writes. If this mapping has a period for the positions of a joint, the new mapping therefore has one, too.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
         """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
 
-        At a period logged values wrap. Both are in the unit of the log. key: name of the setting. quantity: "q", "qd",
-        "tau" or "u".
+        The result is in the unit of the log. key: name of the setting; a period is the interval after which logged
+        values wrap around. quantity: "q", "qd", "tau" or "u".
         """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size

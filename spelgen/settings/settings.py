@@ -160,7 +160,8 @@ class Settings(Group):
         # `tip` and `moving_joints` both determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
-        # Motor torques and couplings are settings of logged torques, and logs of position servos have no torques.
+        # `torque: motor` and couplings describe logged torques. Logs of position servos have none, so that one of the
+        # settings must be wrong.
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would be driven by two different sets of motors.

@@ -80,9 +80,10 @@ class PublishedFigures(Group):
     Attributes:
         parameters: Number of trained parameters.
         step_seconds: Duration of a training step on the authors' machine [s].
-        train_loss: Squared error of predicted training windows, summed over the joints.
-        test_loss: Squared error of predicted test windows, summed over the joints.
-        prediction_loss: Squared error of long predictions, summed over the joints.
+        train_loss: Mean squared errors of q and of qd in predicted training windows, summed over the joints, in rad, m
+            and s.
+        test_loss: Error as in `train_loss`, for predicted test windows.
+        prediction_loss: Error as in `train_loss`, for predictions over 1 s.
         velocity: Mean squared error of the velocity over 1 s, summed over the joints.
         position: Mean squared error of the position over 1 s, summed over the joints.
     """

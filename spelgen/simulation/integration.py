@@ -66,6 +66,6 @@ def rollout(
 
 
 def _stuck(t: float, failure: str) -> RunError:
-    """Return the error for an integration that failed at time t [s]."""
+    """Return the error for an integration that failed at time t [s]. failure: reason of the failure."""
     cure = "check the inertials; make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
     return RunError(f"the motion cannot be integrated beyond t = {t:g} s: {failure}", do=cure)

@@ -97,8 +97,9 @@ def record(
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    with the position error e = q* - q. At a joint with viscous > M_jj omega, where friction would slow the decay of e
-    down, the torque viscous omega e is added.
+    with the position error e = q* - q, and h: Coriolis, centrifugal and gravity torques. Friction is compensated at the
+    desired velocity only, so the viscous friction D e' of a joint remains as additional damping. If D > M_jj omega, it
+    would dominate and slow the decay of e down: the torque D omega e is added, which gives the time constant 1 / omega.
 
     Args:
         dynamics: The arm, with friction.

@@ -1,11 +1,14 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-A_k and B_j are constant matrices, c_k constants and f_j functions of q. U is the span of all changes M(q) - M(q'), and
-W the span of all M(q). A linear functional of M is a weighted sum of the entries of M. It depends only on the joints in
-a set J if and only if it vanishes on all changes of M caused by joints outside J. The functions f_j are functionals
-of M. They are selected greedily: sets of joints close to the tip first, small sets before large ones, single entries of
-M before sums of entries. The sets of linearly independent functionals form a matroid, for which the greedy selection is
-optimal.
+A_k and B_j are constant matrices, c_k constants and f_j functions of q. Each f_j is a linear functional of M: a
+weighted sum of the entries of M. A functional depends only on the joints in a set J if and only if it vanishes on all
+changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
+all changes.
+
+The f_j are selected greedily. The sets J are tried in the order of their joint closest to the root, joints at the tip
+first, and sets with the same such joint in the order of their size. For each set, single entries of M are tried before
+sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
+selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -73,7 +76,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     values = np.array([r.values for r in functionals]).reshape(-1, entries)
     # The rows of R, (m, entries), are the coefficients of the functionals f_j; the rows of U, (m, entries), are a basis
     # of the changes of M. The matrices B_j are the rows of B = (U R^T)^-1 U. Then R B^T is the identity: the functional
-    # f_j has the value 1 for B_j, and 0 for all other matrices.
+    # f_j has the value 1 for B_j, and 0 for each B_i with i other than j.
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
@@ -85,8 +88,9 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     # `constant_values`, (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    # The entry of M at each pivot of the row reduction defines a constant c_k. Row reduction places pivots in the first
-    # possible columns, so the entries of M are sorted: entries that depend on the smallest number of joints are first.
+    # Row reduction gives a basis of this span; the entry of M at the pivot of row k defines the constant c_k. Entries
+    # that depend on few joints give short formulas for c_k. They are sorted first, since row reduction places pivots in
+    # the first possible columns.
     order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -110,7 +114,10 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield the functions f_j: linearly independent functionals of M that together determine every change of M."""
+    """Yield the functions f_j (see the module): independent functionals of M that determine every change of M.
+
+    spans: samples of M and the spans of its changes.
+    """
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
@@ -162,9 +169,10 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of the m functionals that vanish on all changes of M caused by other joints, (m, entries).
-        bound: indices of the entries of M at the pivots of an echelon basis of these changes. Outside of `bound`, a row
-            of `kernel` has a single nonzero element, which is 1.
+        kernel: (m, entries), coefficients of a basis of the functionals that vanish on all changes of M caused by other
+            joints. Each row has the coefficient 1 for one entry of M that is not in `bound`; its other nonzero
+            coefficients belong to entries in `bound`.
+        bound: indices of the entries of M that are pivots of an echelon basis of these changes.
         tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """
@@ -179,7 +187,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # `entry` is the only entry of M outside `bound` at which the row of `kernel` is not zero; it is 1 there.
+        # The functional is M at `entry`, the only entry outside `bound`, minus the combination of the entries in
+        # `bound` that other joints change equally. `coefficients` are the coefficients of this combination in double
+        # precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0

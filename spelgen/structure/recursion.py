@@ -90,7 +90,7 @@ def energies(
     Args:
         arm: the arm.
         positions: position of each coordinate.
-        inertias: ten inertial parameters (m, h, I) of each body, in the order of ``Body.inertia``.
+        inertias: mass, first moment and inertia (10 numbers) of each body, in the order of ``Body.inertia``.
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
     """
     transforms = _joint_transforms(arm, positions, number)
@@ -131,8 +131,9 @@ def coefficients(
 ) -> list[Element]:
     """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
 
-    The recursion computes with vectors of 10 B numbers in place of numbers: since M and V are linear in the inertial
-    parameters, an entry for unit vectors as inertial parameters is its row of coefficients.
+    M is the mass matrix, V the potential energy. The recursion computes with vectors of 10 B numbers in place of
+    numbers: since M and V are linear in the inertial parameters, each entry becomes the row of its coefficients if unit
+    vector k replaces the inertial parameter k.
 
     Args:
         arm: the arm.
@@ -255,7 +256,7 @@ def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
     from the moving frame to the frame at q = 0.
     """
     s, c, _ = transform.rotation[1]
-    # The rotation of a prismatic joint is the identity, which consists of integers.
+    # The rotation of a prismatic joint is the identity, the only one that consists of integers: no rotation is needed.
     if isinstance(c, int):
         return _translated(transform.translation, inertia)
     hx, hy, hz = inertia.moment

@@ -23,8 +23,8 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    Index 0 of the first axis has random positions; the positions of index 1 + k differ from index 0 in coordinate k
-    only (see the module's docstring).
+    M is the mass matrix, V the potential energy. Index 0 of the first axis has random positions; the positions of index
+    1 + k differ from index 0 in coordinate k only (see the module's docstring).
 
     Args:
         arm: the arm, with n coordinates.
@@ -140,8 +140,8 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 class Spans:
     """Linear spans of M and of its changes, in the prime field, from which the structure of an arm is derived.
 
-    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_k the span
-    of the changes of M if only coordinate k moves, and U the sum of all T_k. A basis has a row per dimension.
+    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_i the span
+    of the changes of M if only coordinate i moves, and U the sum of all T_i. A basis has a row per dimension.
 
     Attributes:
         n: Number of coordinates.
@@ -150,7 +150,7 @@ class Spans:
         potential_changes: Whether V depends on each coordinate.
         entry_joints: Set of the joints on which an entry of M depends, for each entry.
         order: Order in which entries of M are eliminated: entries that depend on many joints first.
-        change_bases: Echelon basis of each T_k, (dim T_k, entries), with the entries in the order ``order``.
+        change_bases: Echelon basis of each T_i, (dim T_i, entries), with the entries in the order ``order``.
         varying: Basis of U, (dim U, entries).
         floats: Samples of M in double precision, (1 + n, 2 S, entries). They determine the values of nonzero
             coefficients; zeros and ranks are determined in the prime field.
@@ -181,7 +181,7 @@ class Spans:
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        Joints are in increasing order; each has as many samples as ``floats`` has positions, 2 S.
+        Joints are in increasing order. Each joint has 2 S samples, one for each position of ``floats``.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])

@@ -3,7 +3,8 @@
 For each joint with a position servo, kp (u - q) = kd qd + armature qdd + dry sgn(qd) + Y(q, qd, qdd) pi, with logged
 position q and command u, dry friction torque `dry`, torque regressor Y and inertial parameters pi. The equations are
 linear and homogeneous in kp, kd, armature, dry and pi: logs determine these parameters up to the null space of the
-system of equations. The ratio of a parameter to kp is identifiable if both change by the same factor in the null space.
+system of equations. The ratio of a parameter to kp is identifiable if every vector of the null space changes both by
+the same factor.
 """
 
 from typing import NamedTuple
@@ -58,8 +59,8 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Two relative changes of parameters count as equal if they differ by less than `equal`. Null vectors have
-    # rounding errors about a thousand times larger than the matrix.
+    # [1] Two relative changes of parameters count as equal if they differ by less than `equal`. Rounding errors of the
+    # null vectors are about a thousand times larger than rounding errors of the system matrix.
     equal, kp = 1e-6, changes[:, :1]
     # `same`, (n, n): True for two joints whose kp change by the same factor in the whole null space.
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal

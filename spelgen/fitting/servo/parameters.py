@@ -123,7 +123,10 @@ class ParameterMap:
             self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> Tensor:
-        """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior."""
+        """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior.
+
+        They depend on ``x.active``: a parameter that is not fitted has a variance of practically zero.
+        """
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2

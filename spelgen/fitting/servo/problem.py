@@ -5,9 +5,10 @@ The cost is the negative log posterior of x, except for a constant,
     sum over joints and samples of 2 log(1 + (error / scale)^2 / 4) / samples_per_error + (x - m)^T P (x - m) / 2.
 
 The first term is a Student-t likelihood with three degrees of freedom, which bounds the influence of windows in which
-the arm is blocked, for example by a table. Each joint has one scale. Errors of neighbouring samples are correlated:
-samples_per_error samples count as one independent error. The second term is a Gaussian prior with mean m and precision
-P.
+the arm is blocked, for example by a table. Each joint has one scale, the standard deviation of the Gaussian that
+approximates the likelihood for small errors: sqrt(3) / 2 times the scale in the standard form of the t distribution.
+Errors of neighbouring samples are correlated: samples_per_error samples count as one independent error. The second term
+is a Gaussian prior with mean m and precision P.
 """
 
 from __future__ import annotations
@@ -169,8 +170,9 @@ class ServoProblem:
         curvature = torch.zeros(count, p * n + r, p * n + r).double()
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
-            # The errors of a joint depend only on its p parameters and on the r parameters that all joints share.
-            # `jacobian` has the derivatives of its K' errors in each window, (W, p + r, K').
+            # The errors of a joint depend only on its p parameters and on the parameters that all joints share: the
+            # coordinates of the bodies and the delay, r in total here. `jacobian` has the derivatives of its K' errors
+            # in each window, (W, p + r, K').
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]

@@ -139,10 +139,12 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
     """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
 
+    Dry friction depends on velocity and gravity torque, and is averaged over samples (`sliding_friction`).
+
     Args:
         model: model with position servos.
-        qd: velocities, (..., n) [rad/s, m/s].
-        gravity: gravity torques, (..., n) [Nm, N].
+        qd: velocities of the samples, (..., n) [rad/s, m/s].
+        gravity: gravity torques of the samples, (..., n) [Nm, N].
     """
     servo, kp = model.servo, model.servo.kp()
     dry = sliding_friction(model.friction, qd, gravity) / kp
@@ -189,9 +191,10 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    The ratios are kd / kp, armature / kp and friction / kp, each with its 95 % interval. The key
-    "determined" of a ratio is True if the upper end of its interval is below `ServoTuning.max_factor` times the ratio.
-    For dry friction and the dead zone, the logs must also distinguish one from the other (see `identifiable`).
+    The ratios are the keys of `RATIOS`, each with its 95 % interval. The key "determined" of a ratio is True if the
+    upper end of its interval is below `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the
+    logs must also distinguish one from the other (see `identifiable`). x: fitted parameters. steps: number of
+    Levenberg-Marquardt steps of the fit.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -211,7 +214,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            # A dead zone of zero was not selected at this joint, so it has no interval.
+            # If no dead zone was selected at this joint, it is zero and has no interval.
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
@@ -249,10 +252,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
-                # undetermined and in the list.
-                if column != "dead_zone":
-                    undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
+                undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     end = "All ratios are determined"

@@ -20,8 +20,9 @@ class ServoRollouts:
     """Rollouts of windows, in which each joint is integrated independently of the other joints.
 
     The joints are coupled only by the load of the bodies (gravity, inertia, Coriolis forces). Here, this load is
-    computed along a fixed motion instead of the predicted motion: once for parameters x0, and for other parameters x
-    with the term regressor (phi(x) - phi(x0)), where phi(x) (10 B,) are the inertial parameters of B bodies.
+    computed along a fixed motion instead of the predicted motion, once for parameters x0. For other parameters x, the
+    term regressor (phi(x) - phi(x0)) is added to it, where phi(x) (10 B,) are the inertial parameters of B bodies, and
+    the regressor is evaluated along the fixed motion.
 
     Since the joints are independent, one rollout with a parameter changed at all joints gives the derivatives of all
     joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
@@ -55,7 +56,10 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts with ``motion`` as the fixed motion and x as x0; the model's parameters are set to x."""
+        """Return the rollouts with the load computed along ``motion`` (the fixed motion) for parameters x (the new x0).
+
+        The model's parameters are set to x.
+        """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -65,10 +69,11 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions, and velocities and accelerations from the rollouts with parameters x.
+        """Return the measured positions, with velocities and accelerations that use rollouts with the parameters x.
 
-        The velocities and accelerations are the predicted ones, plus smoothed derivatives of measured minus predicted
-        positions (see `ServoWindows.motion`).
+        Velocities and accelerations are the derivatives of the predicted positions plus smoothed derivatives of the
+        differences, measured minus predicted positions: smoothed derivatives of the measured positions only would
+        attenuate fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

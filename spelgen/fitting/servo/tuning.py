@@ -119,8 +119,9 @@ class ServoTuning:
     # [1] Largest ratio between the initial and the nominal kp, or between the nominal and the initial kp, for which kp
     # is computed from the coefficient of gravity.
     kp_range: float = 20.0
-    # [1] Smallest initial dry friction, as a fraction of nominal friction. The square and the cube of this number are
-    # the smallest initial kd/kp [s] and armature/kp [s^2]. All three are positive, since their logarithms are fitted.
+    # [1] Smallest initial dry friction, as a fraction of nominal friction. The smallest initial kd/kp, 0.05^2 s, and
+    # armature/kp, 0.05^3 s^2, are computed from this number, too: 5 % of 0.05 s (`ModelTuning.servo_lag`) and of 1 /
+    # (20 rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
     min_friction: float = 0.05
     # [s] Largest delay of linear servos.
     max_delay: float = 0.4

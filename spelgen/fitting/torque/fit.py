@@ -51,10 +51,10 @@ class FitComparison(NamedTuple):
         fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
             joints.
         behind: True if the regression is significantly better than the fit.
-        replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
-            initial guess is the regression; otherwise None.
-        discarded: the error of the fit, if the logs do not support a fit and the model before the fit has no larger
-            error; otherwise None. `fit` is then the error of the model before the fit, which is the result.
+        replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
+            regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
+        discarded: None if the result is a fit. Otherwise the result is the model before the fit, since the logs do not
+            support a fit: `fit` is the error of this model, and `discarded` the error of the fit, which is not smaller.
     """
 
     fit: float
@@ -134,7 +134,7 @@ def fit_torque(
         # With `adapt`, motor gains and friction of the model are results of an earlier fit and not nominal values, so
         # they are not changed.
         subset = samples.subsampled(TUNING.initial_samples)
-        set_initial_gains(model, subset, prior.gains)
+        prior = prior.model_copy(update={"gains": set_initial_gains(model, subset, prior.gains)})
         limit_friction(model, subset.columns)
         fitted, comparison = _compared_fit(model, samples, prior)
     else:
@@ -168,7 +168,8 @@ def _staged_fit(
 ) -> _StagedFit:
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
-    max_error: (n,), see `TorqueProblem`.
+    adapt, max_error: purpose of the fit, and upper bound of the root mean square torque error, (n,) [Nm, N] (see
+    `TorqueProblem`). prior: standard deviations of the prior.
     """
     jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
     estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)

@@ -126,8 +126,8 @@ class TorqueJacobian:
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
         """Return the initial divided by the current motor gain of each joint, (..., n) [1]; 1 for fixed gains.
 
-        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`:
-        {name: values}, or values of a batch (...) of sets.
+        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`.
+        parameters: {name: values} of one set of parameters, or of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
         # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
@@ -235,11 +235,12 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the parameters (K,) after a step (K,) from x, along a curved line: a candidate of the solver.
+        """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The line is straight in the inertial parameters and in the friction coefficients, since the torque is linear in
-        them. `step_in_inertial_parameters` updates the inertial parameters. x contains the logarithm of each friction
-        coefficient c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
+        The torque is linear in inertial parameters, armatures and friction coefficients, so the curve is straight in
+        these quantities. x contains log-Cholesky parameters of bodies (see `step_in_inertial_parameters`), and the
+        logarithms of armatures and friction coefficients: a step s > 0 of log c changes c to c (1 + s). The exception
+        is a step s < 0, which changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
@@ -298,7 +299,8 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: gravity torque on the drives, (T, n); None: it is computed from the parameters.
+        block: T samples with their regressors. load: gravity torque on the drives, (T, n); None: it is computed from
+        the parameters.
         """
         samples = block.samples
 
@@ -318,12 +320,16 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
-        have the same colour. A drive then acts on at most one joint of a colour, so that each parameter of a drive, and
-        each gravity torque on a drive, affects at most one joint of a colour. Therefore the gradient of the sum of the
-        torques of one colour contains the Jacobian rows of all joints of this colour. One reverse pass per colour (most
-        arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
-        the gradients of all samples.
+        The rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
+        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
+        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
+        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
+        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
+        pass gives the derivatives of all samples.
+
+        Args:
+            parameters: {name: values}, the parameters at which the derivatives are computed.
+            block: T samples with their regressors.
 
         Returns:
             The scaled residual, (T, n) [Nm, N].

@@ -36,12 +36,13 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
-    """A residual term of one joint, as a linear model of P = L + W weights on T samples.
+    """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries for the joint, for example spline coefficients; the parameter in the model is the entries
-    divided by `scale`. The last W weights of the linear model are changes of single entries. The first L weights are
-    coefficients of trends: the mean and the slope of all spline coefficients.
+    The term has W entries, for example the spline coefficients of the joint. For the weights w (P,), the entries are
+    trends @ w[:L] + w[L:]. The L trends, for example mean and slope of the spline coefficients, change all entries
+    together.
 
+    scale: the parameter of the model is entries / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
@@ -209,7 +210,8 @@ def joint_functions(
     extrapolates to positions without samples (torque of a spring). Ripple has one precision per frequency, and only
     frequencies of which the samples contain two periods: slower ones fit a trend, and are wrong at other positions.
 
-    selected: (parameter, joint) of the terms to yield; None: all.
+    projection: projection onto the rigid-body and friction model. selected: (parameter, joint) of the terms to yield;
+    None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():

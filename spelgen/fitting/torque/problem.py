@@ -50,8 +50,8 @@ class NoiseEstimator:
 
     s^2 is the mean squared residual times the correlation length. The sum over all samples of residual^2 / s^2 is then
     the number of independent errors instead of the number of samples. correlation_length: (n,), number of correlated
-    samples that count as one independent error. torque_std: (n,) [Nm, N], standard deviation of the torque. max_error:
-    (n,) [Nm, N], largest root mean square torque error.
+    samples that count as one independent error. The root mean square residual is limited: below by a fraction of
+    torque_std (n,) [Nm, N], the standard deviation of the torque, and above by max_error (n,) [Nm, N].
     """
 
     count: int
@@ -63,7 +63,10 @@ class NoiseEstimator:
     def of(
         cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor = UNBOUNDED
     ) -> NoiseEstimator:
-        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
+        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors.
+
+        max_error: upper bound of the root mean square residual, (n,) [Nm, N].
+        """
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
         # torque.
@@ -110,9 +113,12 @@ class TorqueProblem:
     """Negative log posterior of K parameters x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     Attributes:
+        jacobian: torque residual and its derivatives with respect to x, on T samples.
         noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
             `NoiseEstimator`).
-        adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
+        prior: prior of x.
+        adapt: purpose of the fit, which determines the estimated parameters: "load" (last body), "friction" (friction
+            and torque offsets), "unit" (all, for another arm of the same type) or None (all).
         compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
         correlation_time: (n,) [s], correlation time of the torque errors.
         max_error: (n,) [Nm, N], upper bound of the root mean square torque error, for example the held-out error of
@@ -138,7 +144,8 @@ class TorqueProblem:
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
-        widths: initial standard deviations of the prior. The initial noise is the upper bound of the noise.
+        widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
+        root mean square torque error (see the class). The initial noise is the upper bound of the noise.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -166,9 +173,9 @@ class TorqueProblem:
         """Return the problem with the noise that is estimated from the residual of unconstrained least squares.
 
         The torque is linearized at x (K,) and fitted by least squares in the inertial, drive and friction parameters,
-        without a prior and without physical consistency of the bodies. If friction were linear in its parameters, no x
-        could have a smaller residual, so this noise is a lower bound. Noise estimated from the residual of a poor
-        initial guess would be too large, and the fit would stop early.
+        without a prior and without physical consistency of the bodies. The torque is linear in these parameters except
+        for some of friction, so that no x has a much smaller residual: this noise is approximately a lower bound. Noise
+        estimated from the residual of a poor initial guess would be too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
@@ -192,7 +199,10 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters.
+
+        residual: result of `residual`, (n,), which is not used: the residual of each sample is computed here.
+        """
         # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
         # computed first, and the rows and columns of the free ones are selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
@@ -269,7 +279,7 @@ class TorqueEstimate:
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
 
-        The squared residual is recomputed with the model's current choice of the friction state per joint.
+        The squared residual is recomputed with the current friction model of each joint: with or without bristles.
         """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
@@ -291,8 +301,8 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # noise^2 / (correlation length) is the mean squared residual (see `NoiseEstimator`), which does not depend on
-        # the sample interval.
+        # noise^2 is defined as the mean squared residual times the correlation length (see `NoiseEstimator`). The mean
+        # squared residual does not depend on the sample interval, so noise^2 is proportional to the correlation length.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -300,8 +310,8 @@ class TorqueEstimate:
         """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
         The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
-        posterior covariance of the parameters must be current (see `with_current_covariance`): with the covariance for
-        a larger noise, this part would be too large.
+        posterior covariance of the parameters must be current (see `with_current_covariance`): the absorbed part is
+        proportional to it, and a covariance for a larger noise would be too large.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -355,8 +365,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the weight of the estimated correlation time, if the weight of its prior mean is 1: a ratio of numbers
-    # of independent errors.
+    # The prior mean has the weight 1, and the estimated correlation time has `weight`: the number of independent errors
+    # in the samples divided by the number to which the prior mean is equivalent.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

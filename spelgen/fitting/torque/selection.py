@@ -2,17 +2,17 @@
 
 Several recordings are held out one at a time, or in groups if there are more than ten. A single recording is divided
 into ten contiguous blocks, which are held out one at a time, with a gap on both sides, since successive errors are
-correlated. A candidate must pass three tests:
+correlated. Every sample is held out once and then has a held-out error. A candidate must pass three tests:
 
-- The mean relative error reduction over ten blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two
-  recordings).
+- The relative reduction of the held-out squared error is significant (one-sided t test over ten contiguous blocks of
+  all samples, 1 %, or 0.1 % for one or two recordings).
 - Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
   repeats errors that another motion does not have.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).
 
-If no candidate of a joint passes, the first two tests use only the held-out samples whose positions are within the
-range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the
-largest error reduction is selected.
+If no candidate of a joint passes, the tests are repeated without the samples whose positions are outside the range of
+the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the largest
+error reduction is selected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -106,7 +106,8 @@ def select_functions(
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
     # With two recordings, each of two fits predicts half of the ten blocks, so the errors of the blocks are not
-    # independent. The stricter test is then used, as for a single recording.
+    # independent. As for a single recording, a candidate must then pass the test with `standard_errors_of_one`, and its
+    # torque is bounded.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -118,8 +119,8 @@ def select_functions(
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
 
-    The bounds apply to terms that are selected on one or two recordings. The bound of a smooth torque is zero for
-    joints without gravity load, since springs and gas cylinders balance a load.
+    The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
+    torque splines is zero for joints without gravity load, since the springs that they represent balance a load.
 
     Args:
         model: fitted model.
@@ -177,8 +178,8 @@ def _best(
                 best[index] = _better(
                     best[index], SelectedTerm(candidate.parameter, candidate.joint, reduction)
                 )
-    # A candidate that passes the tests on all held-out samples is preferred, since it also predicts the torque at
-    # positions outside the fitted range.
+    # `best`: the best candidate in tests on all held-out samples, and the best in tests on held-out samples within the
+    # fitted range of positions. The first is preferred, since it also predicts the torque outside this range.
     return best[0] or best[1]
 
 
@@ -259,8 +260,8 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # If a term halves the squared error of one block and doubles the squared error of another, the relative reductions
-    # g of these blocks add up to zero.
+    # g is used because it is symmetric: if a term halves the squared error of one block and doubles the squared error
+    # of another, their values of g add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:

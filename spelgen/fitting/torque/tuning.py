@@ -21,8 +21,8 @@ DAY_TO_DAY = {
 class TorqueTuning:
     """Constants of fits of rigid-body models to torques (`fitting.torque`)."""
 
-    # [1] Only every second sample is used. After the low-pass filter at 8 Hz, 50 of 100 samples per second contain all
-    # information.
+    # [1] Only every second sample is used. Samples have a common rate of 100 Hz; after the low-pass filter at 8 Hz, 50
+    # samples per second contain all information.
     decimation: int = 2
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
