@@ -35,6 +35,10 @@ class BristleReach:
         """Number of bristles per drive, K."""
         return int(self.values.shape[1])
 
+    def of_drives(self, joints: np.ndarray) -> np.ndarray:
+        """Return positions, displacements or velocities of the drives, (..., n), for those of the joints, (..., n)."""
+        return joints if self.motors is None else joints @ self.motors.T
+
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
@@ -76,9 +80,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     q. After a reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is
     over reversals, not over samples.
     """
-    path = encoded(q)
-    if bristles.motors is not None:
-        path = path @ bristles.motors.T
+    path = bristles.of_drives(encoded(q))
     z = np.empty((*q.shape, bristles.elements))
     for drive, (positions, reach) in enumerate(zip(path.T, bristles.values, strict=True)):
         steps = np.diff(positions)
@@ -106,7 +108,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     if bristles.smoothing_velocity is None:
         return None
     # The smooth sign must be equal to the smooth sign of `runtime.friction_laws`, which the trained model uses.
-    speed = qd if bristles.motors is None else qd @ bristles.motors.T
+    speed = bristles.of_drives(qd)
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
 

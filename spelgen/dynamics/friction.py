@@ -40,7 +40,7 @@ class DriveFriction:
     smoothing_velocity: float
     speeds: np.ndarray | None = None
 
-    def __call__(self, qd: np.ndarray) -> np.ndarray:
+    def __call__(self, qd: np.ndarray, direction: np.ndarray | None = None) -> np.ndarray:
         """Return the friction torque of the joints, (..., n) [Nm, N], at joint velocities qd, (..., n) [rad/s, m/s].
 
         The torque is C^T times the torque of the drives, which depends on their velocities v = C qd:
@@ -49,19 +49,13 @@ class DriveFriction:
 
         The last two terms tend to `forward` and `backward` for large |v|. The torque is smooth, 0 at rest, and
         dissipative: the torque of a drive times its velocity is not negative.
+
+        direction: factor s of the dry friction of each drive, from -1 to 1, (..., n), if it is a function of the
+        friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
-        return self.torque(qd, np.tanh(v / self.smoothing_velocity))
-
-    def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the friction torque of the joints, (..., n) [Nm, N], with a given factor of dry friction.
-
-        Args:
-            qd: joint velocities, (..., n) [rad/s, m/s].
-            direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity)
-                with the velocity v of the drive, or a function of the friction state.
-        """
-        v = qd if self.speeds is None else qd @ self.speeds.T
+        if direction is None:
+            direction = np.tanh(v / self.smoothing_velocity)
         # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)

@@ -78,10 +78,7 @@ class PinocchioDynamics:
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
-        upper = np.triu(self._batched(pin.crba, self.configuration(q)))
-        # Pinocchio guarantees only the upper triangle of M, which is copied to the lower one.
-        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)
-        return np.asarray(self.jacobian.T @ joints @ self.jacobian)
+        return np.asarray(self.jacobian.T @ self._batched(pin.crba, self.configuration(q)) @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
@@ -128,14 +125,10 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # Planar and floating joints are not coordinates: they remain at Pinocchio's neutral configuration.
-        configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
-        for joint in self.model.joints[1:]:
-            position = q[..., joint.idx_v]
-            if joint.nq <= 2:  # Pinocchio represents a continuous joint by (cos q, sin q).
-                values = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
-                configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
-        return configuration
+        # Pinocchio represents a continuous joint by (cos q, sin q). Planar and floating joints are not coordinates and
+        # remain at the neutral configuration.
+        neutral = pin.neutral(self.model)
+        return self._batched(lambda model, _, position: pin.integrate(model, neutral, position), q)
 
     def _batched(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
         """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.

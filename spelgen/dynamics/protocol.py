@@ -176,11 +176,10 @@ class VelocityState:
         return p
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
+        self, q: Tensor, p: Tensor, tau: Tensor, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; p is the velocity qd."""
-        past = known_past(self.dynamics, z)
-        return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
+        return p, self.dynamics.forward_dynamics(q, p, tau, *known_past(self.dynamics, z))
 
 
 def integrable(dynamics: RigidDynamics) -> Any:

@@ -6,7 +6,8 @@ and are linearised at the start of a step (Rosenbrock method with the weights of
 Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step from its duration x in units of the time
 constant of decay: it is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for
 the step. The computed decay is then exact to third order in x (exponential fitting; Liniger and Willoughby, SIAM J.
-Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step.
+Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step. It
+is (K, ..., n) for K bristles per joint, in states as in `ServoDrives`.
 """
 
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.bristles import moved_bristles
+from spelgen.dynamics.prepared import State
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.motors import ServoConstants, beyond
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
@@ -33,17 +35,6 @@ class ServoDrives(NamedTuple):
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
     steepness: Tensor  # stiffness of a bristle / magnitude of dry friction, (K, ..., n) [1/rad, 1/m]
-
-
-class ServoState(NamedTuple):
-    """State of an arm: positions q and velocities qd, (..., n), and friction state z, (K, ..., n) [rad, m].
-
-    z has the deflections of K bristles per joint.
-    """
-
-    q: Tensor
-    qd: Tensor
-    z: Tensor
 
 
 class Load(NamedTuple):
@@ -77,7 +68,7 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
-def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
+def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> State:
     """Return the initial state of a rollout: q, qd, and the friction state that balances all other torques.
 
     The acceleration is then zero, as for an arm at rest or in steady motion. All bristles of a joint are deflected by
@@ -96,10 +87,10 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
     excess = torque - load.bias - drives.friction.viscosity(qd) * qd
     direction = (excess / drives.friction.dry(qd, load.gravity)).clamp(-1.0, 1.0)
-    return ServoState(q, qd, direction * drives.reach)
+    return State(q, qd, direction * drives.reach)
 
 
-def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
+def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor) -> State:
     """Return the state after one implicit step (see the module's docstring).
 
     Args:
@@ -145,7 +136,7 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
             velocity = slipped(momentum - coupling, inertia + damping, bristle_stiffness, bent, reach)
     displacement = h * velocity
     qd = qd + (velocity - qd) / theta
-    return ServoState(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
+    return State(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
 
 
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:

@@ -80,12 +80,10 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
 
     first = last = Frame(root, Link(root), Joint())
     for joint in path:
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", joint.rpy).as_matrix())
-        pose[:3, 3] = torch.tensor(joint.xyz, dtype=torch.float64)
         kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
         axis = torch.tensor(joint.axis, dtype=torch.float64)
-        offset = pk.Transform3d(matrix=pose[None].to(dtype), dtype=dtype)
+        rotation = Rotation.from_euler("xyz", joint.rpy).as_matrix()
+        offset = pk.Transform3d(rot=rotation, pos=joint.xyz, dtype=dtype)
         frame = Frame(
             joint.child, Link(joint.child), Joint(joint.name, offset, kind, axis / axis.norm(), dtype)
         )

@@ -84,13 +84,14 @@ def model_parts(spec: ModelSpec) -> ModelParts:
 
 
 def _inputs(spec: ModelSpec) -> Call:
-    n = range(len(spec.joints))
-    values = {(x.joint, x.motor): x.value for x in spec.inputs}
-    matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # `mask` is True for gains (entries of G) that are trained; known gear ratios are constants.
-    trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
-    mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    return call("MotorInputs", matrix, **_without_defaults({"trained": mask}, trained=not trained))
+    n = len(spec.joints)
+    # `is_trained` is True for gains (entries of G) that are trained; known gear ratios are constants.
+    gains, is_trained = np.zeros((n, n)), np.zeros((n, n), dtype=bool)
+    for entry in spec.inputs:
+        gains[entry.joint, entry.motor] = entry.value
+        is_trained[entry.joint, entry.motor] = entry.trained
+    masks = {"trained": tuple(map(tuple, is_trained.tolist()))} if is_trained.any() else {}
+    return call("MotorInputs", tuple(map(tuple, gains.tolist())), **masks)
 
 
 def base_class(spec: ModelSpec) -> str:
@@ -340,4 +341,4 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     for output in outputs:
         for row, column, value in output.basis:
             mean[row, column] += output.mean * value
-    return np.array([[rounded(value) for value in row] for row in mean])
+    return np.vectorize(rounded)(mean)

@@ -95,17 +95,16 @@ def excite(
             f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
             f"{reach * fraction:.0%} of the ranges."
         )
-    first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
+    states = np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
         motion=motion,
         approach=to_motion,
         collisions=statement,
         parameters=len(criterion.columns),
-        first=criterion.condition(first),
+        first=criterion.condition(criterion.states(starts[0])),
         condition=criterion.condition(criterion.states(best)),
         efforts=criterion.largest_efforts(torch.from_numpy(states)),
-        first_efforts=criterion.largest_efforts(first),
     )
 
 

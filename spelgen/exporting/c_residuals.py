@@ -97,12 +97,10 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
         weight: weights of the layer, (outputs, inputs).
         bias: biases of the layer, (outputs,).
     """
-    spans = []
-    for column in weight.T:
-        nonzero = np.flatnonzero(column).tolist() or [0, -1]
-        spans.append((nonzero[0], nonzero[-1] + 1))
-    first, last = np.array(spans).T
-    packed = [column[slice(*span)] for column, span in zip(weight.T, spans, strict=True)]
+    is_used = weight != 0
+    first = is_used.argmax(axis=0)
+    last = np.where(is_used.any(axis=0), len(weight) - is_used[::-1].argmax(axis=0), 0)
+    packed = [column[a:b] for column, a, b in zip(weight.T, first, last, strict=True)]
     tables = {"bias": bias, "weight": np.concatenate(packed), "first": first, "last": last}
     return [_table(f"{name}_{key}", values) for key, values in tables.items()]
 

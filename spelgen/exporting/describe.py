@@ -62,16 +62,6 @@ class Trained:
         """
         return description.entry_points(self.described, self.entries)
 
-    @property
-    def tip(self) -> str:
-        """Name of the link that is the tip of the arm."""
-        return self.arm.tip or self.arm.robot.last_link(self.arm.chain.joint_names)
-
-    @property
-    def memory(self) -> int:
-        """Number of values in the friction state z of all joints; 0 for a model of networks."""
-        return self.model.n * self.model.elements
-
 
 def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
     """Return a trained model as NumPy arrays, from which C and CasADi code is generated.

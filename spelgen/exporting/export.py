@@ -9,7 +9,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
+from spelgen.exporting.exported import EXPORTERS, WITH_FLOAT32, WITH_FUNCTIONS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
@@ -60,22 +60,20 @@ def export(
         if trained.checkpoint.posterior:
             intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
-    exporter = EXPORTERS[to]
-    if entries and not exporter.choice:
-        formats = [name for name, row in EXPORTERS.items() if row.choice]
-        raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
-    if float32 and not exporter.float32:
-        formats = [name for name, row in EXPORTERS.items() if row.float32]
-        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(formats)}; C has -DNAME_FLOAT")
+    if entries and to not in WITH_FUNCTIONS:
+        raise RunError(
+            f"functions for --to {to}", expected=f"--to {listed(WITH_FUNCTIONS)}, which have a choice"
+        )
+    if float32 and to not in WITH_FLOAT32:
+        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(WITH_FLOAT32)}; C has -DNAME_FLOAT")
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # The exporter is imported here, because packages of other formats may not be installed.
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
-        Trained(trained, arm, tuple(entries), intervals, float32, levels)
-    )
+    export_model = pkgutil.resolve_name(f"spelgen.exporting.{to}_export:export_{to}")
+    exported: Exported = export_model(Trained(trained, arm, tuple(entries), intervals, float32, levels))
     if path is not None:
         exported.write(path, force=force)
     return exported

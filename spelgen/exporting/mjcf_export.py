@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -25,8 +26,8 @@ from spelgen.exporting.tuning import TUNING
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
-_SECTIONS = ("worldbody", "equality", "tendon", "actuator")
-_CONTACTS = {
+_SECTIONS = ("worldbody", "equality", "tendon", "actuator", "asset")
+_CONTACTS: dict[Literal["visual", "collision"], dict[str, str]] = {
     "visual": {"group": "2", "contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
@@ -168,7 +169,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     # MuJoCo's default unit of angles is degrees. With autolimits each given range is a limit.
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
-    world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
+    world, equality, tendons, actuators, assets = (etree.SubElement(root, tag) for tag in _SECTIONS)
     # `is_coupled`: motors whose speed depends on several joints; their inertia is the armature of a tendon, not of a
     # joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
@@ -202,10 +203,10 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         _add_motors(actuators, tendons, projection)
     else:
         _add_servos(actuators, arm.coordinates, projection.servos)
-    for section in (equality, tendons):
+    omitted = _add_shapes(assets, elements, projection.arm)
+    for section in (equality, tendons, assets):
         if not len(section):
             root.remove(section)
-    omitted = _add_shapes(root, elements, projection.arm)
     # The XML is indented, so that the file is readable.
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
@@ -270,24 +271,21 @@ def _add_tendon(
     return tendon
 
 
-def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
+def _add_shapes(assets: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
     """Add the visual and collision shapes of all links to an MJCF; return the names of links with omitted shapes.
 
     The names are separated by commas. A shape is omitted if it is flat or cannot be read.
 
     Args:
-        root: root element of the MJCF, to which meshes are added.
+        assets: element of the MJCF to which meshes are added.
         elements: elements of the world and of the bodies, in the order of the arm.
         arm: arm whose URDF has the shapes.
     """
     names = [link.name for link in arm.robot.links]
-    assets = etree.SubElement(root, "asset")
     omitted: dict[str, None] = {}
     poses = link_poses(arm)
     for kind, attributes in _CONTACTS.items():
-        shapes = link_shapes(
-            arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
-        )
+        shapes = link_shapes(arm.robot.path, kind, names, TUNING.faces)
         omitted |= dict.fromkeys(shapes.unread)
         for shape in shapes.shapes:
             if shape.mesh is not None and _is_flat(shape.mesh[0]):
@@ -298,8 +296,6 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
             form = _geom(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
             # Shapes have no mass, since the <inertial> of the body has the whole mass.
             _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
-    if not len(assets):
-        root.remove(assets)
     return ", ".join(omitted)
 
 

@@ -6,7 +6,7 @@ energy. CasADi omits operations with structural zeros, such as zeros of the geom
 of structural zeros, all operations with velocities are omitted.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -53,11 +53,13 @@ class RigidBodies:
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
         # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
-        self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
+        parameters = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
             # The ten parameters are mass, first moment (3), and the tensor's xx, xy, xz, yy, yz, zz.
             tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
-            self.inertias.append((ten[0], ten[1:4], tensor))
+            parameters.append((ten[0], ten[1:4], tensor))
+        # Per body, parents first: the body; mass, first moment (3, 1) and inertia tensor (3, 3); frame.
+        self._rows = list(zip(self.bodies, parameters, self.frames, strict=True))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
@@ -70,7 +72,7 @@ class RigidBodies:
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
             speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
@@ -110,7 +112,7 @@ class RigidBodies:
         # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
         momenta = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, v = twists[body.parent + 1]
             w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
             speed = _Z * (float(body.multiplier) * qd[body.coordinate])
@@ -127,10 +129,6 @@ class RigidBodies:
             momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
-
-    def _rows(self) -> Iterator[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
-        return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _accumulate(self, wrenches: list[Wrench]) -> None:
         """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
@@ -197,8 +195,4 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 def _rotation_about_z(angle: ca.SX) -> ca.SX:
     """Return the matrix of the rotation about z, (3, 3), by an angle, (1, 1) [rad]."""
     c, s = ca.cos(angle), ca.sin(angle)
-    rotation = ca.SX(3, 3)
-    rotation[0, 0] = rotation[1, 1] = c
-    rotation[1, 0], rotation[0, 1] = s, -s
-    rotation[2, 2] = 1
-    return rotation
+    return ca.diagcat(ca.blockcat([[c, -s], [s, c]]), 1)

@@ -206,9 +206,7 @@ class Estimator:
             # belong to the last body.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
-            decay = np.zeros(1)
-            if ahead <= TUNING.disturbance_ahead:
-                decay = np.exp(-ahead / self.levels.drift.time_constant)
+            decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:
                 # Errors of measured torques may make the external torque arbitrarily large. The compensation is limited

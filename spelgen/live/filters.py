@@ -16,6 +16,7 @@ over several samples.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -129,9 +130,9 @@ class LoadFilter:
     def predict(self, duration: float) -> None:
         """Replace the state x and its covariance P by their prediction after a time `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
-        decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
+        decay[-self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration
-        growth[10 + 2 * self.n :] = (1 - decay[10 + 2 * self.n :] ** 2) * self.disturbance
+        growth[-self.n :] = (1 - decay[-self.n :] ** 2) * self.disturbance
         self.x *= decay
         self.P = self.P * np.outer(decay, decay) + np.diag(growth)
         self.surprise = 0.0
@@ -286,7 +287,7 @@ class PayloadEstimate:
     def _rows(self, block: Block) -> Iterator[None]:
         for each in self.filters:
             each.predict(block.duration)
-        rows = [(each, joint) for each in self.filters for joint in range(len(block.y))]
+        rows = list(itertools.product(self.filters, range(len(block.y))))
         for number, (each, joint) in enumerate(rows, start=1):
             each.update(block, joint)
             if number == len(rows):

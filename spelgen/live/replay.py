@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -171,8 +171,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
         # The logs are processed as one recording with pauses. Each pause exceeds `TUNING.gap`, so that the estimator
         # resets the friction state.
         begin = float(t[-1]) + 2 * TUNING.gap
-        for _ in estimator.steps(t, log.q, log.qd, log.tau):
-            pass
+        estimator.replay(replace(log, t=t))
     return estimator.report()
 
 

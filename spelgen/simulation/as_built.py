@@ -161,8 +161,7 @@ def urdf_without(robot: Path, *tags: str) -> etree._Element:
     """Return the root element of a URDF or xacro file, without comments and without the elements named in `tags`."""
     root = read_document(robot).root
     etree.strip_tags(root, etree.Comment)
-    for element in list(root.iter(*tags)):
-        element.getparent().remove(element)
+    etree.strip_elements(root, *tags)
     return root
 
 
