@@ -138,9 +138,9 @@ class BodyChain(nn.Module):
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
 
-        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the returned
-        vector is the Coriolis, centrifugal and gravity torque at the joint of each body. ``ratios`` transposed
-        maps it to the n joints, to which mimic joints are coupled.
+        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the
+        returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body. ``ratios``
+        transposed maps it to the n joints, to which mimic joints are coupled.
 
         Args:
             cache: configuration cache at q.
