@@ -36,7 +36,7 @@ class BristleReach:
         return int(self.values.shape[1])
 
     def of_drives(self, joints: np.ndarray) -> np.ndarray:
-        """Return positions, displacements or velocities of the drives, (..., n), for those of the joints, (..., n)."""
+        """Return positions or velocities of the drives, (..., n), from positions or velocities of the joints."""
         return joints if self.motors is None else joints @ self.motors.T
 
 

@@ -341,4 +341,4 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     for output in outputs:
         for row, column, value in output.basis:
             mean[row, column] += output.mean * value
-    return np.vectorize(rounded)(mean)
+    return np.asarray(np.vectorize(rounded)(mean))

@@ -7,6 +7,7 @@ a module is found in its text, which is not executed.
 import ast
 import json
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -175,7 +176,10 @@ def _quoted(name: str) -> str:
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
     """Return the source of the tables ``JOINTS``, ``LINKS``, ...: one assignment each, after comments on its units."""
     statements = []
-    terms = {"FUNCTIONS": spec.outputs, "CONSTANTS": spec.constants}
+    terms: dict[str, Sequence[OutputSpec | ConstantSpec]] = {
+        "FUNCTIONS": spec.outputs,
+        "CONSTANTS": spec.constants,
+    }
     for name, rows in assembly.rows.items():
         lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
         for k, row in enumerate(rows):
