@@ -42,7 +42,8 @@ def kinds_of_faults(
     return (
         WrongOrder("joint-order", "the columns of other joints", (0, 1)),
         WrongOrder("torque-order", "the torques of other joints", (1,)),
-        # fewer starts for orders of only the motion: such logs are rare, and each order requires a new regressor
+        # exchanged columns of only the motion are searched from fewer initial orders: such logs are rare, and each
+        # order requires a new regressor
         WrongOrder("motion-order", "the positions and velocities of other joints", (0,), starts=3),
         JointSense(n),
         TorqueSense(n),
@@ -59,16 +60,17 @@ def kinds_of_faults(
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    The hypotheses have about the same cost, and the best one is first. If there is none, the result has only the fit of
-    the unchanged log. Kinds of faults with other evidence, such as a comparison of the torques with the URDF's gravity,
-    need no significant decrease of the cost. faults: kinds of faults; each kind and combinations are tested.
+    The hypotheses have about the same cost, and the best one is first. If no decrease is significant, the best
+    hypothesis with other evidence, such as a comparison of the torques with the URDF's gravity, is returned, too, if it
+    lowers the cost at all. Otherwise the result has only the fit of the unchanged log. faults: kinds of faults; each
+    kind and combinations are tested.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # At most three corrections are combined, where an order of all joints is one correction: more corrections could
-    # explain any log.
+    # At most three corrections are combined, where any permutation of the columns is one correction: more corrections
+    # could explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
         # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
@@ -78,8 +80,9 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
-        # To save time, orders of all joints and long drifts are searched only if no single correction explains the
-        # torques, or if the best one is a drift: the search from no delay may have found a drift of the wrong signals.
+        # To save time, permutations of all joints and long drifts of delays are searched only if no single correction
+        # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
+        # wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -112,10 +115,11 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    Let a be the decrease of the cost from `base` to a hypothesis without hysteresis, and b the decrease with
-    hysteresis. That residual does not hide a part of b, but b is larger for wrong hypotheses, too: on recorded arms up
-    to 32, and a up to 17. The new cost is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay
-    than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a delay.
+    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis without hysteresis, and b the
+    decrease with hysteresis. No part of b is hidden, but b is also larger for wrong hypotheses: on recorded arms up to
+    32, and a only up to 17. Therefore half of b counts, and the new cost is the cost of `base` minus max(a, b / 2). For
+    a hypothesis with another delay than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a
+    delay.
 
     Args:
         problem: problem without hysteresis.

@@ -64,7 +64,8 @@ class Hypothesis:
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
 
-        samples: logged samples. The result has no signals before and after each sample: E = 1 in `MotionSamples`.
+        samples: logged samples. The result has signals only at the samples, and not at times before and after each
+        sample: the last axis of `values` has the length 1.
         """
         delays = _per_signal(self.delay)
         if self.drift.any():
@@ -75,7 +76,7 @@ class Hypothesis:
         return samples._replace(values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the inverse of `signals`: logged samples for `samples` of the joints.
+        """Return the samples that a log with these faults has for the true signals `samples` (inverse of `signals`).
 
         The hypothesis must have no delays, and no exchanged columns.
         """

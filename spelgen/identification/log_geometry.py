@@ -74,7 +74,7 @@ class GeometryProblem:
 
         The other torques and their regressor rows become zero.
 
-        counted: mask (S, n), True for the samples and joints of the unchanged log whose torques are fitted.
+        counted: mask (S, n), True for the torques that are fitted, per sample and per joint of the uncorrected log.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -93,7 +93,7 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the least-squares problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
+        """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint."""
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
@@ -151,9 +151,10 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # `bent`: deflections of the bristles under the hypothesis. They are stored for the current mapping, so
-                # the joints are permuted and the signs reversed like the motion. The friction of drive j, which
-                # includes the force of its bristles, acts on joint i with the factor C_ji of C = `speeds`.
+                # `bent`: deflections of the bristles under the hypothesis. The samples contain deflections for the
+                # current mapping, so the joints are permuted and the signs reversed like the motion. C = `speeds` maps
+                # joint speeds to motor speeds; by virtual power, friction of drive j, bristles included, acts on joint
+                # i with the factor C_ji.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
@@ -256,12 +257,12 @@ class GeometryProblem:
         return values, fit
 
     def _beyond_limits(self, q: np.ndarray) -> float:
-        """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
+        """Return the penalty on the cost for positions q (S, n) beyond the position limits: at most 15 for each joint.
 
-        The penalty of a joint is 15 min(1, 2 d / range), with the largest distance d of its positions beyond the limits
-        and the range between the limits. It is not infinite, because limits of a URDF may be wrong and zeros may be
-        calibrated badly. Positions of a revolute joint may be logged with another number of turns: d is the smallest
-        distance of the positions and of the positions plus or minus one turn.
+        The penalty of a joint is 15 min(1, 2 d / r), with the largest distance d of its positions beyond the limits and
+        the range r between the limits. It is bounded, because limits of a URDF may be wrong and zeros may be calibrated
+        badly. For a revolute joint, whose positions may be logged with another number of turns, d is the smallest
+        distance without a shift and with shifts by plus or minus one turn.
         """
         penalty = 0.0
         for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
@@ -290,9 +291,9 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # The first n functionals of x are the rotor inertias. The second n functionals are the powers that friction
-        # takes from the motion of each joint, qd (viscous qd + Coulomb sign(qd)), summed over the samples. The sums are
-        # entries of the Gram matrices.
+        # `functionals` @ x: first the n rotor inertias, then for each joint the power dissipated by friction, qd
+        # (viscous qd + Coulomb sign(qd)), summed over the samples. The sums of qd^2 and qd sign(qd) are entries of its
+        # Gram matrix.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -330,8 +331,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # without <inertial> the prior is wide: standard deviations of 20 times the typical mass, at an extent of at
-        # least 0.5 m
+        # without <inertial> the prior is wide: standard deviations of 20 m, 20 m L and 20 m L^2, with the typical mass
+        # m and the distance L to the body's farthest joint, at least 0.5 m
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
@@ -348,7 +349,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # the standard deviations are 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
+    # the standard deviations of the prior are 50 %: of the mass, of the body's extent for the centre of mass, and of
+    # mass times squared radius of gyration for the tensor
     return 0.5 * root
 
 

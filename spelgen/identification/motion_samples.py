@@ -1,4 +1,4 @@
-"""Samples of the motion of an arm and its torques, at and around each sample, from successive trajectories."""
+"""Samples of an arm's motion and torques, with signals shortly before and after each, of successive trajectories."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from spelgen.logs.dynamics_samples import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-# [samples] Times around a sample at which its signals are kept: signals of the filter's bandwidth are determined by
-# values every 20 ms.
+# [samples at 100 Hz] Times around a sample at which signals are kept for it: every 20 ms, which determines signals of
+# the filter's bandwidth.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 # [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
 ENDS = 3
@@ -96,7 +96,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest time before or after a sample up to which its signals are stored [s]; 0 without such signals."""
+        """Largest time before or after a sample at which signals are stored for it [s]; 0 if none are stored there."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def every(self, stride: int) -> MotionSamples:

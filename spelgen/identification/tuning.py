@@ -35,7 +35,7 @@ class DriveHintTuning:
     # [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
     # delay may be due to friction.
     longest_delay: float = 0.02
-    # [samples] Largest time shift of the signals of one joint, 160 ms.
+    # [samples at 100 Hz] Largest delay of the signals of one joint relative to the other joints, 160 ms.
     longest_offset: int = 16
     # [1] Largest number of samples of the estimation of delays and couplings, ample for about 70 parameters of six
     # joints.

@@ -327,8 +327,9 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             axis = stated / size
             ratio = float(axis @ found) / size
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
-            # Masses of CAD models are wrong by a factor of less than 2.5. The difference from the URDF must also
-            # exceed four standard deviations of the fitted value: one of many bodies may exceed two by chance.
+            # The ratio must be beyond 2.5 or its inverse: masses of CAD models are wrong by less. The difference from
+            # the URDF must also exceed four standard deviations of the fitted value: at one of many bodies, it exceeds
+            # two by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

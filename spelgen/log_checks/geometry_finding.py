@@ -87,10 +87,13 @@ def find_unexplained(
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
     """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
 
-    1. If the mean relative residual of all joints is above `no_torque`: the joints with a residual above `no_advice`,
-       and the mean. It is weighted with the variances of the torques: the torque of a joint at rest may be only noise.
-    2. Otherwise: the joints with a residual above `no_torque` that move and whose torque by the URDF is at least half
-       as large as logged, and the largest residual of these joints.
+    A relative residual is the squared torque residual divided by the variance of the torque; `no_torque` and
+    `no_advice` are thresholds in `GEOMETRY`.
+
+    1. If the mean residual of all joints is above `no_torque`: the joints with a residual above `no_advice`, and the
+       mean. It is weighted with the variances of the torques: the torque of a joint at rest may be only noise.
+    2. Otherwise: the moving joints with a residual above `no_torque` whose torque by the URDF varies at least half as
+       much as the logged torque, and the largest residual of these joints.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)

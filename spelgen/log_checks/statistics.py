@@ -38,9 +38,9 @@ class Clock:
 class Statistics(NamedTuple):
     """Statistics of one trajectory of n joints.
 
-    clock: sample times. signals: for each of "q", "qd" and "tau" or "u" an array (4, n) with the lowest value, the
-    highest value, the standard deviation of white noise (NaN for sparse logs), and the quantisation step (NaN for
-    signals that are not quantised).
+    clock: statistics of the sample times. signals: for each of "q", "qd" and "tau" or "u" an array (4, n) with the
+    lowest value, the highest value, the standard deviation of white noise (NaN below 50 Hz), and the quantisation step
+    (NaN for signals that are not quantised).
     """
 
     clock: Clock

@@ -177,8 +177,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
-        # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. Messages decoded to arrays
-        # need ten times their size in the file, so the bound of 20 times the file size suffices.
+        # The memory of the process is limited, since a damaged bag may contain chunks that rosbags unpacks to any size.
+        # Messages decoded to arrays need ten times their size in the file, so a limit of 20 times the file size
+        # suffices.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, path)
             unfinished = [] if is_ros1 else _unfinished(path)

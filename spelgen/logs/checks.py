@@ -172,13 +172,13 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# REPAIRED and REMARKED find nothing and only have a code and a severity: the messages, about changed rows (REPAIRED) or
-# properties of the file (REMARKED), are from the reader of the log.
+# REPAIRED and REMARKED are no checks, but the code and severity of messages from the reader of the log, about changed
+# rows (REPAIRED) or properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, which would
-    # otherwise be reported as frozen signals.
+    # Jumps are searched before frozen signals: a velocity in raw register words differs from dq/dt as a frozen signal
+    # does, and would otherwise be reported as one.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -236,7 +236,7 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) sum of the results of `velocity_products` for all trajectories.
+    products: (2n, 2n) Gram matrix that compares dq/dt to qd: sum of `velocity_products` over all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:

@@ -199,8 +199,8 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the text encoding of a file (UTF-8, UTF-16 or Latin-1), and its first characters."""
-    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. The module
-    # csv reads no larger cells.
+    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. It is as
+    # large as the largest cell that the module csv reads.
     size = 2**17
     with file.open("rb") as source:
         head = source.read(size)

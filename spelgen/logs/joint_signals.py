@@ -142,7 +142,7 @@ class JointSignals(NamedTuple):
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a measured ratio of dq/dt to qd equals the conversion factor `unit` between units within 25 %."""
+    """Return True if a measured ratio of dq/dt to qd equals, within 25 %, the conversion factor `unit` of two units."""
     # Ratio of dq/dt to qd and conversion factor may differ by 25 %: noisy velocities make the ratio inexact, and
     # conversion factors of different units differ by more than 25 %.
     return 0.8 < value / unit < 1.25
@@ -285,8 +285,8 @@ def find_elastic(signals: JointSignals) -> str | None:
     # Candidates for the resonance: at up to 1.5 times the highest excited frequency, it still changes the apparent
     # inertia noticeably.
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance f_0 would otherwise
-        # give a frequency band close to f_0 too much weight.
+        # The apparent inertia H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance
+        # f_0 would otherwise give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
         # Solutions in which the link has less than a tenth of the motor's inertia are rejected: such a resonance is not
@@ -299,7 +299,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # A rigid model counts as valid up to the frequency at which H(f) is 10 % above H(0).
+    # A rigid model counts as valid up to the frequency f at which the apparent inertia H(f) is 10 % above H(0).
     share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"

@@ -27,8 +27,8 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
         return values
     turns = np.diff(values, prepend=values[:1]) / period
     whole = np.round(turns)
-    # Two opposite steps of about half a period are an outlier of one sample: rounded separately, the two steps would
-    # shift all later samples by a period.
+    # Two opposite steps of about half a period are an outlier of one sample. Their sum is rounded to whole periods:
+    # rounded separately, the two steps would shift all later samples by a period.
     is_half = np.abs(np.abs(turns) - 0.5) < 0.25
     rows = np.flatnonzero(is_half[:-1] & is_half[1:] & (turns[:-1] * turns[1:] < 0))
     whole[rows], whole[rows + 1] = 0.0, np.round(turns[rows] + turns[rows + 1])
@@ -59,10 +59,10 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 
 
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """Return a mask (T,) of the samples that are lost or outliers.
+    """Return a mask (T,) of the samples that are lost (see `is_lost`) or outliers.
 
     An outlier is one of at most five samples between two opposite jumps. Torques and velocities may have genuine steps:
-    their outliers must also lie above or below all other samples by more than half of the range of these samples.
+    their outliers must also lie outside the range of all other samples by more than half of this range.
 
     smooth: True for positions, which change gradually; False for torques and velocities.
     """
@@ -157,9 +157,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
-    at the end of the block is then about as large as k steps of the following motion. The number m of copies is the
-    median length of these blocks, since a logger may write each row m times; m is 1 if there are none. In all other
-    blocks, the arm was at rest: every m-th row is original, and the others are repeats (no row for m = 1).
+    at the end of the block is then about as large as k steps between later rows. The number m of copies is the median
+    of k over these blocks, since a logger may write each row m times; m is 1 without such blocks. In all other blocks,
+    the arm was at rest: every m-th row is original, and the rows between are repeats (none for m = 1).
 
     positions: number of leading columns that are positions.
     """
@@ -186,7 +186,8 @@ def held_samples(values: np.ndarray) -> int:
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # Only changes by several quantisation steps are counted: equal samples of a slow quantised signal are genuine.
+    # Only blocks of equal samples that end with a change by several quantisation steps are counted: other blocks are
+    # genuine in a slow quantised signal.
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -197,8 +198,9 @@ class Word(NamedTuple):
     """Decoding of a logged signal as register words, the raw integers of a drive's register.
 
     Attributes:
-        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
-        value: value of this setting in the unit of the log.
+        key: setting of the mapping that decodes the signal: "period", at which words overflow, or "sign_bit", the value
+            of the bit that marks negative numbers.
+        value: period or sign bit in the unit of the log.
         values: (T,) decoded signal in the unit of the log.
     """
 
@@ -268,7 +270,8 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # Differences below `FINEST_WORD` of the range are rounding errors: the values were converted to SI units and back.
+    # Differences below the fraction `FINEST_WORD` of the signal's range are rounding errors: the values were converted
+    # to SI units and back.
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())

@@ -137,7 +137,7 @@ def _equally_long(
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table of all arrays with the largest number of rows, T, to draft a mapping; matrices become lists."""
+    """Return a table, for the draft of a mapping, of all arrays with the most rows; a matrix is a column of lists."""
     names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
@@ -146,12 +146,15 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return {`q_<joint>`: ("q", index)} for each column of the matrix q (T, n) of an archive; {} without this matrix.
+    """Return the columns of the mapping that are columns of a matrix (T, n) of an archive; {} without this matrix.
+
+    Keys are names of columns in the mapping, such as `q_elbow`; values are the name of the matrix and the index of its
+    column, such as ("q", 2).
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
 
-    pattern: name of the columns in the mapping, such as `q_{joint}`, which also determines the name of the matrix (q).
-    names: names of the arm's joints in the log.
+    pattern: name of the columns in the mapping, such as `q_{joint}` for the matrix `q`. names: names of the arm's
+    joints in the log.
     """
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:

@@ -19,7 +19,8 @@ from spelgen.settings.yaml_document import YamlDocument, validated
 INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
-# Largest position that LeRobot may have normalised: 100, with a tolerance for rounding to single precision.
+# Largest magnitude of positions that LeRobot has normalised to -100..100, with a tolerance for rounding to single
+# precision.
 LARGEST_NORMALISED = 100.001
 # Text of the remark that positions may be normalised and not in degrees. The check of servo logs removes this remark if
 # the step size of the encoders determines the unit.

@@ -119,7 +119,8 @@ def _unwrap(rows: Rows) -> None:
         count = jump_count(column, period)
         if count and quantity == "q":
             word = read_as_words((column - offset) / scale, 2 * pi / abs(scale))
-            # Words with a sign bit are not unwrapped, since their jumps are no wraps: a check reports them.
+            # Register words with a separate sign bit are not unwrapped: their jumps are changes of sign and no wraps at
+            # a period. A check reports such words.
             if word is not None and word.key == "sign_bit":
                 continue
         result = unwrapped(column, period)
@@ -127,8 +128,8 @@ def _unwrap(rows: Rows) -> None:
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - columns["q", joint]) / period)
-        # Other signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
-        # period. Exception: an angle without wraps whose period is one turn is correct as logged.
+        # Measured signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
+        # period. Exception: a signal with a period of one turn that never wraps is an angle, and correct as logged.
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
@@ -317,7 +318,8 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # A time step that is too long for the resolution of the clock is a gap: times are evenly spaced between gaps.
+    # A time step of more than `TUNING.gap` ticks and mean steps is a gap, since the resolution of the clock does not
+    # explain it. Times are evenly spaced between gaps.
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):

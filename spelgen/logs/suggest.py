@@ -108,7 +108,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
 
 
 def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
-    """Return the draft for a table of the log `file`; see `suggest_mapping`."""
+    """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
@@ -183,7 +183,7 @@ def _joint_lines(
 
 
 def _ranges(names: Sequence[str]) -> list[str]:
-    """Return the names, in which runs such as x1, x2, x3, that differ only in a number, are `x1 ... x3`."""
+    """Return the names, with runs that differ only in a number, such as x1, x2, x3, abbreviated to `x1 ... x3`."""
     groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
     return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
 
@@ -214,7 +214,7 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 def _column_name(name: str, words: set[str]) -> ColumnName:
     """Return the words and the unit in a column's name; the unit is in brackets, or the last word.
 
-    words: additional words of the column, which its name does not contain.
+    words: additional words that describe the column, such as "time" for a column of dates.
     """
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
@@ -286,9 +286,9 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: index of its columns in the log}, from cells of the first row that contain joint names.
+    """Return {joint: number in the names of its columns, such as 2 in `q[2]`}, from joint names in the first row.
 
-    Such cells are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
+    Joint names are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
     omitted.
     """
     order: dict[str, int] = {}
@@ -349,9 +349,9 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names. order: {joint: last
-    number in the name of its column}; if it does not contain all joints, the columns are assigned in the order of their
-    numbers to the joints in the order of `joints`.
+    If no column name contains a joint name, columns are assigned by the last number in their names: to the joint with
+    this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
+    number}, the result of `_order_in_cells`.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]

@@ -280,11 +280,11 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # `held_rows`: rows whose commands act between the first and the last of `samples`, each minus the delay. A command
-    # acts until the next one, so the row before the first of these times is included.
+    # `held_rows`: rows whose commands act between the times samples[0] - delay and samples[-1] - delay. A command acts
+    # until the next one, so the row before samples[0] - delay is included.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    # `previous`: command that acts in the interval before each sample, (H, n) [rad, m] for H held rows.
+    # `previous`: (H, n) [rad, m], for each of the H held rows the command of the row before, which acts until this row.
     previous = np.concatenate([u[:1], u[:-1]])
     # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])

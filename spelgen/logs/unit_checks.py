@@ -167,12 +167,13 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
     if "qd" not in mapping.quantities or len(factors) < 2 or len(steps) <= 2 * SIGNALS.increments:
         return None
     factor = float(np.median(factors))
-    # The times are assumed to be wrong only if dq/dt is the same multiple of qd for all joints, and steps are even.
+    # The times are assumed to be wrong only if dq/dt is the same multiple of qd for all joints, and time steps are
+    # equal.
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    # A factor near 1 is more probably an error of the velocities. For a factor between two units of time, such as 1000,
-    # the caller reports the unit.
+    # A ratio of dq/dt to qd near 1 is more probably an error of the velocities than of the times. If the ratio is a
+    # factor between two units of time, such as 1000, the caller reports the unit.
     if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
@@ -324,7 +325,8 @@ def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    # Logged velocities in both directions have a sign, and so have velocities computed from positions.
+    # The check is omitted for velocities with a sign: logged velocities in both directions, and velocities computed
+    # from positions.
     if "qd" not in trajectory.mapping.quantities or not is_one_sided(qd, share) or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)
