@@ -276,7 +276,9 @@ def test_a_second_of_motion_supports_no_fit(shared, arm):
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]
 
 
-@pytest.mark.parametrize(("seconds", "advice"), [(5.0, "record about 23 s"), (70.0, "a longer log would not help")])
+@pytest.mark.parametrize(
+    ("seconds", "advice"), [(5.0, "record about 23 s"), (70.0, "a longer log would not help")]
+)
 def test_a_longer_recording_is_advised_only_if_the_recording_is_short(robots, seconds, advice):
     """Logs of more than a minute that support no fit are no reason to record a minute.
 
