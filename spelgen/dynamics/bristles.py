@@ -49,7 +49,7 @@ def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleR
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Return the break-away displacements of a trained model; there are K = 0 bristles in a model without bristles."""
+    """Return the break-away displacements of the K bristles per drive of a trained model; K = 0 without bristles."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity

@@ -38,7 +38,8 @@ class TipKinematics:
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        # The positions of the moving joints on the path to the link are _jacobian q + _offset; (joints, n), (joints,).
+        # The J moving joints on the path to the link include mimic joints. Their positions are _jacobian q + _offset,
+        # with _jacobian (J, n) and _offset (J,).
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
         # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
