@@ -76,7 +76,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             (`BodyLoad.bias`), and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5), joint first
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution

@@ -68,8 +68,9 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     covariance = torch.linalg.inv(curvature.sum(dim=0) + prior)
     steps, of_blocks = jackknife_covariance(curvature, descent, prior)
     if len(blocks) > 1:
-        # Of the posterior and the jackknife covariance, the larger one is used, since each is too small in some
-        # directions: few blocks may agree by chance, and the posterior covariance neglects differences between motions.
+        # In each direction, the larger one of the posterior and the jackknife covariance is used, since each is too
+        # small in some directions: few blocks may agree by chance, and the posterior covariance neglects differences
+        # between motions.
         covariance = larger_covariance(of_blocks, covariance) * student_scale(len(blocks)) ** 2
     without_block = torch.zeros(len(blocks), len(x)).double().masked_scatter(free, steps) @ change.mT
     # The residual after a step is [J, residual] @ [-step, 1]; its square is computed from the Gram matrices of [J,

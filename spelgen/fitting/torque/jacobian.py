@@ -249,7 +249,8 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # For s > 0: log(c (1 + s)) = log c + log1p(s), which equals log c + s to first order.
+            # A step s > 0 of log c becomes log(c (1 + s)) - log c = log1p(s), which equals s to first order; s < 0 is
+            # unchanged, since 1 + s could be negative.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -322,14 +323,14 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
+        """Return the torque residual times `logged_scale`, and the compressed Jacobian of the modelled torque.
 
-        The rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
-        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
-        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
-        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
-        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
-        pass gives the derivatives of all samples.
+        The Jacobian is the negated Jacobian of the scaled residual. Its rows of several joints are computed in one
+        reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974). Joints on which no
+        common drive acts may have the same colour. A parameter of a drive then affects the torque of at most one joint
+        of a colour, and so does the gravity torque on the drive. A derivative of the sum of all torques of a colour is
+        therefore the derivative of the torque of this joint. Most arms have one colour, so one pass replaces n passes.
+        Each sample has its own copy of the parameters, so that a pass gives the derivatives of all samples.
 
         Args:
             parameters: {name: values}, the parameters at which the derivatives are computed.

@@ -1,4 +1,4 @@
-"""Ridge regression of the torque on the samples of a fit, a simple method to which the fit is compared."""
+"""Ridge regression of the torque on the regressors of bodies and friction, a simple method compared with the fit."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -115,8 +115,8 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
         # The pseudo-inertia of a body is C S C^T with the constant factor C, and its log-Cholesky parameters are the
-        # Cholesky factor of S. With the pseudo-inertia `body` of the default body, `relative` is first C^-1 body, and
-        # then S = C^-1 body C^-T.
+        # Cholesky factor of S. `body` is the pseudo-inertia P of `DEFAULT_BODY`. The first line computes C^-1 P, the
+        # second line S = C^-1 P C^-T.
         relative = torch.linalg.solve(model.bodies.factors, body)
         relative = torch.linalg.solve(model.bodies.factors, relative.mT)
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))

@@ -28,7 +28,7 @@ class TorqueTuning:
     # time count as one independent error.
     correlation_time: float = 0.2
     # [s] Correlation time of torque errors in comparisons of friction models. It is shorter than `correlation_time`,
-    # because friction models differ only near reversals of velocity.
+    # because friction models differ only for short times after reversals of velocity.
     reversal_correlation_time: float = 0.1
     # [1] Weight of the prior mean `correlation_time` in the estimated correlation time, as a number of independent
     # errors.
@@ -126,7 +126,8 @@ class ResidualTuning:
     # freedom.
     standard_errors: float = 2.82
     # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
-    # `standard_errors`, since the motion of few recordings may repeat the errors of the model.
+    # `standard_errors`, since held-out and fitted motion of few recordings may be similar, with the same errors of the
+    # model.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.
