@@ -63,13 +63,14 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """Error: the polynomial of an entry needs more multiplications of polynomial terms than its `Expansion` permits."""
+    """Error: the polynomial of V or of an entry of M needs more multiplications of terms than `Expansion` permits."""
 
 
 class Expansion:
     """M and V of ``arm`` as recorded operations, from which polynomials in s1, c1, q1, s2, ... are computed.
 
-    s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
+    M is the mass matrix, V the potential energy; an operation is recorded as a `Deferred`. s, c and q with a number are
+    sine, cosine and position of the coordinate with this number, from 1 (``Position``).
 
     Args:
         arm: the arm.

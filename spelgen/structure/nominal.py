@@ -57,7 +57,7 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return typical values of M, V and torques of ``arm``, for the terms of M in its ``structure``."""
+    """Return typical values of the terms of M in the ``structure`` of ``arm``, of its potential energy and torques."""
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -99,7 +99,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return the coefficients with which the functions of m terms are computed from M, (m, n(n+1)/2).
+    """Return the coefficients of m terms' functions f as linear functionals of M (`Term.functional`), (m, n(n+1)/2).
 
     The columns are the entries of the lower triangle of M, row after row.
     """
@@ -120,7 +120,10 @@ def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body."""
+    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body.
+
+    from_urdf: True: values of the URDF; False: default bodies of 1 kg.
+    """
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
