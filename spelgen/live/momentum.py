@@ -28,13 +28,13 @@ class Balance(NamedTuple):
 
     Attributes:
         momentum: Momentum p of the arm, (T, n).
-        torque: G (tau - offset) + dL/dq in the equation of the module, plus the friction compensation of the drives,
+        torque: G (tau - offset) + dL/dq, with the symbols of the module, plus the friction compensation of the drives,
             (T, n).
         friction: Mean of the friction torques at the two bounds of the friction state, (T, n).
         uncertainty: Half the difference of the friction torques at the two bounds, (T, n).
         load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).
         load_torque: N, torque per inertial parameter of the payload, (T, n, 10).
-        jacobian: Jacobian of a point of the last body, in root axes, (T, 3, n).
+        jacobian: Jacobian of a point of the last body, such as the tip, in root axes, (T, 3, n).
         velocity: Velocities qd, (T, n).
     """
 

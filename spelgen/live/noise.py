@@ -54,11 +54,11 @@ class NoiseLevels(BaseModel):
     fifth of the peaks is modelled by an exponential distribution.
 
     Attributes:
-        drift: Noise of the blocks of the drift filter.
-        load: Noise of the blocks of the payload filter.
+        drift: Noise of the torque residual, averaged over the blocks of samples of the drift filter.
+        load: Noise of the torque residual, averaged over the blocks of samples of the payload filter.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
-        resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
-            [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
+        resting: Additional threshold for a joint at rest: three standard deviations of the noise at rest that is added
+            to `observer`, (n,) [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
         peak_start: Smallest value of the exponential distribution, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].

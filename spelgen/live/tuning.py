@@ -68,9 +68,9 @@ class LiveTuning:
     # "changed load" exceeds the log likelihoods of "no change" and of "contact" by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion. They are dropped
-    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact"
-    # and "no change" is below `unlikely` [1].
+    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion at the latest. They
+    # are dropped earlier, after `changed_after` [s], if "changed load" is unlikely: if its log likelihood minus the
+    # larger one of "contact" and "no change" is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -140,8 +140,9 @@ class LiveTuning:
     # have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] The grid of the noise of the momentum observer near standstill: velocity scales divided by the largest speed,
-    # and the additional noise at rest divided by the noise in motion.
+    # [1] The grid of the noise of the momentum observer near standstill, s^2 (1 + (r exp(-|qd| / v))^2)
+    # (`live.levels`): velocity scales v divided by the largest speed, and ratios r of additional noise at rest to noise
+    # s in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 
