@@ -80,8 +80,8 @@ def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
-    # An entry of M is zero if all its samples in `spans` are zero, and varying if it changes with a coordinate. Ranks of
-    # the samples determine the terms of M.
+    # An entry of M is zero if all its samples in `spans` are zero, and varying if it changes with a coordinate. The
+    # ranks of the samples determine the terms of M.
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(
