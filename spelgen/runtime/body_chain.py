@@ -21,7 +21,7 @@ class ChainConfiguration(NamedTuple):
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
-    mass: Tensor  # square roots of the point masses, (..., 1, B bodies, 4 points) [kg^(1/2)]
+    mass: Tensor  # sqrt(mass) of the point masses in `place`, (..., 1, B bodies, 4 points) [kg^(1/2)]
     axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, B bodies)
     # Derivatives of the coordinates of all point masses with respect to the joint displacement of each body,
     # times sqrt(mass), (..., B, 12 B). A body has 3 coordinates of each of its 4 point masses: coordinate,
@@ -84,7 +84,8 @@ class BodyChain(nn.Module):
                 carriers[:, index] += carriers[:, carrier]
         # `carriers`, (bodies, bodies): entry (i, j) is 1 if body i carries body j or i = j, else 0.
         self.carriers = nn.Buffer(carriers)
-        # `carried`, (bodies, 12 bodies): `carriers` with a column for each coordinate of each point mass.
+        # `carried`, (bodies, 12 bodies): `carriers`, with 12 columns for the coordinates of the four
+        # point masses of a body; it is a mask of the Jacobian.
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
         # `base`: minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
@@ -127,7 +128,8 @@ class BodyChain(nn.Module):
             (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies) (Featherstone, 2.31).
         """
         rates = qd @ self.ratios.mT
-        # The product with the Jacobian, and with the mask `carriers`, sums over the joints that carry a body.
+        # Sums over the joints that carry a body: the Jacobian is zero for other joints, and twists are
+        # multiplied by the mask `carriers`, (bodies, bodies).
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
@@ -242,8 +244,8 @@ class InertialParameters(nn.Module):
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
-        # torch has only lower Cholesky factors. With rows and columns in reverse order, the lower factor of
-        # the reversed matrix becomes the upper factor.
+        # The upper triangular C with C C^T is needed; torch computes only L L^T, with lower L, and U^T U.
+        # C is the L of the matrix with rows and columns in reverse order, reversed again.
         self.factors = nn.Buffer(torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2))
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 

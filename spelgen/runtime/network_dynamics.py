@@ -242,8 +242,8 @@ class DenseFriction(NetworkFriction):
     def prepare(self) -> Layers:
         """Return the parameter cache: layers of a network with the entries of L as outputs, row after row.
 
-        Only the row of each joint's last axis is included (see the class): n rows of n * axes entries
-        [sqrt(Nm s/rad), sqrt(N s/m)].
+        The class defines L and ``axes``. Only the row of each joint's last axis is included: n rows of n
+        * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)
