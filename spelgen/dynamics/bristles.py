@@ -43,7 +43,8 @@ class BristleReach:
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
 
-    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C of `BristleReach`.
+    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C, (n, n): the velocities of the drives are
+    C qd; None: each drive moves its own joint.
     """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 

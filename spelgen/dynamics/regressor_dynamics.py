@@ -136,7 +136,7 @@ class RegressorDynamics:
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n).
 
-        z: friction state, (..., n, K) [rad, m]; None: unknown.
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on qd.
         """
         equations = self.equations_at(q)
         # `solve` broadcasts the batch dimensions of M and tau only if the force is a matrix with one column.
@@ -207,7 +207,10 @@ def identified_dynamics(
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), for a friction state z.
+
+        z: deflections of K bristles per drive, (..., n, K) [rad, m]; None: friction depends only on qd.
+        """
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 

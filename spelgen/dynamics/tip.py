@@ -66,7 +66,7 @@ class TipKinematics:
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of all joints on the path to the link, (S, joints) [rad, m]; q: (..., n), S states."""
+        """Return the positions of all joints on the path to the link, (S, joints) [rad, m], of S states q, (..., n)."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 

@@ -62,7 +62,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the momentum stage, then epochs until the fit ends; ``save`` is called after the stage and each epoch."""
+        """Run the stage of steps on `momentum_loss`, then epochs until the fit ends; ``save`` is called after each."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)

@@ -68,8 +68,8 @@ class RunFolder:
             content[self.urdf] = urdf_bytes(urdf)  # stores the expanded URDF of a xacro file
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json, which marks the folder as a run, is removed first, since it is the first file in `__init__`: if
-        # the removal is interrupted, the folder is not treated as a run.
+        # The files are removed in the order of `__init__`. The first one is config.json, which marks the folder as a
+        # run: if the removal is interrupted, the folder is not treated as a run.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)

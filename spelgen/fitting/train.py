@@ -55,7 +55,8 @@ def train(
     run = RunFolder(folder)
     robot, notes, settings = None, list[Diagnostic](), dict(of_logs or {})
     if options.resume:
-        # The record is read first, so that a missing run is reported before the logs are read.
+        # The record of the run (config.json) is read first, so that a folder without a run is reported before the logs
+        # are read.
         record = run.read_record()
         # Validation logs that were passed from Python are not stored in a file, so this function cannot resume the run.
         if record.validation_fraction is None and record.validation:

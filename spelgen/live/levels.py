@@ -177,7 +177,8 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
     Its mean is computed for each k and each length of trials, together with `prior_trials` imaginary trials of the
     value `prior_variance`. The factor is the largest mean: errors of the model are correlated over time, so that the
-    mean may be larger for longer trials. The degrees of freedom are the number of trials, imaginary ones included.
+    mean may be larger for longer trials. The degrees of freedom are the number of trials of the largest mean's length,
+    imaginary ones included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -241,7 +242,8 @@ def _likelihood(
     # assumed to be at most a few standard deviations of the white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # The filters have drifts=False: joints at rest update no state, so the noise of joints in motion is estimated.
+        # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is
+        # estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)

@@ -57,8 +57,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
         point: position of the point in the frame of the last body, (3,) [m].
 
     Returns:
-        P, generalised momentum per inertial parameter of the payload, (T, n, 10); N, torque per inertial parameter,
-        (T, n, 10); Jacobian of the point in root axes, (T, 3, n).
+        P and N of the module's equation: generalised momentum, and centrifugal and gravity torque, per inertial
+        parameter of the payload, (T, n, 10) each; Jacobian of the point in root axes, (T, 3, n).
     """
     # `chain.forward` transforms points of the bodies. The columns of the identity are passed as points, so that the
     # result contains the whole homogeneous transform of each body.

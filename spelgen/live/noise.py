@@ -140,7 +140,8 @@ class NoiseLevels(BaseModel):
         Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
         With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds it by more than x
         with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start` + x, with the x
-        for which this probability times `tail_peaks` is the rate of false alarms.
+        for which this probability times `tail_peaks`, the rate of peaks above `peak_start`, is the rate of false
+        alarms.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

@@ -59,8 +59,8 @@ class LiveTuning:
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
-    # [1] The hypotheses of a changed load and of a contact start if the sum of the squared residuals of a block exceeds
-    # its expected value by this number of its standard deviations.
+    # [1] The filters for the two hypotheses, a changed load and a contact, are started if the sum of the squared
+    # residuals of a block exceeds its expected value by this number of its standard deviations.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
@@ -80,7 +80,8 @@ class LiveTuning:
     bandwidth: float = 20.0
     # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
     # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt, with the
-    # bandwidth of the observer and with twice this bandwidth. This is the error for a lag of 1 / (4 bandwidth) = 12 ms.
+    # bandwidth of the observer and with twice this bandwidth. The estimates lag by 1 / bandwidth and half of this, so
+    # 0.5 times their difference is the error for a lag of torques of 1 / (4 bandwidth) = 12 ms.
     jerk: float = 0.5
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.

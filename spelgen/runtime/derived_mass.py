@@ -215,7 +215,7 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of the nominal value of a large matrix.
+    """Return C of ``DenseMass``, (3 n, 3 n): Cholesky factor of the nominal inverse of the large matrix.
 
     The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
     axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
@@ -320,8 +320,8 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # For the kinetic energy T = 1/2 qd^T M qd, with w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T
-        # and dT/de = -p^2 / 2.
+        # For the kinetic energy T = 1/2 qd^T M qd, with U, A and e of the class, w = U^-1 A qd and
+        # p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).

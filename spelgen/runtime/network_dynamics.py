@@ -222,10 +222,10 @@ class JointFriction(NetworkFriction):
 class DenseFriction(NetworkFriction):
     """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
 
-    L is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the joint frame as in the
-    model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves along its last axis only,
-    so only the row of the last axis of each joint is computed: the result is D, (..., n, n). The inputs of
-    the network are the encoding of q, and qd / typical speed.
+    L, (axes n, axes n), is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the
+    joint frame as in the model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves
+    along its last axis only, so only the row of the last axis of each joint is computed: the result is D,
+    (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:

@@ -101,7 +101,7 @@ def joint_masks(
         outputs: names of the joints that each output depends on.
         width: number of units of each hidden layer.
         depth: number of hidden layers.
-        min_units: smallest number of units of a hidden layer for outputs that depend on the same joints.
+        min_units: smallest number of units of a hidden layer for each group of outputs with equal joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]

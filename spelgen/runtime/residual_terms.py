@@ -31,7 +31,7 @@ class ResidualParameters(NamedTuple):
     """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
     splines: Tensor  # spline coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
-    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 HARMONICS + 4)
+    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 (HARMONICS + 2))
     constant: Tensor  # constant part of the residual R of M, flattened, (n n,)
     functions: Tensor  # flattened matrices dR / d tanh(output) of R's network, (functions, n n)
     mass: Layers | None
@@ -103,7 +103,8 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(center + spacing * knots)
         self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
-        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2).
+        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2); the
+        # last two are of the motor if ``gear`` exceeds HARMONICS.
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
         for index, joint in enumerate(joints):
             if joint.gear > HARMONICS:
@@ -127,7 +128,7 @@ class ResidualTerms(nn.Module):
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the part of R due to each of its functions and constants, (functions + constants, n, n).
+        """Return the parts of R, a term of M, due to its functions and constants, (their number, n, n).
 
         sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
         """
@@ -137,9 +138,10 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). A + R is positive
-        definite if no function or constant exceeds its bound: ``part`` times the minimum of sqrt(d_i d_j) /
-        |coefficient in R_ij| over the entries of R, with d = 1 / (row sums of |A^-1|).
+        R is the residual term of M, linear in its functions and constants (see the class). A + R is
+        positive definite if no function or constant exceeds its bound: ``part`` (0.9 / largest number of
+        terms in a row of R) times the minimum of sqrt(d_i d_j) / |coefficient in R_ij| over the entries
+        of R, with d = 1 / (row sums of |A^-1|).
 
         Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
         dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
@@ -161,7 +163,7 @@ class ResidualTerms(nn.Module):
         """Return the parameter cache: quantities that depend on trained parameters only.
 
         armature: rotor inertia on the joint side, (n, n), for the ``bounds`` of functions and constants
-            in R.
+        in R.
         """
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
@@ -237,7 +239,8 @@ class ResidualTerms(nn.Module):
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
 
-        It is dR/dt qd - ``gradient`` [Nm, N]. cache: configuration cache at q. qd: velocities, (..., n).
+        It is dR/dt qd - ``gradient`` [Nm, N], with the residual term R of M. cache: configuration cache
+        at q. qd: velocities, (..., n).
         """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)

@@ -5,10 +5,10 @@ weighted sum of the entries of M. A functional depends only on the joints in a s
 changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
 all changes.
 
-The f_j are selected greedily. The sets J are tried in the order of their joint closest to the root, joints at the tip
-first, and sets with the same such joint in the order of their size. For each set, single entries of M are tried before
-sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
-selection is optimal.
+The f_j are selected greedily. The sets J are sorted in two steps. The first criterion is their joint closest to the
+root: sets with only joints at the tip are tried first. The second criterion is their size, small sets first. For each
+set, single entries of M are tried before sums of entries. The sets of functionals that are linearly independent on U
+form a matroid, for which the greedy selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -84,8 +84,8 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
-    # `constant_values`, (S, entries), are samples of this difference.
+    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` (prime
+    # field) and `constant_values` (double precision), (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
     # Row reduction of these samples gives the A_k; the entry of M at the pivot of row k defines the constant c_k.
@@ -219,9 +219,10 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a lower triangle, with their rows and columns, as rational numbers.
+    """Return the nonzero elements of a symmetric matrix's lower triangle, with row and column, as rational numbers.
 
-    exact, values: the elements of the lower triangle, (entries,), in the prime field and in double precision.
+    spans: its `keys` are the rows and columns of the elements. exact, values: the elements, (entries,), in the prime
+    field and in double precision.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)

@@ -136,7 +136,8 @@ class Expansion:
         if action == "add":
             return x + y
         # The cost of a multiplication is the number of products of two polynomial terms: FLINT computes all of them
-        # before it collects like terms. A product with 0, the value of all inertial parameters but one, costs nothing.
+        # before it collects like terms. A product with 0 costs nothing; all inertial parameters except for one have the
+        # value 0.
         cost = 1
         for factor in (x, y):
             if isinstance(factor, fmpq_mpoly):

@@ -211,7 +211,7 @@ def _mass_changes(
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return the magnitudes of all coordinates, (n,), divided by the largest magnitude, and at least 0.02.
+    """Return the magnitudes of the effects of all coordinates on M or V, (n,), divided by the largest, at least 0.02.
 
     The results are factors of the inputs of networks; with the lower bound, every joint is an input.
     """
@@ -281,9 +281,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one. J
-    # counts as inconsistent only if this ratio is below fraction^2: the ratio of a slender body may be below
-    # `fraction`, although the body is consistent.
+    # [1] An inconsistent pseudo-inertia J is corrected: its smallest eigenvalue becomes `fraction` times the largest
+    # one. J counts as inconsistent only if the ratio of these eigenvalues is below fraction^2: the ratio of a slender
+    # body may be below `fraction`, although the body is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

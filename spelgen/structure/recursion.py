@@ -129,7 +129,7 @@ def energies(
 def coefficients(
     arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
-    """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
+    """Return the coefficients of the 10 B inertial parameters of B bodies in each entry of M, and in V.
 
     M is the mass matrix, V the potential energy. The recursion computes with vectors of 10 B numbers in place of
     numbers: since M and V are linear in the inertial parameters, each entry becomes the row of its coefficients if unit

@@ -51,7 +51,7 @@ def servo_rank(arm: Chain) -> ServoRank:
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        # The coefficient of kp is the command error u - q. With kp = 1, it is the torque of all other terms.
+        # The coefficient of kp in kp (u - q) = torque is the command error u - q, which equals the torque for kp = 1.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
@@ -94,7 +94,8 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
     triangles, potential = float_energies(arm, shifted, [list(ten) for ten in inertias])
-    # `mass`: M per unit inertial parameter at the shifted positions, (S, n + 1, 10 B, n, n).
+    # `mass`: M per unit inertial parameter at positions shifted in each of the n + 1 directions, (S, n + 1, 10 B, n,
+    # n).
     mass = np.zeros((*potential.shape, n, n), dtype=complex)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]

@@ -96,8 +96,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # The mean commands for a delay are cached: most evaluations of the residual have the same delay, since finite
-    # differences change one of the four unknowns at a time.
+    # The commands, averaged over each interval, are cached per delay: most evaluations of the residual have the same
+    # delay, since finite differences change one of the four unknowns x at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m].

@@ -61,7 +61,7 @@ class Likelihood:
     def costs(self, errors: Tensor) -> Tensor:
         """Return the negative log likelihood of each joint's position errors, (n,), up to a constant.
 
-        errors: (W, K', n) [rad, m].
+        errors: (W, K', n) [rad, m], at K' samples of W windows.
         """
         costs = 2 * torch.log1p((errors / self.scale).square() / 4) / self.samples_per_error
         return costs.sum(dim=(0, 1))
@@ -131,7 +131,7 @@ class ServoProblem:
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
     def cost(self, x: ServoParameters, errors: Tensor) -> float:
-        """Return the negative log posterior at x for errors (W, K', n) [rad, m]; infinite if a rollout diverged."""
+        """Return the negative log posterior at x; infinite if a rollout diverged. errors: position errors at x."""
         if not errors.isfinite().all():
             return float("inf")
         return float(self.likelihood.costs(errors).sum() + self._prior(x).sum())
@@ -141,7 +141,7 @@ class ServoProblem:
         return self.parameters.precision(x) * (x.flat - self.parameters.prior_mean.flat).square() / 2
 
     def candidates(self, x: ServoParameters, step: Tensor) -> Iterable[ServoParameters]:
-        """Return the only candidate: the parameters after a step (k,) with components within +-`TUNING.max_step`."""
+        """Return the only candidate: parameters after a step (k,) with components clipped to +-`TUNING.max_step`."""
         return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
     def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:

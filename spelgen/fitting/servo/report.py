@@ -105,8 +105,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The last solver step estimates the integration error of x. It counts as an error of one standard deviation, so its
-    # outer product is added to the covariance.
+    # The last solver step, with shorter integration steps than the fit, estimates the integration error of x. It counts
+    # as an error of one standard deviation, so its outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 

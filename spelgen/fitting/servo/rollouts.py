@@ -56,9 +56,9 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts with the load computed along ``motion`` (the fixed motion) for parameters x (the new x0).
+        """Return the rollouts with the load recomputed along another fixed motion, ``motion``, for parameters x.
 
-        The model's parameters are set to x.
+        x replaces x0 (see the class); the model's parameters are set to x.
         """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
@@ -139,7 +139,7 @@ class ServoRollouts:
     def _integrate(
         self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n) each.
+        """Integrate all joints of W windows of K samples for P sets of parameters; return q and qd, (P, W, K, n) each.
 
         Args:
             drives: servos and friction of the P sets.

@@ -35,8 +35,8 @@ class ServoTuning:
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
-    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along a direction; 0.3 is about 30 % of
-    # a mass.
+    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along each unit direction that is
+    # fitted; 0.3 is about 30 % of a mass.
     bodies: float = 0.3
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
@@ -49,7 +49,8 @@ class ServoTuning:
 
     # Constants of the cost of a fit and of its derivatives (`servo.problem`, `servo.rollouts`).
 
-    # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
+    # [s] Upper bound of the estimated correlation time of the position errors. Most measured correlation times are
+    # above 0.2 s, so the bound must be larger.
     correlation_time: float = 0.5
     # [1] Finite-difference step of the parameters. The step must be far above the rounding errors of rollouts, which
     # lose about half the digits of double precision.
@@ -57,7 +58,8 @@ class ServoTuning:
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
     max_step: float = 1.0
-    # [1] Number of samples from which the directions of the body parameters are computed.
+    # [1] Number of samples at whose positions the effect of body parameters on gravity is computed, which determines
+    # the fitted directions (`body_directions`).
     gravity_samples: int = 2000
 
     # Constants of the outer iterations and their convergence (`servo.objective`).
@@ -75,7 +77,7 @@ class ServoTuning:
     # `min_decrease` is too small for the high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
     # [1] Levenberg-Marquardt damping of the first step of the second and third outer iteration. With 1e-3, the few
-    # steps would end with an error of kd of 0.3 %.
+    # steps of these iterations would end with an error of kd of 0.3 %.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the derivatives from which the covariance is computed. With a shorter step, the
     # derivatives of a joint that is about to slip would be too large and its intervals too narrow.

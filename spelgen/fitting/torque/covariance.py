@@ -62,7 +62,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     noise = problem.noise / problem.jacobian.logged_scale(x)
     blocks = contiguous_blocks(problem.jacobian.samples)
     products = torch.stack([_products(TorqueJacobian(model, block), x) for block in blocks])
-    weighted = (products / noise.square()[:, None, None]).sum(dim=1)  # weighted: (blocks, K + 1, K + 1)
+    weighted = (products / noise.square()[:, None, None]).sum(dim=1)  # Gram matrices, (blocks, K + 1, K + 1)
     curvature = (change.mT @ weighted[:, :-1, :-1] @ change)[:, free][:, :, free]
     descent, prior = (weighted[:, :-1, -1] @ change)[:, free], problem.prior.precision[free][:, free]
     covariance = torch.linalg.inv(curvature.sum(dim=0) + prior)

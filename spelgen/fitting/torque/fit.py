@@ -231,7 +231,8 @@ def _compared_fit(
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < best.held_out.sum():
             best, replaced = restarted, nmse(best.held_out)
-    # A fit that is supported by its data is kept even if the URDF is exact: it has the smaller intervals.
+    # A fit whose nMSE is below the threshold is kept even if the model before the fit (URDF) is exact and predicts
+    # better: the intervals of the fit are smaller.
     if nmse(best.held_out) > TUNING.unsupported:
         model.load_state_dict(initial)
         unfitted = _unfitted(model, samples, prior, blocks)

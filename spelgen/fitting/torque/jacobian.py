@@ -98,7 +98,7 @@ class TorqueJacobian:
 
     @cached_property
     def torque_std(self) -> torch.Tensor:
-        """Standard deviation of the measured joint torque, (n,) [Nm, N]."""
+        """Standard deviation of the measured joint torque over the samples, (n,) [Nm, N]."""
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:

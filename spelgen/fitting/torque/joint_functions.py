@@ -72,7 +72,7 @@ class JointFunction:
     def read(self, terms: ResidualTerms) -> torch.Tensor:
         """Return the weights (P,) of the `JointFunction` that represent the term's current parameter in `terms`.
 
-        The weights of trends are zero: the weights of single entries suffice.
+        The weights of the L trends (see the class) are zero: the W weights of single entries suffice.
         """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
@@ -83,7 +83,8 @@ class JointFunction:
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
         """Set the term's parameter in `terms` to the values that weights (P,) of the `JointFunction` represent."""
         count = self.trends.shape[1]
-        # Trends have a separate prior in the fit but no parameter in the model, so they are added to the entries.
+        # Trends (see the class) have a separate prior in the fit but no parameter in the model, so their part is added
+        # to the entries of the term.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
             # The model bounds the logarithm of a friction factor by a tanh, which is inverted here.
@@ -193,8 +194,8 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
-            # The weights of a position-dependent torque will be eliminated. The torque in the model is set to zero, or
-            # it would count twice.
+            # The next fit will eliminate the weights of a position-dependent torque by variable projection. The torque
+            # in the model is set to zero, or it would count twice.
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))

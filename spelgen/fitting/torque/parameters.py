@@ -335,8 +335,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
 
     Each body also has a width b of its own. Its hyperprior has the same form, with the width s of all bodies in place
     of s0. Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale
-    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2
-    (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2 with
+    its current width b (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.
@@ -361,7 +361,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), sum per body
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |d|^2 of each body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

@@ -149,7 +149,7 @@ class TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
         widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
-        root mean square torque error (see the class). The initial noise is the upper bound of the noise.
+        root mean square torque error (see the class). The initial noise is `NoiseEstimator.upper_bound`.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -205,10 +205,12 @@ class TorqueProblem:
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters.
 
-        residual: result of `residual`, (n,), which is not used: the residual of each sample is computed here.
+        residual: squared residual per joint, (n,) [Nm^2, N^2], which is not used: the residual of each sample is
+        computed here.
         """
-        # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
-        # computed first, and the rows and columns of the free ones are selected afterwards.
+        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters.
+        # Therefore the Hessian of all parameters is computed first, and the rows and columns of the free ones are
+        # selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -217,7 +219,7 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,), step of the k free parameters.
+        step: (k,), step of the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate

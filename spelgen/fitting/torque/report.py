@@ -118,8 +118,8 @@ def _few_data(
     ridge regression is part of the text; None: no comparison.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
-    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion, up to a
-    # minute, which is enough for the recorded arms.
+    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion. It is at
+    # most a minute, which is enough for all arms whose recordings were tested.
     enough = min(math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported), 60)
     ridge = "" if comparison is None else f" (nMSE {comparison.regression:.2g}, mean over joints)"
     return _warning(

@@ -120,7 +120,8 @@ def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> d
     """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
 
     The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
-    torque splines is zero for joints without gravity load, since the springs that they represent balance a load.
+    torque splines is zero for joints without gravity load: the splines represent springs, which are built in to balance
+    a load.
 
     Args:
         model: fitted model.
@@ -229,8 +230,9 @@ def _cross_validate(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the cross-validation error (T,) [Nm, N], and a mask (T,) of the samples without extrapolation.
 
-    The error at a sample is the error of the fit to the other folds. The mask is True if the position of the sample is
-    within the range of positions of this fit.
+    The candidate is fitted to ``target``, (T,) [Nm, N]; for the other arguments see `_best`. The error at a sample is
+    the error of the fit to the other folds. The mask is True if the position of the sample is within the range of
+    positions of this fit.
     """
     position = candidate.position
     error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
