@@ -323,14 +323,15 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual times `logged_scale`, and the compressed Jacobian of the modelled torque.
+        """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        The Jacobian is the negated Jacobian of the scaled residual. Its rows of several joints are computed in one
-        reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974). Joints on which no
-        common drive acts may have the same colour. A parameter of a drive then affects the torque of at most one joint
-        of a colour, and so does the gravity torque on the drive. A derivative of the sum of all torques of a colour is
-        therefore the derivative of the torque of this joint. Most arms have one colour, so one pass replaces n passes.
-        Each sample has its own copy of the parameters, so that a pass gives the derivatives of all samples.
+        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. Its
+        rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
+        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
+        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
+        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
+        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
+        pass gives the derivatives of all samples.
 
         Args:
             parameters: {name: values}, the parameters at which the derivatives are computed.

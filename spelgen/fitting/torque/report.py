@@ -99,8 +99,8 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     """Return a median-unbiased nMSE of held-out blocks, (n,): it is too small or too large with equal probability.
 
     The mean of few squared errors is more often too small than too large. The sum of all squared errors is assumed to
-    be chi-squared with one degree of freedom per second, since errors within `TUNING.segment` are correlated. The nMSE
-    is multiplied by (degrees of freedom) / (median of this distribution).
+    be chi-squared with one degree of freedom per `TUNING.segment`, one second, since errors of models are correlated
+    over such times. The nMSE is multiplied by (degrees of freedom) / (median of this distribution).
     """
     seconds = samples.count * samples.interval / TUNING.segment
     # The correction is important only for short logs: the factor is 1.27 for three seconds of motion, and 1.06 for
