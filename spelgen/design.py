@@ -31,15 +31,16 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of a model: how each quantity of the equations of motion (M, V, friction, G) is represented.
 
-    V is the potential energy, G the input matrix. The types of the fields list the values of each quantity.
+    V is the potential energy, G the input matrix. The types of the fields list the possible representations of each
+    quantity.
 
     ``derived``: the structure of the arm determines which entries of the quantity are zero, are constant, or depend on
-    which joints; networks learn only the entries that vary. ``dense``, ``dense-n``: a network learns the whole quantity
-    without knowledge of the arm. ``dense-3n``: a network learns rows for all three axes of each joint's frame, as in
-    the publications of such models, although a joint moves only about or along one axis (Wang et al., Sci Rep 15:33179,
-    2025, and Duong et al., IEEE T-RO 40:3695, 2024). ``closed-form``: rigid bodies with trained inertial parameters,
-    and networks for residual terms, if any. ``per-joint``: friction of each joint with a network. ``constants``: a
-    friction model with trained constants.
+    which joints; networks learn only the entries that vary. ``dense`` (of V) and ``dense-n`` (of friction, as an n x n
+    matrix): a network learns the whole quantity without knowledge of the arm. ``dense-3n``: a network learns rows for
+    all three axes of each joint's frame, as in the publications of such models, although a joint moves only about or
+    along one axis (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024). ``closed-form``:
+    rigid bodies with trained inertial parameters, and networks for residual terms, if any. ``per-joint``: friction of
+    each joint with a network. ``constants``: a friction model with trained constants.
 
     Raises SettingsError for an inconsistent combination.
     """

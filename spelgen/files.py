@@ -105,9 +105,9 @@ def limited_memory(size: int) -> Iterator[None]:
 def replacing(path: Path | str) -> Iterator[Path]:
     """Context manager that yields a hidden file, which at the end replaces `path` atomically, even if power fails.
 
-    An absent folder is created. If `path` is in the local copy of an address, the file is also uploaded. An interrupted
-    or failed write does not change `path`. Raises OSError with the path if the file cannot be written, for instance on
-    a full disk.
+    An absent folder is created. If `path` is in the local copy of a remote address such as `s3://bucket/logs`, the file
+    is also uploaded. An interrupted or failed write does not change `path`. Raises OSError with the path if the file
+    cannot be written, for instance on a full disk.
     """
     path = Path(path)
     with naming(path):
@@ -134,10 +134,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager in which an OSError gets the file name `path`; an OSError that names another file is unchanged.
+    """Context manager in which an OSError about `path` gets this file name; an OSError about another file is unchanged.
 
-    The error on a full disk names no file. An error in `replacing` names the hidden file; since this name contains the
-    name of `path`, it is replaced by `path`.
+    An error without a file name, such as the error on a full disk, is regarded as an error about `path`, as is an error
+    about the hidden file of `replacing`: the name of the hidden file contains the name of `path`.
     """
     try:
         yield

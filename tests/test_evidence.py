@@ -276,6 +276,20 @@ def test_a_second_of_motion_supports_no_fit(shared, arm):
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]
 
 
+@pytest.mark.parametrize(("seconds", "advice"), [(5.0, "record about 23 s"), (70.0, "a longer log would not help")])
+def test_a_longer_recording_is_advised_only_if_the_recording_is_short(robots, seconds, advice):
+    """Logs of more than a minute that support no fit are no reason to record a minute.
+
+    The held-out nMSE of both fits is replaced by 2, four times the largest one of a supported fit.
+    """
+    model = build(robots / "two_link.urdf", "closed-form")
+    samples = TorqueSamples.of([recording(model, "x", seconds, 0)], TUNING.decimation)
+    solution = replace(fit_torque(model, samples), held_out_nmse=np.full(2, 2.0))
+    (message,) = [x.message for x in torque_notes(model, samples, solution) if x.code == "few-data"]
+    assert advice in message
+    assert ("record about" in message) == (seconds < 60)
+
+
 def test_twelve_seconds_of_an_exciting_motion_support_a_fit(shared):
     solution, codes, _ = first_seconds(shared / "logs", "panda", 12.0)
     assert "few-data" not in codes

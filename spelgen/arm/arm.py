@@ -343,7 +343,10 @@ def _dependent_remarks(
 
 
 def _axis(frame: Frame, joint: UrdfJoint) -> np.ndarray:
-    """Return the direction (3,) of a joint's axis in the frame of its parent body. frame: frame of its parent link."""
+    """Return the direction (3,) of a joint's axis in the frame of the body that carries its parent link.
+
+    frame: pose of the parent link in the frame of this body.
+    """
     rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
     return np.asarray(rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis))
 
@@ -354,7 +357,7 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of the revolute joints in ``moved`` on the body of ``frame`` with axes parallel to ``axis``."""
+    """Return the names of revolute joints in ``moved`` whose parent is the body of ``frame``, parallel to ``axis``."""
     # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
     return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

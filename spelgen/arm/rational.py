@@ -178,8 +178,8 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     """
     # The angle is split into exact quarter turns and a remainder: only the remainder is approximated, so that the
     # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is in [-`eighth`, pi/2 -
-    # `eighth`), from -40 to 50 degrees. With bounds of +-45 degrees, rounding errors would change the number of quarter
-    # turns of angles of +-45 degrees, which are common.
+    # `eighth`), from -40 to 50 degrees. `eighth` is less than an eighth turn: with bounds of +-45 degrees, rounding
+    # errors would change the number of quarter turns of angles of +-45 degrees, which are common.
     eighth = 0.7
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)

@@ -1,8 +1,8 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results prove reasons for the structure of M and the potential energy V. A relation, such as parallel axes, is
-tested in exact arithmetic at two random rational configurations. A relation that is not true at all configurations
-fails this test with a probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results are proofs of the reasons for the structure of M and the potential energy V. A relation, such as parallel
+axes, is tested in exact arithmetic at two random rational configurations. A relation that is false at some
+configurations passes this test with a probability below 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -46,13 +46,15 @@ class Axes:
         self.arm = arm
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # The seed is constant, so that reports are reproducible.
-        # Two configurations suffice: the probability that a false relation is true by chance at one configuration is
-        # about (degree of the relation's polynomial) / 1e6.
+        # Two configurations suffice: a relation is a polynomial equation in random numbers below 1e6 (see
+        # `_configuration`). If the relation is false and the polynomial has the degree d, it is true by chance at one
+        # configuration with a probability of about d / 1e6.
         configurations = [_configuration(arm, generator) for _ in range(2)]
         # Exact fractions: directions (2, n, 3) and twists (2, n, 6) of the axes of the n joints.
         self._directions, self._twists = map(np.array, zip(*configurations, strict=True))
-        # The balance of the last body is tested if its joint is revolute and its inertials are known. In all other
-        # cases its inertial parameters are set to 1, for which all attributes about the last body are False.
+        # The mass balance of the last body is tested if its joint is revolute and its inertials are known. In all other
+        # cases its ten inertial parameters are set to 1: since none of the ten is zero, all attributes about the last
+        # body are False.
         last = arm.bodies[-1]
         inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
         if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
@@ -100,10 +102,13 @@ class Axes:
         The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
         ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
         the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
-        constant.
+        constant: if ``hinge`` rotates, the velocity of a point along ``slider`` is proportional to its distance from
+        the plane.
         """
+        # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
+        # any plane that is fixed to the child link of `hinge`.
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between them can turn ``slider`` out of any such plane.
+            return False
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
         normal = np.cross(self._directions[:, slider], self._directions[:, hinge])
         return all(_is_orthogonal(self._twists[:, joint], normal) for joint in later)

@@ -160,8 +160,8 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # The coefficients of a function with a single parameter are not normalised: they are lengths of the arm, which
-        # users recognise.
+        # The function of a group with a single parameter keeps its coefficients: the coefficients are lengths of the
+        # arm, which users recognise. The function of several parameters is divided by its first coefficient.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))

@@ -65,8 +65,8 @@ class _Sentences:
 
     Attributes:
         structure: structure of the arm.
-        axes: tests of the joint axes that prove reasons; None for an arm with branches or mimic joints, whose facts
-            have no reasons.
+        axes: tests of the joint axes, which prove the reasons of facts; None for an arm with branches or mimic joints,
+            whose facts have no reasons.
     """
 
     structure: Structure
@@ -92,12 +92,12 @@ class _Sentences:
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)
-        # Entries without a reason are listed last.
+        # The entries of M whose value has no known geometric reason are listed last, after the explained ones.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # A reason names one of the two joints of an entry. Its placeholder is replaced by the other one: the
-                # joint of the column or, if this joint is prismatic, the joint of the row (see `zero_reason`,
-                # `balance_reason`).
+                # A reason names one joint of an entry and has a placeholder for the other joint (see `zero_reason`,
+                # `balance_reason`): the other joint is the joint of the column or, if the joint of the column is
+                # prismatic, the joint of the row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -166,7 +166,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the geometric reason why an entry of M is constant; None if no reason is found."""
+    """Return the geometric reason why an entry of M is constant, as text, or None if no reason is found."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)
@@ -226,10 +226,10 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    Let c be the joint of the row. The reason is that the joints of the columns are coaxial or, if prismatic, parallel:
-    each of them gives the bodies that c carries the same velocity field, up to its sign. If c is the last joint and its
-    body is dynamically balanced, revolute joints only have to be parallel: their angular velocities are the same, up to
-    sign.
+    Let c be the joint of the row. The first possible reason is that the joints of the columns are coaxial or, if
+    prismatic, parallel: each of these joints gives the bodies that c carries the same velocity field, up to its sign.
+    The second is that c is the last joint, its body is dynamically balanced, and the joints of the columns are revolute
+    and parallel: the entries then depend only on the angular velocities, which are equal up to sign.
 
     entries: (row, column) of each entry, counted from 0.
     """

@@ -129,8 +129,8 @@ class Formulas:
     def trusted(self) -> str:
         """Text that states for which inertial parameters the formulas are valid.
 
-        Valid parameters have any values or, with ``assume="inertials"``, the zeros and symmetries of the URDF's
-        parameters.
+        The formulas are valid for parameters of any values or, with ``assume="inertials"``, for parameters with the
+        zeros and symmetries of the URDF's parameters.
         """
         if self.assume == "inertials":
             return "the URDF's inertial zeros and symmetries"
@@ -143,7 +143,7 @@ class Formulas:
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The formulas without an expression, of entries of M or of the potential energy V that are too long."""
+        """The formulas without an expression: entries of M, or the potential energy V, with too long closed forms."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -250,8 +250,8 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # For the inertials of the URDF, terms of different base parameters with the same monomial may cancel each
-        # other. Monomials whose total coefficient is zero are removed.
+        # The formulas are for the inertials of the URDF only: terms of different base parameters with the same monomial
+        # may cancel each other for these values. Monomials whose total coefficient is then zero are removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

@@ -91,7 +91,7 @@ class Inspection:
         }
 
     def text(self) -> str:
-        """Return the result as a report for a terminal: joints, pattern of M, needs of the model, facts, remarks."""
+        """Return the result as text for a terminal: joints, kinds of entries of M, functions to learn, facts."""
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
@@ -134,7 +134,7 @@ class Inspection:
         if self.input == "torque":
             return {"entries": entries}
         # Logs of torques determine all base parameters. Logs of position servos determine some parameters only in ratio
-        # to kp or together with others, so their JSON object lists these parameters, too.
+        # to kp, or together with the inertial parameters: for such logs the JSON object lists these parameters, too.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -217,7 +217,7 @@ class Inspection:
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
-        # An arm with constant M has no outputs, so there is nothing to list.
+        # If M is constant, its model has no outputs, so there are no sets of joints to list.
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"

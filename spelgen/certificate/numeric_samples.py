@@ -74,7 +74,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    # Without gravity, all gravity torques are zero, and they are divided by 1.
+    # Gravity torques are divided by their largest magnitude, but by 1 if all are zero (no gravity), to avoid 0 / 0.
     largest = np.abs(gravity).max() or 1.0
     mass = mass[:, :, rows, columns] / scale
     return NumericSamples(mass, scale, gravity / largest, mass[1:] - mass[0])
@@ -180,8 +180,8 @@ def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> 
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
     (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
-    column. M is the sum of its upper triangle and the transpose of this triangle: its diagonal entries are doubled, as
-    is permitted because each entry is compared relative to its own magnitude.
+    column. M is the sum of its upper triangle, which Pinocchio computes, and the transposed triangle. The sum doubles
+    the diagonal entries, which has no effect, because each entry is compared relative to its own magnitude.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -58,7 +58,8 @@ def inspect(
         # written. Text and LaTeX contain formulas up to the default length.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
-    # The result is printed before --strict and a failed proof end the command with an error code.
+    # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
+    # error.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(

@@ -66,7 +66,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
     for option in options:
         _name_values(option.annotation, option.default)
-    # Typer reads the options of a command from its signature and annotations, so both are replaced.
+    # Typer reads the options of a command from the signature and annotations of its function: both are set for `run`.
     parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {option.name: option.annotation for option in options}

@@ -173,7 +173,8 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
     chosen = log_source(arm, mapping).mapping
-    # Accepted codes are collected in a dict, which preserves the order, so that the record of a run is deterministic.
+    # The codes of log errors to accept, from the mapping and from --accept, are collected in a dict without duplicates.
+    # A dict preserves their order, so that the record of a run is deterministic.
     accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
     return chosen.model_copy(update={"accept": tuple(accepted)})
 

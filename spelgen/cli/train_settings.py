@@ -68,7 +68,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
     key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by the option --objective.
+    keys = Assignments.model_fields.keys() - {"objective"}  # The option --objective sets it: no key of --set.
     # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
@@ -112,7 +112,8 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
         # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The logs determine the objective later, and some objectives have no time limit. For these objectives the
-        # option `max_minutes` would be an error; as a setting, which is only a default value, it is ignored.
+        # No objective is given: the logs determine the objective after this point, and some objectives have no time
+        # limit. Among `options`, a time limit would then be an error; among `settings`, which are only default values,
+        # it is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

@@ -88,7 +88,8 @@ def load_comparison(path: Path) -> Comparison:
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
-    # A preset is a name or the path of a YAML file. Only paths are relative to the folder.
+    # A preset is a name or the path of a YAML file. A path is relative to the folder of the comparison's file; a name
+    # is not changed.
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)

@@ -91,8 +91,8 @@ def simulated_figures(
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
-    # The training loss is the loss that the fit minimises. Its windows, and those for the test loss, are therefore as
-    # long as the windows of the training, and not 1 s.
+    # The training loss is the loss that the fit minimises. The windows of training loss and test loss are therefore as
+    # long as the windows of the fit; only the prediction loss is over 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]
@@ -123,7 +123,7 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """Return windows that are evenly spread over the logs, about `TUNING.windows` at most.
+    """Return windows that are evenly spread over the logs, at most `TUNING.windows` plus one per log.
 
     A window contains `samples` samples: every `decimation`-th sample of a log.
     """
@@ -137,10 +137,10 @@ def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) ->
 def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[float | None, ...]:
     """Return the total, the position and the velocity error of predictions from the first sample of each window.
 
-    The position error is the squared error of q, summed over joints and averaged over windows and samples; the error of
-    a revolute position is the geodesic distance. The velocity error is computed from qd in the same way. The total is
-    the sum of the position and the velocity error (eq. 8 of the paper). Units are rad, m and s. An error that is not
-    finite is None. substeps: integrator steps per sample.
+    The position error is the squared error of q [rad^2, m^2], summed over joints and averaged over windows and samples;
+    the error of a revolute position is the geodesic distance. The velocity error is computed from qd [rad/s, m/s] in
+    the same way. The total is the sum of the numbers of the position and the velocity error, eq. 8 of Wang et al.
+    (2025). An error that is not finite is None. substeps: integrator steps per sample.
     """
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
@@ -157,7 +157,7 @@ def sizes(model: ArmModel) -> Figures:
     networks included), the number of inputs of the network of M, and the number of trained parameters.
     """
     figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
-    # The damping D has one output per joint if it is not computed by a network.
+    # If no network computes the damping D, each joint has a friction model, which is counted as one output.
     figures |= {"outputs of D": model.n, "inputs of M": 0}
     for name, module in model.named_modules():
         masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]

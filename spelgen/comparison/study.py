@@ -96,10 +96,10 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
 
 
 def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address: str | None = None) -> Study:
-    """Run the unfinished jobs, write comparison.json and return the study with all results.
+    """Run the unfinished jobs of ``study``, write comparison.json and return the study with all results.
 
-    A run with an error becomes a failure of the study; the same command runs it again. note: function called with a
-    line of text after each run. jobs, address: see `run_tasks`.
+    A job with an error becomes a failure of the study; the same command runs the job again. note: function called with
+    a line of text after each job. jobs: number of parallel jobs. address: address of a Ray cluster, see `run_tasks`.
     """
     waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)

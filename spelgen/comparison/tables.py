@@ -36,7 +36,7 @@ class ArmResults:
 
 
 def arm_sections(study: Study) -> list[ArmResults]:
-    """Return the tables and the sentence of each arm with finished runs, for the report of a comparison."""
+    """Return the tables of each arm with finished runs, and the sentence that names its best model, for a report."""
     arms: dict[str, list[RunResult]] = {}
     for job in study.jobs:
         if job.name in study.results:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """Base class of all models in memory that are made from a specification, which is their attribute ``spec``.
+    """Base class of models that are made in memory, without a module file, from the specification ``spec``.
 
     Each model has a second base class, from ``spelgen.runtime``, with its dynamics.
     """

@@ -30,8 +30,8 @@ class NetworkTuning:
     friction_units: int = 8
     # [1] Smallest number of hidden units per group of outputs (of a network) that depend on the same joints.
     min_units: int = 4
-    # [1] Smallest number of hidden units per group of outputs of a Kolmogorov-Arnold network, whose units have a
-    # learned function per edge.
+    # [1] Smallest number of hidden units per group of outputs (with the same joints) of a Kolmogorov-Arnold network;
+    # smaller than `min_units`, because each edge of such a network has a learned function.
     min_kan_units: int = 2
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
@@ -68,8 +68,9 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # The residual terms compute bounds of their functions in M from the armature, and need no mean and scale: a row
-        # of the table has only the joints of a function.
+        # The learned functions of R, the residual term of M, are scaled by bounds that the model computes from the
+        # armature, so that armature + R is positive definite. A row of the table therefore has the joints of a
+        # function, but no mean and scale.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -112,8 +113,8 @@ def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `runtime.rows.Joint` computes center and half range from the limits with the same rounding: a row omits
-        # `typical_range` if it is equal to the computed values.
+        # `typical_range` is (center, half range). `runtime.rows.Joint` computes the same two numbers from the limits,
+        # with the same rounding: the row of a joint omits `typical_range` if it is equal to the computed numbers.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
@@ -201,7 +202,7 @@ def _mass(spec: ModelSpec) -> Call:
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
-        # M is symmetric, so a module has only the lower triangle of the nominal mean.
+        # M is symmetric, so a module has only the lower triangle of the mean of the nominal M over positions.
         mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
         triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
         return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
@@ -213,7 +214,7 @@ def _mass(spec: ModelSpec) -> Call:
 
 
 def _mass_network(spec: ModelSpec) -> Call:
-    """Return the constructor call of the network whose outputs are the learned functions of M."""
+    """Return the constructor call of the network whose outputs are the learned functions of q in the entries of M."""
     # Each edge of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
@@ -229,7 +230,8 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
 
 
 def _potential(spec: ModelSpec) -> Call:
-    # The inputs cos q and sin q of a joint have the same scale.
+    # The inputs cos q and sin q of a joint are multiplied by the same factor, the sensitivity of V to the joint's
+    # position.
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
     # The network of V has a single output, the network of M has many: a fraction of its hidden units suffices for V.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))

@@ -42,7 +42,7 @@ class ModelTuning:
     """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
 
     # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
-    # positions. These eigenvalues are generalised ones, relative to the mean of the nominal M.
+    # positions. Both are generalised eigenvalues with respect to the mean of the nominal M over these positions.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -72,8 +72,8 @@ class ModelTuning:
     full_effort_at: float = 0.5
     # [s] Initial ratio kd / kp of a servo.
     servo_lag: float = 0.05
-    # [1] Armature of a drive of unknown rotor inertia, effort or speed, divided by the joint's diagonal entry of the
-    # nominal M.
+    # [1] Armature of a drive with unknown rotor inertia and an unknown limit of effort or speed, divided by the joint's
+    # diagonal entry of the nominal M.
     min_armature: float = 0.01
 
 
@@ -181,14 +181,15 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(
     coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
 ) -> JointSpec:
-    """Return the ``JointSpec`` of a coordinate: limits, typical friction and armature, and sensitivities of M and V.
+    """Return the ``JointSpec`` of a coordinate: limits, typical friction, armature, and sensitivities of M and V to q.
 
     Args:
         coordinate: joint with the limits of the URDF.
         sizes: typical magnitudes of M, potential energy V and torques.
         index: index of the coordinate, from 0.
         drive: settings of the joint's drive.
-        min_armature: armature if neither the rotor inertia nor both limits, effort and speed, are known [kg m^2, kg].
+        min_armature: armature if the rotor inertia and at least one of the limits of effort and speed are unknown [kg
+            m^2, kg].
     """
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
@@ -284,8 +285,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # Second moments below the bound are raised to twice the bound. All others and the principal directions are
-    # unchanged.
+    # Principal second moments below twice the bound are raised to twice the bound, so that rounding cannot make one
+    # smaller than the bound. All others and the principal directions are unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))

@@ -11,7 +11,7 @@ SKIP = "  # fmt: skip"  # With this comment in a module, ruff does not reformat 
 
 @dataclass(frozen=True)
 class Code:
-    """A name in source code, such as the name of a table; texts that are not names are ``str``."""
+    """A name in source code, such as the name of a table, written without quotes; a ``str`` is a string literal."""
 
     text: str
 

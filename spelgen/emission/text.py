@@ -202,7 +202,7 @@ def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
 
 
 def _mass_entries(spec: ModelSpec) -> str:
-    """Return the source of the function ``mass_entries``, which computes M from functions and constants."""
+    """Return the source of the function ``mass_entries``, which computes M from its functions f_j(q) and constants."""
     names = parts.term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"

@@ -1,7 +1,7 @@
 """Selection of the motions that charts show.
 
-Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion of median error and
-the motion of largest error. A predictor is the trained model or a baseline.
+Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion with the median
+error and the motion with the largest error of the trained model. Predictors are the trained model and the baselines.
 """
 
 import math
@@ -52,9 +52,9 @@ class PredictedMotion(DrawnMotion):
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         u: Commands of position servos, (T, n) [rad, m]; None for a window.
-        error: For a window: the RMS over q and qd of all joints of the error at the last sample, divided by the RMS
-            change of the same quantity from the first to the last sample, over all windows. For a replayed log: RMS
-            position error [rad, m].
+        error: For a window: RMS over joints of the relative errors of q and qd at the last sample [1]. A relative error
+            is an error divided by the RMS change of its quantity since the first sample, over all windows. For a
+            replayed log: RMS position error [rad, m].
     """
 
     start: float | None = None
@@ -162,7 +162,8 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
 
     At a low sample rate only the mean acceleration can be computed: the change of qd divided by the duration of the
-    interval. logs: the evaluated logs, for their preprocessing and the bristles of friction.
+    interval. logs: the evaluated logs, for their filter (`used`) and the break-away displacements of bristles
+    (`reach`).
     """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt

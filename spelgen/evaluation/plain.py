@@ -17,7 +17,7 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array of any shape as nested lists for JSON, of numbers as `number` returns them."""
+    """Return an array of any shape as nested lists for JSON, with five significant digits, and None if not finite."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))

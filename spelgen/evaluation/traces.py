@@ -1,4 +1,4 @@
-"""The curves from which the figures of an evaluation are computed: for pages, and `traces` in evaluation.json.
+"""Curves of an evaluation (errors, motions, torques, M, friction) for charts of pages, and `traces` in evaluation.json.
 
 All curves are arrays in SI units [rad, m, s, Nm, N, kg m^2, J], with NaN for unknown numbers. In JSON, numbers have
 five significant digits.
@@ -49,8 +49,8 @@ class Growth:
     Attributes:
         seconds: Times since the start of a prediction, (T,) [s].
         windows: Number of predictions.
-        relative: {predictor: quantiles of the relative error}: the errors of q and qd divided by the RMS change of q
-            and qd since the start.
+        relative: {predictor: 10, 50 and 90 % quantiles of the relative error over the windows}. The errors of q and qd
+            of each joint are divided by the RMS change of this q or qd since the start, over all windows.
     """
 
     seconds: Curve
@@ -67,7 +67,7 @@ class MassCurves:
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M along a trajectory at times t (T,) [s]. by: {predictor: entries of M along the trajectory}."""
+    """M along a trajectory at times t (T,) [s]. by: {predictor: its M, as `MassCurves`}."""
 
     trajectory: str
     t: Curve

@@ -50,11 +50,12 @@ def verdict(
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
-    identified: content of least_squares.json, for the range of motion of the training logs. limits: position limits of
-    the joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first
-    axis.
+    identified: content of least_squares.json, with the range of motion of the training logs, from which recommendations
+    of further recordings are computed. limits: position limits of the joints. independent: names of joints on whose
+    position the dynamics do not depend, such as a vertical first axis.
     """
-    # Each assessment function adds uses, and the texts with the errors from which they were decided.
+    # Each assessment function adds the uses for which the model is or is not sufficient, and texts with the errors that
+    # decide this.
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
@@ -158,7 +159,7 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
+    """Return the relative error (RMS error / RMS change), averaged over q and qd of all joints; infinity if unknown."""
     if errors is None or errors.mean_relative_rms is None:
         return math.inf
     return errors.mean_relative_rms

@@ -58,7 +58,8 @@ class Collisions:
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
         """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
 
-        bounds: position limits of the random positions from which ``ignored`` is found, and of prismatic joints.
+        bounds: position limits, for the random positions at which ``ignored`` is determined, and for the travel of
+        prismatic joints, by which displacements of the arm are bounded.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
@@ -136,7 +137,10 @@ class Collisions:
         return None
 
     def contact_at(self, q: np.ndarray, time: float = 0.0) -> Contact | None:
-        """Return the nearest pair at q (n,) [rad, m] if it is closer than the clearance, otherwise None."""
+        """Return the nearest pair of objects at q (n,) [rad, m]; None if its distance is not below the clearance.
+
+        time: time at which the motion is at q [s], for the result.
+        """
         distances = self.distances(q)
         nearest = int(distances.argmin()) if self.pairs else 0
         if not self.pairs or distances[nearest] >= self.clearance:
@@ -201,9 +205,10 @@ class Collisions:
         return self._names[objects.first], self._names[objects.second]
 
     def _pairs(self, chain: Chain, links: int) -> Iterator[tuple[int, int]]:
-        """Yield the indices of the two objects of each pair to be compared.
+        """Yield the indices of the two objects of each pair whose distance is computed.
 
-        links: number of objects that are shapes of links; they are the first objects.
+        Objects of the same body, and shapes of two bodies that a joint connects, form no pair. links: number of objects
+        that are shapes of links; these objects are followed by the floor and the boxes.
         """
         neighbour = {}
         for index, body in enumerate(chain.bodies):

@@ -111,7 +111,7 @@ def excite(
 def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
-    """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
+    """Return ``harmonics``, or its default for ``duration``. Raises SettingsError for a bad argument of `excite`."""
     bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
     bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}
     for name, (value, largest) in bounded.items():
@@ -128,9 +128,10 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of the acceleration, and the acceleration limits of the approach, (n,).
+    """Return the bounds with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
 
-    Without an acceleration limit, the approach reaches its largest speed in one second.
+    The approach is the motion to the first position of the exciting motion. Without an acceleration limit, the approach
+    reaches its largest speed in one second. arm: for the number and the names of the joints.
     """
     if acceleration is None:
         return bounds, bounds.speed

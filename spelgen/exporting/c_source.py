@@ -109,7 +109,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     """Return the C function of an entry point, which computes the outputs of a CasADi function.
 
     entry: function of the model, such as inverse_dynamics. function: CasADi function of scalar expressions, made by
-    `named_function`; its residual terms are computed in C.
+    `named_function`. Its residual terms are inputs, which the C function computes by calls of other C functions.
     """
     # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))

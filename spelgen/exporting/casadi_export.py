@@ -86,7 +86,7 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """Return a function for `check_parity`, which calls a CasADi function once per state and stacks the results."""
+    """Return a function for `check_parity`: it calls a named CasADi function per state and stacks the results."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]

@@ -147,7 +147,7 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """Matrix (n, n) from joint torques to motor torques: G^-1, with the identity at passive joints."""
+        """Matrix (n, n) from joint torques to motor torques: inverse of G, with 1 in zero rows of passive joints."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 

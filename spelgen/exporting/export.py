@@ -54,7 +54,8 @@ def export(
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
-    # Only a fit has intervals of its parameters and noise levels, which the export contains, too; a model has neither.
+    # A fit has 95 % intervals of its parameters, and noise levels of the estimator. The export contains both; a model
+    # that is given without its fit has neither.
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:

@@ -90,8 +90,8 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
-    # The reference has the unrounded angles of the URDF, as the file has: rounded angles, as in the model, would change
-    # M.
+    # The MJCF file has the angles of the URDF. The reference must have the same angles: the model has angles rounded to
+    # multiples of pi/2, which would change M.
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
@@ -103,7 +103,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the URDF's angles of joint origins, as in the MJCF: not rounded to pi/2."""
+    """Return the rigid-body model with the angles of joint origins in URDF and MJCF, which no rounding has changed."""
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
@@ -127,13 +127,14 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off, since the reference has none: MuJoCo has another friction model.
+    # Torque limits and friction are switched off: the reference of `check_mjcf` has neither, since MuJoCo's friction
+    # model differs from the model's.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # `constraint` is the linear map from the coordinates to the positions of all joints, including mimic joints.
     constraint = body_constraint(arm)
-    # The rows of the map are sorted in MuJoCo's order of joints, the order of the tree of bodies.
+    # The rows of `constraint`, one per joint, are sorted in MuJoCo's order of joints, the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
     jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]

@@ -77,7 +77,7 @@ def residuals_needed(function: ca.Function) -> list[str]:
 def _expressions(
     model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
 ) -> Outputs:
-    """Return {name: expressions} of all entry points except derivatives, and of ``force``.
+    """Return {name: expressions} of ``force`` and of all entry points that are not derivatives of other entry points.
 
     The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the input matrix G, the
     measured torque ``offset`` at zero torque, and the torque ``compensation`` that the drives add. ``force`` is M qdd +
@@ -85,9 +85,10 @@ def _expressions(
 
     Args:
         model: the model as NumPy arrays.
-        inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1), of K bristles per joint.
+        inputs: symbols q, qd, qdd, tau, dq (displacement), u (command of servos), (n, 1) each, and z, (n K, 1), the
+            friction state of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: True if the expressions will be differentiated: argument of `coriolis`.
+        derivatives: True if the caller differentiates the expressions for other entry points; passed to `coriolis`.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -148,7 +149,8 @@ def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: 
         z: friction state of K bristles per joint, (n K, 1).
     """
     motors = constant(model.motors)
-    # Power is equal at motors and joints, so the gravity torques ``load`` of the motors satisfy C^T load = gravity.
+    # C is the matrix `motors`: the motor speeds are C qd. Power is equal at motors and joints, so the gravity torques
+    # ``load`` of the motors satisfy C^T load = gravity.
     load = constant(np.linalg.inv(model.motors).T) @ gravity
     friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
@@ -250,8 +252,8 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
-    # No chain rule is needed for qd: symbols of residual terms depend on q only, and `coriolis` is an explicit
-    # expression in qd.
+    # The derivative of `force` with respect to qd needs no chain rule: the symbols of residual terms in `force` depend
+    # on q only, and `coriolis` is an explicit expression in qd.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
     # The Jacobians of the force are evaluated at the accelerations of the forward dynamics.

@@ -172,7 +172,7 @@ class _Decomposed(TorchFunctionMode):
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
-    """Return a function for `check_parity`, which evaluates an entry point in ONNX Runtime for arrays of states."""
+    """Return a function for `check_parity` that evaluates an entry point (key of ``files``) in ONNX Runtime."""
     sessions = {name: onnx_session(content) for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:

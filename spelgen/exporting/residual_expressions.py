@@ -70,9 +70,10 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
     """Return the Coriolis torque of R, the residual term of M: dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1).
 
-    derivatives: True if the result will be differentiated with respect to q. The result then depends on ``first``, the
-    Jacobian of ``mass``, and not on ``rate`` (d mass / dt) and ``kinetic`` (d/dq of 1/2 qd^T R qd), since there are no
-    symbols for the Jacobians of these two.
+    symbols: result of `residual_symbols`. Its ``mass`` has the entries of R, ``rate`` is d mass / dt, ``kinetic`` is
+    d/dq of 1/2 qd^T R qd, and ``first`` is the Jacobian of ``mass`` with respect to q. derivatives: True if the result
+    will be differentiated with respect to q. The result then depends on ``first``, and not on ``rate`` and ``kinetic``,
+    whose Jacobians have no symbols.
     """
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]

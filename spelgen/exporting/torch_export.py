@@ -56,7 +56,7 @@ def prepared(trained: Trained) -> PreparedModel:
 def program_names(trained: Trained) -> list[str]:
     """Return the names of the functions to export as programs, such as inverse_dynamics.
 
-    Raises RunError for unknown names.
+    Raises RunError for unknown names in ``trained.entries``.
     """
     available = [name for name in PROGRAMS if trained.model.elements or name not in FRICTION_STATE]
     return select_names(trained.entries, available)

@@ -126,7 +126,10 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint."""
+    """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint.
+
+    The names are the fields of ``FrictionConstants``, and ``position_factor``. projection: for the joint ranges.
+    """
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))

@@ -116,7 +116,8 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """Return the integrated autocorrelation time (n,), in samples, of the residuals (T, n) of all trajectories.
 
-    It is 1 plus twice the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
+    It is 1 plus twice the sum of the autocorrelations before the first negative one, a simpler form of the initial
+    sequences of Geyer (Stat. Sci. 7:473, 1992).
     """
     max_lag = min(500, max(map(len, residuals)) - 1)  # [samples] largest lag, 5 s at 100 Hz
     power = sum(np.square(x).sum(axis=0) for x in residuals)

@@ -128,7 +128,8 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
-    # Logs of position servos contain commands and no torques, so charts of velocity and torque are omitted.
+    # Logs of position servos contain commands in place of velocities and torques, so the charts of velocity and torque
+    # are omitted.
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:

@@ -90,7 +90,8 @@ def _explanation(entry: MassEntry, every_fact: Sequence[Fact]) -> str:
     default = f"depends on {joints_in_ranges(entry.joints)} only"
     lines = [f"{name} {predicates.get(entry.kind, default)}."]
     for fact in every_fact:
-        # The fact "M does not depend on ..." mentions no entry by name, but applies to every varying entry.
+        # The fact "M does not depend on ..." mentions no entry by name, but is listed for every varying entry, since it
+        # applies to all.
         of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
         if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
             lines.append(str(fact))
@@ -131,7 +132,8 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 def _colour(error: np.ndarray) -> np.ndarray:
     """Return colours (T, n) of the links of the animated arm, as numbers, for relative errors (T, n) of its joints.
 
-    A colour is proportional to the magnitude of the error (divided as in `evaluated_motions`); 1: an error of 0.5.
+    A colour is proportional to the magnitude of the error; 1: an error of 0.5. Position errors are divided by the
+    extent of the motion, torque residuals by the standard deviation of the torque, see `evaluated_motions`.
     """
     return np.asarray((np.abs(error) / 0.5).round(3))
 

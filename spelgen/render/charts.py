@@ -163,7 +163,7 @@ class Band:
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
         """Return the outline of the area between two curves as an SVG path, clipped to both axes.
 
-        NaN is drawn at the top.
+        NaN in a curve, as of diverged predictions, is drawn at the top of the chart.
         """
         # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
@@ -225,7 +225,7 @@ def line_chart(
         return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
-    # SVG counts pixels from the top, so the first pixel of the y axis is the bottom.
+    # SVG counts pixels from the top, so the y axis starts at the larger coordinate `bottom`.
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
     legend, beyond = [], []
     for mark in marks:

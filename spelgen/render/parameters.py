@@ -60,8 +60,9 @@ def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None
     columns = {"parameter": names, "URDF": urdf}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # The posterior has only base parameters of bodies and armatures, because the fit and least squares have
-        # different friction models. In the rows of friction, the column of the model is empty.
+        # The posterior has only the base parameters of bodies and armatures. Parameters of friction cannot be compared,
+        # because the fit and least squares have different friction models: the rows of friction have an empty column
+        # "model".
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)

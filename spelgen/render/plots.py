@@ -108,7 +108,8 @@ def _error_limits(errors: Mapping[str, tuple[Values, Quantiles]]) -> tuple[float
     `TUNING.outlier` times the largest quantile of the model. None is returned if `errors`, see `growth_chart`, has no
     entry of the model, or no positive error.
     """
-    # A page of several runs has one line per run and no baselines, so its axis is not limited.
+    # A page of several runs has one line per run and no baselines that could extend the axis, so the axis is not
+    # limited.
     if labels.MODEL not in errors:
         return None
     _, of_model = errors[labels.MODEL]

@@ -68,7 +68,7 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # `delay`: the fit has shifted the logged torques by this time, which the tables of the posterior state.
+        # `delay`: time by which the fit has shifted the logged torques [s]; shown in the tables of the posterior.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
 

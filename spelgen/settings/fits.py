@@ -49,10 +49,11 @@ UNLESS = {
 
 
 class GaussianPrior(Group):
-    """Standard deviations of the Gaussian prior of rigid-body and friction parameters, about their initial values.
+    """Standard deviations of the Gaussian prior of rigid-body and friction parameters about their initial values.
 
-    The parameters are logarithms or fractions without unit. The fit estimates the standard deviations of bodies,
-    armature and offset; the values here are their initial values.
+    The parameters are logarithms or fractions without unit. Typical friction is 2 % of a joint's effort limit, and the
+    typical speed is the velocity limit, if the URDF has these limits. The fit estimates the standard deviations of
+    bodies, armature and offset; the values here are their initial values.
 
     Attributes:
         bodies: Log-Cholesky parameters of the inertias; 0.1 is about 10 % of the mass and of the radii of gyration.
@@ -69,9 +70,10 @@ class GaussianPrior(Group):
         shared_friction: Logarithm of a factor on all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Weight of the initial value in the estimate of a standard deviation, as a number of
-            parameters. The standard deviation of each single body is estimated with the same weight, so that the prior
-            of its parameters is a Student-t distribution with this number of degrees of freedom.
+        degrees_of_freedom: No standard deviation, but the weight of the initial value in the estimate of a standard
+            deviation, as a number of parameters. The standard deviation of each single body is estimated with the same
+            weight, so that the prior of its parameters is a Student-t distribution with this number of degrees of
+            freedom.
     """
 
     bodies: Positive = 0.75

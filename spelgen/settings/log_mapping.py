@@ -122,7 +122,8 @@ class LogUnits(JointUnits):
 class JointWords(Group):
     """Periods, or sign bits, of the logged signals of one joint, in logged units; default: values are plain numbers.
 
-    A period is the interval after which logged values wrap around.
+    A period is the interval after which logged values wrap around. A sign bit s marks negative numbers in values of
+    sign and magnitude: s + x means -x.
 
     Attributes:
         q: Period or sign bit of positions.
@@ -295,7 +296,8 @@ class LogMapping(Group):
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
         """Return the mapping with other names of columns.
 
-        columns: {joint: {quantity: name of the column}}; None: the name in `columns` for all joints.
+        columns: {joint: {quantity: name of the column}}; for None, the joint has the column of the mapping's attribute
+        `columns`.
         """
         joints = dict(self.joints)
         for joint, names in columns.items():
@@ -311,7 +313,8 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # A period that the mapping contains may be longer than a turn: the range of a register with several turns.
+            # A period that the mapping contains is kept, because it may be longer than a turn: the range of a register
+            # that counts several turns.
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -321,10 +324,12 @@ class LogMapping(Group):
     def in_si(self) -> LogMapping:
         """Return the mapping for the same signals in a file with SI units and default names of columns.
 
-        `input` and `accept` are unchanged. The positions of a joint with a period have the period of one turn.
+        `input` and `accept` are unchanged. For joints whose logged positions wrap around after a period, the period of
+        positions becomes one turn, 2 pi rad.
         """
-        # Positions of a joint that wrap around in the log may also wrap around, after one turn, in a file that spelgen
-        # writes. If this mapping has a period for the positions of a joint, the new mapping therefore has one, too.
+        # If the positions of a joint wrap around in the log, the positions in a file that spelgen writes may wrap
+        # around after one turn. For each joint with a period of positions, the new mapping therefore has a period of
+        # one turn.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 

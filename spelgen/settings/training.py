@@ -65,7 +65,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the settings that are not None and are options of a fit with any objective."""
+        """{name: value} of the settings that are not None and are options of a fit, of at least one objective."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
@@ -109,7 +109,7 @@ class ComparisonSettings(Group):
         seeds: Number of runs of each preset.
         width: Units per hidden layer.
         depth: Number of hidden layers.
-        published: Published figures, by preset.
+        published: Errors and sizes of the presets in a publication about this robot, by name of the preset.
     """
 
     first: Positive | None = None

@@ -43,8 +43,8 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
     arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
-    # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the
-    # arm is first written and read without drives.
+    # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the arm
+    # is written and read twice: first without drives, for these scales, then with drives.
     bodies = _with_settings(path, settings, arm)
     settings["joints"] = _drives(arm, bodies, np.random.default_rng([seed, 1]))
     return _with_settings(path, settings, arm)

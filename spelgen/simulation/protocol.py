@@ -110,8 +110,8 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
     if settings.tracking.paths == "same":
-        # The phases of all joints differ by a constant from the phases of the first trajectory, so all trajectories
-        # follow the same path from different starting points.
+        # All joints have the same frequency. A constant that is added to the phases of all joints is therefore a shift
+        # in time: all trajectories follow the same path from different starting points.
         drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
     return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
 

@@ -46,10 +46,12 @@ def track(
 ) -> SimulatedLogs:
     """Return logs of the arm under feedback control along paths.
 
-    Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
-    is for testing. A log contains encoder positions after a zero-phase low-pass filter, velocities by central
-    differences of the filtered positions, and motor torques. Raises ArmError without inertials, SettingsError for a
-    joint without a range, and RunError if the motion cannot be integrated.
+    Each recording has the controller gains for the next bandwidth in `tracking.bandwidths`. Depending on
+    `tracking.paths`, each recording has its own random path, its own phases of the sines, or its own first point on a
+    common path. The last `test_fraction` of each recording is for testing. A log contains encoder positions after a
+    zero-phase low-pass filter, velocities by central differences of the filtered positions, and motor torques. Raises
+    ArmError without inertials, SettingsError for a joint without a range, and RunError if the motion cannot be
+    integrated.
 
     Args:
         arm: The arm.

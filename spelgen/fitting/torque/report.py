@@ -119,15 +119,17 @@ def _few_data(
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion. It is at
-    # most a minute, which is enough for all arms whose recordings were tested.
+    # most a minute, which is enough for the recorded arms. After a minute, the cause is not the duration.
     enough = min(math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported), 60)
+    advice = f"record about {enough} s in which all joints move"
+    if enough <= seconds:
+        advice = "a longer log would not help: `spelgen logs` tests units and signs, `spelgen excite` plans a motion"
     ridge = "" if comparison is None else f" (nMSE {comparison.regression:.2g}, mean over joints)"
     return _warning(
         "few-data",
-        "torques that were not fitted are predicted no better than by a constant at "
-        f"{joints} (nMSE {np.nanmax(nmse):.2g}): "
-        f"{seconds:.2g} s of this motion do not support a fit, the values of the URDF or of a ridge regression{ridge} "
-        f"may be as good; record about {enough} s in which all joints move",
+        f"torques that were not fitted are predicted no better than by a constant at {joints} "
+        f"(nMSE {np.nanmax(nmse):.2g}): {seconds:.2g} s of this motion do not support a fit, the values of the URDF or "
+        f"of a ridge regression{ridge} may be as good; {advice}",
     )
 
 
@@ -179,15 +181,10 @@ def _selected_terms(samples: TorqueSamples, solution: TorqueSolution, names: np.
     for term in solution.selected_terms:
         joint = "" if term.joint is None else f" at {names[term.joint]}"
         parts.append(f"{TERM_NAMES[term.name]}{joint} ({term.error_reduction:.1%})")
-    one = (
-        ""
-        if samples.recordings.any()
-        else "; all of them were selected in one recording: test them on another motion"
-    )
-    return (
-        "residual terms selected by cross-validation, with the decrease of the mean squared torque residual: "
-        f"{', '.join(parts)}{one}"
-    )
+    if not samples.recordings.any():
+        parts[-1] += "; all of them were selected in one recording: test them on another motion"
+    heading = "residual terms selected by cross-validation, with the decrease of squared torque residuals: "
+    return heading + ", ".join(parts)
 
 
 def terms_in_use(model: ArmModel) -> list[str]:
