@@ -146,7 +146,8 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
     linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
-    resists with at most its sliding force, so that the true resistance is the smallest of the K + 1 linear ones.
+    resists with at most its sliding force, so the resistance of the valid equation is the smallest one, and its |x| the
+    largest.
 
     Args:
         push: force on the joint, (..., n).

@@ -52,9 +52,9 @@ class LiveTuning:
     uncertainty: float = 3.0
 
     # [1] Fraction of the variance of torque errors that recurs if the motion recurs. More motion does not reduce this
-    # part: the variance of the torque of the estimated payload does not fall below this fraction of the variance of
-    # torque errors. Without this bound, the normalised squared error of the payload estimated for an arm without
-    # payload grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
+    # part: it is the lower bound of the variance of the torque of the estimated payload, divided by the variance of
+    # torque errors. Without this bound, the squared error of the payload estimated for an arm without payload, divided
+    # by its variance, grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
     recurring: float = 0.03
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).

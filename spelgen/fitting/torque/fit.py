@@ -1,6 +1,7 @@
 """Fit of a model of rigid bodies to torques, stage by stage.
 
-initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
+initial fit -> choice of friction with or without bristle states -> choice of friction effects (Stribeck, saturation,
+    load dependence) -> residual terms -> final fit
     -> comparison with ridge regression on held-out blocks of samples -> another fit if the regression is better
     -> comparison with the model before the fit, which is kept if the fit is not better
 
