@@ -81,7 +81,7 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with the disturbance included.
+        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with `disturbance` of `_stepper`.
 
         pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
         """
@@ -89,9 +89,10 @@ def _stepper(
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Return the state after one step, with the approximate Jacobian A = [[0, 1], [-M^-1 K, -M^-1 D]] of (q, qd).
+        """Return the state after one step of ROS2 (see `roll_out_stiff`).
 
-        D = d friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
+        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
+        friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -107,7 +108,8 @@ def _stepper(
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
             """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each.
 
-            A is the approximate Jacobian of (q, qd), and h = GAMMA times the step length.
+            A is the approximate Jacobian (see `step`), and h = GAMMA times the step length, with the parameter GAMMA of
+            ROS2.
             """
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
@@ -132,18 +134,19 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
+    """Return the derivatives of joint friction with respect to velocity (damping) and to position (stiffness).
 
-    D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
-    a joint depends only on the motion of the joint. Friction depends on position through the bristles.
+    Damping [Nm s/rad, N s/m] and stiffness [Nm/rad, N/m] are (W, n) for W windows, the diagonals of Jacobian matrices:
+    the friction of a joint depends only on the motion of the joint, and on its position through the bristles.
 
     Args:
         dynamics: dynamics of the arm.
-        pose: mass matrix and forces at the positions.
+        pose: equations of motion at the current positions, with the function of friction.
         qd, z: velocities (W, n) [rad/s, m/s] and friction state (W, n, K) [rad, m] of K bristles.
         width: finite-difference steps of velocity, (n,) [rad/s, m/s].
     """
-    # Central differences are used, because dry friction changes steeply at standstill.
+    # Central differences are used, because the slope of dry friction changes fast near standstill: their error is of
+    # second order in `width`.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
     # Negative damping (friction that decreases with velocity) is omitted from the friction derivative D, so that the
     # matrix M + h D + h^2 K of a Rosenbrock step remains positive definite. The method then treats this part of
@@ -169,8 +172,9 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS error in the test of `tolerance`, divided by the RMS change of velocity in the windows:
-    # otherwise an exact model would need the largest number of steps.
+    # [1] Lower bound of the RMS error of predicted velocities, with which `tolerance` is multiplied, divided by the RMS
+    # change of velocity in the windows: an exact model, with an error of zero, would otherwise need the largest number
+    # of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16

@@ -107,9 +107,9 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     A base parameter is its row of coefficients times the inertial parameters of B bodies and the n armatures, in the
     order of `constants_regressor`. That regressor is evaluated at random states. The parameter of a column that depends
     linearly on the preceding columns is regrouped into the parameters of those columns (Gautier and Khalil, IEEE T-RA
-    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter. Torque offsets are regrouped,
-    too, since constant gravity along a prismatic joint cannot be distinguished from an offset; the result does not
-    contain the coefficients of offsets.
+    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter. Torque offsets take part in
+    the regrouping, since constant gravity along a prismatic joint cannot be distinguished from an offset. The columns
+    and rows of the n offsets are then removed from the result.
 
     Args:
         chain: kinematics of B bodies.

@@ -43,13 +43,14 @@ class BristleReach:
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
 
-    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C of `BristleReach`.
+    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C, (n, n): the velocities of the drives are
+    C qd; None: each drive moves its own joint.
     """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Return the break-away displacements of a trained model; there are K = 0 bristles in a model without bristles."""
+    """Return the break-away displacements of the K bristles per drive of a trained model; K = 0 without bristles."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity

@@ -166,6 +166,8 @@ class FrictionModel:
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
         """Return the torque at the drives of each effect in `effects` per unit of its coefficient, (..., effects, n).
 
+        For example, the effect "viscous" has the torque `speed`, and "armature" has the torque `rise`.
+
         Args:
             speed: velocities of the drives, (..., n) [rad/s, m/s].
             rise: accelerations of the drives, (..., n) [rad/s^2, m/s^2].

@@ -160,8 +160,8 @@ def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Mo
     The result is differentiable with respect to the given parameters. Parameters that are not given have the values of
     the model.
     """
-    # The tensors of the model are replaced while the function is evaluated, as in `torch.func.functional_call`, which
-    # takes longer than most of the functions.
+    # The tensors of the model are replaced while the function is evaluated. `torch.func.functional_call` does the same,
+    # but takes longer than most of the functions.
     replaced = []
     for name, tensor in parameters.items():
         path, _, key = name.rpartition(".")

@@ -1,4 +1,4 @@
-"""Pinocchio model of a derived arm (its bodies, not its URDF file), with rotor inertia from the settings file."""
+"""Pinocchio model of a `Chain` (the bodies of an arm, not its URDF file), with rotor inertia from the settings file."""
 
 from collections.abc import Callable
 from functools import partial

@@ -67,7 +67,8 @@ class PinocchioDynamics:
         order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
         self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
         self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
-        # Products with K would take longer than Pinocchio's `aba` itself: they are skipped if K is the identity.
+        # Products with the constraint's Jacobian would take longer than Pinocchio's `aba`: they are skipped if it is
+        # the identity.
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property

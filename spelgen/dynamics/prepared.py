@@ -91,7 +91,10 @@ class PreparedModel:
         return self.model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self.model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the inputs tau, (..., n), that cause the accelerations qdd, (..., n) [rad/s^2, m/s^2]."""
+        """Return the inputs tau, (..., n), that cause the accelerations qdd, (..., n) [rad/s^2, m/s^2].
+
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on the velocity qd.
+        """
         return self.model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self.model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class RigidDynamics(Protocol):
         """Return h, (..., n): Coriolis, centrifugal and gravity torque, without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the friction torque, (..., n)."""
+        """Return the friction torque, (..., n) [Nm, N], with the sign of qd: it is subtracted from the inputs."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau."""
@@ -133,8 +133,8 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
     """Return the arguments about friction that a caller appends to (q, qd, ...) in a call of a method of `dynamics`.
 
-    They are () if z is None or friction has no state, even if a direction is given; otherwise (z, direction), or (z,)
-    if direction is None or the dynamics are not `RigidBodyDynamics`.
+    Three cases: () if z is None or friction has no state, since `direction` is passed after z; (z, direction) for
+    `RigidBodyDynamics` with a given direction; otherwise (z,).
 
     Args:
         dynamics: dynamics whose method is called.
@@ -154,7 +154,8 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts also call the methods of the friction state on the adapter, so it gets the methods of `dynamics`.
+        # Rollouts also call `memory` and `memory_after`, the methods of the friction state, on the adapter. They are
+        # therefore copied from `dynamics`.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements

@@ -26,8 +26,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
 
-    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): a
-    rollout takes two thirds of the time that it takes with (..., n, K).
+    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n), since a
+    rollout with this layout takes two thirds of the time with (..., n, K).
     """
 
     servo: ServoConstants
@@ -60,8 +60,9 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # `batch`: batch dimensions of the friction constants. If they have none, a dimension of size 1 is added, (K, 1, n),
-    # so that the constants broadcast with states of W windows, (K, W, n).
+    # Constants of K bristles of n drives are (K, *batch, n), with the batch dimensions of the friction constants.
+    # Without batch dimensions, one of size 1 is added, (K, 1, n), so that the constants broadcast with states of W
+    # windows, (K, W, n).
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
@@ -145,7 +146,8 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
     linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
-    resists with at most its sliding force, so that the true resistance is the smallest of the K + 1 linear ones.
+    resists with at most its sliding force, so the resistance of the valid equation is the smallest one, and its |x| the
+    largest.
 
     Args:
         push: force on the joint, (..., n).
@@ -154,8 +156,9 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
             shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # Cumulative sums over the number of sliding bristles, 0 to K. `remaining`: |push| minus the force of the sliding
-    # bristles. `resisting`: stiffness of the spring and of the bristles that do not slide.
+    # The linear equations for 0 to K sliding bristles are computed by cumulative sums. Their solutions |x| are
+    # `remaining` (|push| minus the forces of the sliding bristles) divided by `resisting` (`slope` plus the stiffness
+    # of the bristles that do not slide).
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)

@@ -38,7 +38,8 @@ class TipKinematics:
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        # The positions of the moving joints on the path to the link are _jacobian q + _offset; (joints, n), (joints,).
+        # The J moving joints on the path to the link include mimic joints. Their positions are _jacobian q + _offset,
+        # with _jacobian (J, n) and _offset (J,).
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
         # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
@@ -65,7 +66,7 @@ class TipKinematics:
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of all joints on the path to the link, (S, joints) [rad, m]; q: (..., n), S states."""
+        """Return the positions of all joints on the path to the link, (S, joints) [rad, m], of S states q, (..., n)."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 

@@ -1,4 +1,4 @@
-"""Constants of drives for which a posterior has 95 % intervals, and the straight line that approximates friction."""
+"""Constants of drives that have 95 % intervals, and friction torque approximated by a straight line over velocity."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -84,7 +84,7 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 
     def line_of(model: ArmModel) -> Tensor:
-        """Return viscous and Coulomb friction coefficients of `model`, (2, n), for the precomputed load and factor."""
+        """Return viscous [Nm s/rad, N s/m] and Coulomb [Nm, N] friction coefficients of `model`, (2, n)."""
         friction = model.friction
         speed = torch.from_numpy(speeds)[:, None] * friction.speed
         slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)

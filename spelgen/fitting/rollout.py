@@ -158,7 +158,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: Tensor) -> Tensor:
-    """Return the loss scales for mean squares (..., n) of n joints: square roots, at least 1 % of the largest root."""
+    """Return the loss scales of n joints, (..., n): roots of `mean_square`, at least 1 % of the largest root."""
     root = mean_square.sqrt()
     # The bound 1e-9 keeps the scale positive even if nothing varies, since errors are divided by the scale.
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
@@ -226,7 +226,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout of a window diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)

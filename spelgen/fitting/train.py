@@ -44,7 +44,7 @@ def train(
         config: a configuration, or options by name; the default objective depends on the logs.
         urdf: URDF that the module was built from, for the regularizer and the baselines; by default, the file with the
             URDF's original name in the module's folder.
-        source: run folder with a fitted model, by default ``folder``.
+        source: run folder with the fitted model, used only if ``module`` is None; by default ``folder``.
         of_logs: dict with fields of `Preprocessing`, validation_fraction and seed.
         require: function that checks the logs before the fit: it raises an error for unusable logs and returns
             diagnostics.
@@ -55,7 +55,8 @@ def train(
     run = RunFolder(folder)
     robot, notes, settings = None, list[Diagnostic](), dict(of_logs or {})
     if options.resume:
-        # The record is read first, so that a missing run is reported before the logs are read.
+        # The record of the run (config.json) is read first, so that a folder without a run is reported before the logs
+        # are read.
         record = run.read_record()
         # Validation logs that were passed from Python are not stored in a file, so this function cannot resume the run.
         if record.validation_fraction is None and record.validation:

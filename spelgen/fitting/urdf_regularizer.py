@@ -39,9 +39,9 @@ class UrdfRegularizer(NamedTuple):
         """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
         The loss is the sum of two terms, averaged over the positions. The first one is the squared Frobenius norm,
-        divided by n, of the difference of W (M - mean M) W^T, where W is `whitening` and model and URDF each have their
-        own mean M. The second one is the mean square over the joints of the difference of the gravity torques divided
-        by `gravity_scale`.
+        divided by n, of the difference of W (M - mean M) W^T, where W is `whitening`, and mean M is over the positions,
+        for model and URDF separately (see the module). The second one is the mean square over the joints of the
+        difference of the gravity torques divided by `gravity_scale`.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -58,7 +58,7 @@ def urdf_regularizer(
     """Return the regularizer towards a URDF; None without a URDF.
 
     If the URDF cannot be read, a message is appended to ``notes``, and the result is None. windows: windows of the
-    logs, whose range of positions determines the positions of the regularizer.
+    logs; model and URDF are compared at random positions in their range of positions.
     """
     if urdf is None or not urdf.exists():
         return None

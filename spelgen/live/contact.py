@@ -103,8 +103,8 @@ class ContactObserver:
             self.baseline, self.jerk = disturbance, np.zeros_like(disturbance)
         else:
             gains = np.full((len(inputs), 1), gain)
-            # Row 4 of `low` has twice the bandwidth of row 3. The difference between the two estimates of dp/dt
-            # indicates how fast dp/dt changes.
+            # Rows 3 and 4 of `low` are the momentum p after low-pass filters with the bandwidths `rate` and 2 `rate`.
+            # Each gives an estimate of dp/dt; the difference of the two indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
             # The baseline (slow disturbance) of a joint in contact is not updated, because the estimated disturbance
@@ -122,8 +122,8 @@ class ContactObserver:
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
         # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
         # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
-        # the variance of the residual therefore contains the square of `jerk`, and this square after the filter
-        # (`self.jerk`).
+        # the variance of the residual therefore contains the square of `jerk` for the present error, and this square
+        # after the filter (`self.jerk`) for the persisting error.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

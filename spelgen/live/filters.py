@@ -138,9 +138,9 @@ class LoadFilter:
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Update the state with the measurement y of one joint.
+        """Update the state with the torque residual y (`block.y`) of one joint.
 
-        A joint at rest updates only its own disturbance d.
+        A joint at rest updates only its own disturbance d (see the module).
 
         block: means over a block of samples. joint: index of the joint.
         """
@@ -163,8 +163,8 @@ class LoadFilter:
             self.P -= product
             self.P[:10, :10] += kept * product[:10, :10]
         else:
-            # The Kalman gains of all states except d are set to zero. Such a gain is not optimal, so the covariance is
-            # updated by Joseph's form, which is valid for any gain.
+            # A joint at rest updates only its disturbance d: the Kalman gains of all other states are set to zero. Such
+            # a gain is not optimal, so the covariance is updated by Joseph's form, which is valid for any gain.
             d, product = columns[-1], gain[columns[-1]] * covariance
             self.x[d] += gain[d] * residual
             self.P[d] -= product
@@ -204,7 +204,7 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the drift filters of the estimator: their states are the friction change a, a random walk, and d."""
+        """Return the drift filters of the estimator: states are friction change a, a random walk, and disturbance d."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
@@ -216,7 +216,8 @@ class JointFilters:
             torque: Torque residual of the block minus the torque of the payload, (n,) [Nm, N].
 
         Returns:
-            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each.
+            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each,
+            with an axis (...) for filters with different noise.
         """
         decay = np.ones_like(self.x)
         decay[..., -1] = np.exp(-block.duration / self.time_constant)

@@ -138,7 +138,7 @@ def balance_along(
 
     Args:
         model: model in double precision.
-        levels: noise levels, with the position of the tip, whose Jacobian is among the terms.
+        levels: noise levels; they also have the position of the tip (`point`), whose Jacobian is one of the terms.
         intake: checks of the samples; its state is updated.
         t: times, (T,) [s].
         samples: q [rad, m], qd [rad/s, m/s] and tau [Nm, N], (T, n) each.

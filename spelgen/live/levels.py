@@ -177,7 +177,8 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
     Its mean is computed for each k and each length of trials, together with `prior_trials` imaginary trials of the
     value `prior_variance`. The factor is the largest mean: errors of the model are correlated over time, so that the
-    mean may be larger for longer trials. The degrees of freedom are the number of trials, imaginary ones included.
+    mean may be larger for longer trials. The degrees of freedom are the number of trials of the largest mean's length,
+    imaginary ones included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -241,7 +242,8 @@ def _likelihood(
     # assumed to be at most a few standard deviations of the white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # The filters have drifts=False: joints at rest update no state, so the noise of joints in motion is estimated.
+        # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is
+        # estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -276,11 +278,11 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
     """Return the exponential distribution of the largest peaks of all logs, as fields of `NoiseLevels`.
 
     A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. Peaks
-    differ between logs. All peaks are therefore multiplied by a factor, which multiplies the contact thresholds, too.
-    Cross-validation determines the factor: for each log, thresholds are computed from all other logs. With these
-    thresholds times the factor, all held-out logs together have at most the number of alarms that the default rate of
-    false alarms allows. The factor is the same for all joints, because the joint that needs the largest factor differs
-    between logs.
+    differ between logs, so thresholds from some logs cause too many alarms on others. The distribution is therefore
+    fitted to all peaks times a factor, which multiplies the contact thresholds, too. Cross-validation determines the
+    factor: for each log, thresholds are computed from all other logs. With these thresholds times the factor, all
+    held-out logs together have at most the number of alarms that the default rate of false alarms allows. The factor is
+    the same for all joints, because the joint that needs the largest factor differs between logs.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].
@@ -321,12 +323,14 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)
-    # The number of peaks above `start` is the same for all joints, except for joints whose residuals are all zero.
+    # `start` is the same quantile for each joint, so the number of peaks above it is the same for all joints, except
+    # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, and the error of each is 1 / sqrt(count) of its value. The scales are shrunk
-    # towards their mean; the weight of the mean is the variance of the error divided by the variance over the joints
-    # (James and Stein, 1961). It is at most 1 - 1 / n, since the mean over n joints is estimated from n `count` peaks.
+    # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
+    # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
+    # the joints (James and Stein, 1961). It is at most 1 - 1 / n: `peak_count` is then at most n `count`, the number of
+    # peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)

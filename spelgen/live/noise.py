@@ -54,11 +54,11 @@ class NoiseLevels(BaseModel):
     fifth of the peaks is modelled by an exponential distribution.
 
     Attributes:
-        drift: Noise of the blocks of the drift filter.
-        load: Noise of the blocks of the payload filter.
+        drift: Noise of the torque residual, averaged over the blocks of samples of the drift filter.
+        load: Noise of the torque residual, averaged over the blocks of samples of the payload filter.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
-        resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
-            [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
+        resting: Additional threshold for a joint at rest: three standard deviations of the noise at rest that is added
+            to `observer`, (n,) [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
         peak_start: Smallest value of the exponential distribution, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
@@ -140,7 +140,8 @@ class NoiseLevels(BaseModel):
         Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
         With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds it by more than x
         with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start` + x, with the x
-        for which this probability times `tail_peaks` is the rate of false alarms.
+        for which this probability times `tail_peaks`, the rate of peaks above `peak_start`, is the rate of false
+        alarms.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

@@ -114,7 +114,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or "no payload" with limit."""
+    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or its mass limit."""
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(

@@ -118,8 +118,9 @@ class FrictionLaws(nn.Module):
     rest. Powers replace exponentials, so that a control loop takes a third of the time.
     """
 
-    # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Initial
-    # values are in units of the joint's typical friction and typical speed. A parameter of zero gives them.
+    # (name, group, unit of the constant, initial value of the constant) of each trained parameter.
+    # Initial values are in units of the joint's typical friction and typical speed; a constant has its
+    # initial value if its parameter is zero.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),

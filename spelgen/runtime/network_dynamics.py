@@ -222,10 +222,10 @@ class JointFriction(NetworkFriction):
 class DenseFriction(NetworkFriction):
     """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
 
-    L is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the joint frame as in the
-    model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves along its last axis only,
-    so only the row of the last axis of each joint is computed: the result is D, (..., n, n). The inputs of
-    the network are the encoding of q, and qd / typical speed.
+    L, (axes n, axes n), is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the
+    joint frame as in the model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves
+    along its last axis only, so only the row of the last axis of each joint is computed: the result is D,
+    (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
@@ -242,8 +242,8 @@ class DenseFriction(NetworkFriction):
     def prepare(self) -> Layers:
         """Return the parameter cache: layers of a network with the entries of L as outputs, row after row.
 
-        Only the row of each joint's last axis is included (see the class): n rows of n * axes entries
-        [sqrt(Nm s/rad), sqrt(N s/m)].
+        The class defines L and ``axes``. Only the row of each joint's last axis is included: n rows of n
+        * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)

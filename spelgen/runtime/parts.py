@@ -8,7 +8,7 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # returns M, (..., n, n), from its functions of q and constants, (...) each
+Entries = Callable[..., Tensor]  # (functions of q and constants, (...) each) -> M, (..., n, n)
 Layers = tuple[tuple[Tensor, Tensor], ...]  # (masked weights, biases) of each layer of a network
 # The four types below are Any, because each class of models defines its own named tuples for them.
 Intermediates = Any  # intermediate values of a network's evaluation, for its derivatives

@@ -45,7 +45,7 @@ class BaseParameter:
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
     """Return the number of base parameters, which is the rank of the energy regressor over random positions."""
-    points = 7  # Seven random positions determine the rank for most arms of at most seven joints.
+    points = 7  # Enough random positions for most arms of at most seven joints; the loop doubles them.
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)

@@ -5,10 +5,10 @@ weighted sum of the entries of M. A functional depends only on the joints in a s
 changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
 all changes.
 
-The f_j are selected greedily. The sets J are tried in the order of their joint closest to the root, joints at the tip
-first, and sets with the same such joint in the order of their size. For each set, single entries of M are tried before
-sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
-selection is optimal.
+The f_j are selected greedily. The sets J are sorted in two steps. The first criterion is their joint closest to the
+root: sets with only joints at the tip are tried first. The second criterion is their size, small sets first. For each
+set, single entries of M are tried before sums of entries. The sets of functionals that are linearly independent on U
+form a matroid, for which the greedy selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -68,7 +68,7 @@ class _Functional(NamedTuple):
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     """Return the minimal exact form of M: its varying terms f_j(q) B_j (outputs), and its constant terms c_k A_k.
 
-    spans: samples of M and of its changes.
+    The symbols are defined in the docstring of the module. spans: samples of M and of its changes with q.
     """
     functionals = list(_functionals(spans))
     entries = len(spans.keys)
@@ -84,13 +84,13 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
-    # `constant_values`, (S, entries), are samples of this difference.
+    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` (prime
+    # field) and `constant_values` (double precision), (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    # Row reduction gives a basis of this span; the entry of M at the pivot of row k defines the constant c_k. Entries
-    # that depend on few joints give short formulas for c_k. They are sorted first, since row reduction places pivots in
-    # the first possible columns.
+    # Row reduction of these samples gives the A_k; the entry of M at the pivot of row k defines the constant c_k.
+    # Entries that depend on few joints give short formulas for c_k. Such entries are sorted first, since row reduction
+    # places pivots in the first possible columns.
     order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -99,8 +99,8 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     solutions = _solved(constant_values[:, bound], constant_values)
     constants = []
     for pivot, row, row_values in zip(bound, rows, solutions, strict=True):
-        # The constant c_k is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
-        # entry.
+        # At the pivot of row k, A_k has the entry 1 and all other A are zero: c_k is the entry of M at the pivot minus
+        # the contribution of the varying terms f_j B_j.
         exact, approximate = _single(spans, pivot)
         for j, output in enumerate(functionals):
             coefficient = int(basis[j, pivot])
@@ -114,7 +114,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield the functions f_j (see the module): independent functionals of M that determine every change of M.
+    """Yield the functions f_j of the module, as independent functionals of M that determine every change of M with q.
 
     spans: samples of M and the spans of its changes.
     """
@@ -124,15 +124,16 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
         outside = spans.outside(joints)
         kernel = field.null_space(outside)[:, np.argsort(spans.order)]
         bound = [spans.order[pivot] for pivot in field.pivots(outside)]
-        # `missing`: number of functionals that depend on `joints` only and are independent of the chosen functionals.
+        # `missing`: number of functionals still to be chosen for the set `joints`: functionals that depend on these
+        # joints only and are independent of the chosen ones.
         on_changes = field.product(kernel, spans.varying.T)
         missing = field.rank(np.concatenate([chosen, on_changes])) - len(chosen)
         candidates = _candidates(spans, joints, kernel, bound, tried)
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # Each row of `rows` is a functional, represented by its values for a basis of U, the span of all changes of
-            # M. Functionals that differ by a constant have equal rows.
+            # Each row of `rows` is a functional, represented by its values for the basis `spans.varying` of all changes
+            # of M. Functionals whose difference does not depend on q have equal rows.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transpose of `rows` are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -187,9 +188,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # The functional is M at `entry`, the only entry outside `bound`, minus the combination of the entries in
-        # `bound` that other joints change equally. `coefficients` are the coefficients of this combination in double
-        # precision.
+        # The functional `row` is M at `entry`, the only entry outside `bound`, minus a combination of the entries in
+        # `bound`, which changes like M at `entry` if joints outside `joints` move. `coefficients` are the coefficients
+        # of this combination in double precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -201,7 +202,7 @@ def _candidates(
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
 
-    They are elements of the prime field, and the same in double precision.
+    The first array has elements of the prime field, the second one the same numbers in double precision.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1
@@ -218,9 +219,10 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a lower triangle, with their rows and columns, as rational numbers.
+    """Return the nonzero elements of a symmetric matrix's lower triangle, with row and column, as rational numbers.
 
-    exact, values: the elements of the lower triangle, (entries,), in the prime field and in double precision.
+    spans: its `keys` are the rows and columns of the elements. exact, values: the elements, (entries,), in the prime
+    field and in double precision.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
@@ -245,8 +247,8 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # Such a fraction exists for any element modulo PRIME. It is the represented number only if it is also close to
-        # `value`; otherwise the number has no short fraction.
+        # For any element, the algorithm finds a fraction that equals the element modulo PRIME. The fraction is the
+        # represented number only if it is also close to `value`; otherwise the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

@@ -63,13 +63,14 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """Error: the polynomial of an entry needs more multiplications of polynomial terms than its `Expansion` permits."""
+    """Error: the polynomial of V or of an entry of M needs more multiplications of terms than `Expansion` permits."""
 
 
 class Expansion:
     """M and V of ``arm`` as recorded operations, from which polynomials in s1, c1, q1, s2, ... are computed.
 
-    s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
+    M is the mass matrix, V the potential energy; an operation is recorded as a `Deferred`. s, c and q with a number are
+    sine, cosine and position of the coordinate with this number, from 1 (``Position``).
 
     Args:
         arm: the arm.
@@ -135,7 +136,8 @@ class Expansion:
         if action == "add":
             return x + y
         # The cost of a multiplication is the number of products of two polynomial terms: FLINT computes all of them
-        # before it collects like terms. A product with 0, the value of all inertial parameters but one, costs nothing.
+        # before it collects like terms. A product with 0 costs nothing; all inertial parameters except for one have the
+        # value 0.
         cost = 1
         for factor in (x, y):
             if isinstance(factor, fmpq_mpoly):

@@ -57,7 +57,7 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return typical values of M, V and torques of ``arm``, for the terms of M in its ``structure``."""
+    """Return typical values of the terms of M in the ``structure`` of ``arm``, of its potential energy and torques."""
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -99,7 +99,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return the coefficients with which the functions of m terms are computed from M, (m, n(n+1)/2).
+    """Return the coefficients of m terms' functions f as linear functionals of M (`Term.functional`), (m, n(n+1)/2).
 
     The columns are the entries of the lower triangle of M, row after row.
     """
@@ -120,7 +120,10 @@ def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body."""
+    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body.
+
+    from_urdf: True: values of the URDF; False: default bodies of 1 kg.
+    """
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
@@ -208,7 +211,7 @@ def _mass_changes(
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return the magnitudes of all coordinates, (n,), divided by the largest magnitude, and at least 0.02.
+    """Return the magnitudes of the effects of all coordinates on M or V, (n,), divided by the largest, at least 0.02.
 
     The results are factors of the inputs of networks; with the lower bound, every joint is an input.
     """
@@ -278,9 +281,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one. J
-    # counts as inconsistent only if this ratio is below fraction^2: the ratio of a slender body may be below
-    # `fraction`, although the body is consistent.
+    # [1] An inconsistent pseudo-inertia J is corrected: its smallest eigenvalue becomes `fraction` times the largest
+    # one. J counts as inconsistent only if the ratio of these eigenvalues is below fraction^2: the ratio of a slender
+    # body may be below `fraction`, although the body is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

@@ -23,7 +23,7 @@ from spelgen.urdf.robot import Assume
 
 
 class MassEntry(NamedTuple):
-    """An entry of the mass matrix: row and column (from 0), kind, and the coordinates that it depends on (from 0)."""
+    """An entry of M: row and column, kind (zero, constant or varying), and its joints (0-based indices)."""
 
     row: int
     column: int
@@ -80,7 +80,8 @@ def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
-    # Entries and terms of M are derived from ranks and zeros of the samples in `spans`.
+    # An entry of M is zero if all its samples in `spans` are zero, and varying if it changes with a coordinate. The
+    # ranks of the samples determine the terms of M.
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(

@@ -15,13 +15,13 @@ from spelgen.identification.intervals import QUANTILE
 def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
     """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
 
-    The fit determines the covariance of k parameters, from which the covariance of the K parameters of the model is
-    computed by their derivatives. Users of the result multiply standard deviations by 1.96. The covariance is therefore
-    scaled such that this product is half the 95 % interval of Student's t.
+    The fit determines the covariance of k parameters. The derivatives of the K parameters of the model with respect to
+    these k parameters give the covariance (K, K). Users of the result multiply standard deviations by 1.96. The
+    covariance is therefore scaled such that this product is half the 95 % interval of Student's t.
 
     Two covariances are added to it: the variance of kd, armature and friction due to errors of the friction model
-    (`ServoTuning.model_deviation`), and the prior covariance of the body parameters in the directions that the fit does
-    not change.
+    (`ServoTuning.model_deviation`), and the prior covariance of the body parameters orthogonal to the directions that
+    the fit changes (`ParameterMap.directions`).
 
     If no kp is known, the logs determine the common factor of all torques only by effort limits, and the limits in
     URDFs often differ from the limits of the motors. The variance of the logarithm of this factor is therefore raised

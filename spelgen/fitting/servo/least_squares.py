@@ -76,7 +76,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             (`BodyLoad.bias`), and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5), joint first
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
@@ -96,8 +96,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # The mean commands for a delay are cached: most evaluations of the residual have the same delay, since finite
-    # differences change one of the four unknowns at a time.
+    # The commands, averaged over each interval, are cached per delay: most evaluations of the residual have the same
+    # delay, since finite differences change one of the four unknowns x at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
         """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m].

@@ -46,7 +46,7 @@ class ServoObjective(Objective):
     """Objective of a servo fit. The fit uses all logs, without validation, and can be resumed at each outer iteration.
 
     A checkpoint contains the initial weights of the model, and the fitted parameters at the start of each outer
-    iteration. The load of the bodies and the scale of the position errors are recomputed from these parameters.
+    iteration. The torque of the rigid bodies and the scale of the position errors are recomputed from these parameters.
     """
 
     name: ClassVar[str] = "servo"

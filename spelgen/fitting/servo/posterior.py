@@ -57,7 +57,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters for the title of a table; for ratios to a kp, with the name of its joint."""
+        """Units of the base parameters for the title of a table, with "; ratios to kp of <joint>" if no kp is known."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 

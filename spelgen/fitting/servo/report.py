@@ -62,11 +62,12 @@ class FitSummary:
 class ServoSolution:
     """Normal equations and covariance of the k parameters at the end of a fit.
 
-    The dead zones of all joints are free parameters here.
+    The dead zones of all joints are free parameters here, unlike in the fit, where only joints with a dead zone have
+    one.
 
     Attributes:
         blocks: normal equations of B blocks of windows, (B, k, k) and (B, k); a block is a log or a segment of a log.
-        precision: (k,), precision of the prior.
+        precision: (k,), inverse prior variance of each parameter.
         covariance: (k, k), jackknife covariance of the parameters.
     """
 
@@ -104,8 +105,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The last solver step estimates the integration error of x. It counts as an error of one standard deviation, so its
-    # outer product is added to the covariance.
+    # The last solver step, with shorter integration steps than the fit, estimates the integration error of x. It counts
+    # as an error of one standard deviation, so its outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -127,7 +128,7 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
     Args:
         blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).
-        precision: (k,), precision of the prior.
+        precision: (k,), inverse prior variance of each parameter.
         indices: (m,), indices of the m parameters.
     """
     curvature = blocks.curvature.sum(dim=0)
@@ -161,7 +162,7 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each, for the current parameters of the model.
+    """Return {key of `RATIOS`: (ratios to kp, deviations)}, (n,) each, for the current parameters of the model.
 
     The deviations are the standard deviations of the logarithms of the ratios, from the covariance of ``solution``.
     """
@@ -170,8 +171,8 @@ def ratios_with_deviations(
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    # `blocks` (p + 1, p + 1, n): for each joint, the covariance of its p parameters and the delay, the last parameter
-    # of all.
+    # `blocks` (p + 1, p + 1, n): for each joint, the covariance of the joint's p parameters and the common delay, which
+    # is the last of the k parameters.
     index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
     blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}

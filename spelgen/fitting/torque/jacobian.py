@@ -98,7 +98,7 @@ class TorqueJacobian:
 
     @cached_property
     def torque_std(self) -> torch.Tensor:
-        """Standard deviation of the measured joint torque, (n,) [Nm, N]."""
+        """Standard deviation of the measured joint torque over the samples, (n,) [Nm, N]."""
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
@@ -249,7 +249,8 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # For s > 0: log(c (1 + s)) = log c + log1p(s), which equals log c + s to first order.
+            # A step s > 0 of log c becomes log(c (1 + s)) - log c = log1p(s), which equals s to first order; s < 0 is
+            # unchanged, since 1 + s could be negative.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -324,7 +325,8 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        The rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
+        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. Its
+        rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
         Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
         drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
         derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most

@@ -93,7 +93,7 @@ class ParameterVector:
 
         Args:
             adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
-                vary from day to day (`DAY_GROUPS`); None or "unit": all groups.
+                vary from day to day (`DAY_GROUPS`); None or "unit" (another arm of the same type): all groups.
             compensated: (n,) joints whose friction compensation is free; it is fixed at all other joints.
         """
         if adapt == "load":
@@ -120,14 +120,14 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
     together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
     without a significant coefficient have the median coefficient of the others.
 
-    A corrected gain is wrong by the same factor as the URDF's masses of the most loaded links. The prior of the gains
+    A corrected gain has the same relative error as the masses in the URDF that load the joint. The prior of the gains
     is then wide, so that the prior of all bodies determines the common scale of gains and masses.
 
     Args:
         model: model whose motor gains are corrected.
         samples: samples with torques as logged, (T, n) [Nm, N].
-        deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
-            coefficient exceeds three standard deviations.
+        deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the magnitude of the
+            coefficient's logarithm exceeds three of these standard deviations.
 
     Returns:
         `deviation` if no gain was changed, otherwise the upper bound of prior standard deviations.
@@ -209,8 +209,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    # If the change of S has overflowed, the fraction of it that keeps S positive definite cannot be computed. The whole
-    # step is returned; the solver rejects it because of its cost.
+    # If the change of S = T T^T has overflowed, the fraction that keeps S positive definite cannot be computed. The
+    # whole step is returned; the solver rejects it because of its cost.
     if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
@@ -278,9 +278,10 @@ class ParameterPrior:
 
     @property
     def plausible(self) -> bool:
-        """Whether the masses of the URDF agree with the fit up to a factor of `TUNING.wrong_urdf`.
+        """Whether the masses of the URDF differ from the fitted masses by at most a factor of `TUNING.wrong_urdf`.
 
-        The factor is exp(root mean square of `body_widths`), since the logarithm of a mass is a parameter.
+        Their ratio is estimated as exp(root mean square of `body_widths`), since the logarithm of a mass is a
+        parameter.
         """
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
@@ -334,8 +335,8 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
 
     Each body also has a width b of its own. Its hyperprior has the same form, with the width s of all bodies in place
     of s0. Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale
-    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2
-    (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2 with
+    its current width b (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.
@@ -346,13 +347,13 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return sqrt((squares + c center^2) / (gamma + c)), limited by the upper bound of the group's width.
+        """Return the updated width, sqrt((squares + c center^2) / (gamma + c)), limited by the group's upper bound.
 
-        c is the number of degrees of freedom of the hyperprior.
+        c is the number of degrees of freedom of the hyperprior (see `update_widths`).
 
         Args:
             group: name of the group, for the upper bound.
-            center: scale of the hyperprior: s0, or for a single body the width s of all bodies.
+            center: scale of the hyperprior: the initial width s0, or for a single body the width s of all bodies.
             squares: sum of squares of x - prior mean.
             gamma: effective number of parameters, same shape as squares.
         """
@@ -360,7 +361,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), sum per body
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |d|^2 of each body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

@@ -80,7 +80,7 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the largest noise (n,) [Nm, N], at most the noise of a model that predicts a constant torque."""
+        """Return the largest noise (n,) [Nm, N]: for the RMS residual `max_error`, or `torque_std` if smaller."""
         return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
@@ -149,7 +149,7 @@ class TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
         widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
-        root mean square torque error (see the class). The initial noise is the upper bound of the noise.
+        root mean square torque error (see the class). The initial noise is `NoiseEstimator.upper_bound`.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -205,10 +205,12 @@ class TorqueProblem:
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
         """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters.
 
-        residual: result of `residual`, (n,), which is not used: the residual of each sample is computed here.
+        residual: squared residual per joint, (n,) [Nm^2, N^2], which is not used: the residual of each sample is
+        computed here.
         """
-        # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
-        # computed first, and the rows and columns of the free ones are selected afterwards.
+        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters.
+        # Therefore the Hessian of all parameters is computed first, and the rows and columns of the free ones are
+        # selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -217,11 +219,11 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,), step of the k free parameters.
+        step: (k,), step of the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the curved step
-        # may have a lower cost.
+        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate
+        # along a curve (`curved_step`) may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -305,8 +307,9 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # noise^2 is defined as the mean squared residual times the correlation length (see `NoiseEstimator`). The mean
-        # squared residual does not depend on the sample interval, so noise^2 is proportional to the correlation length.
+        # noise^2 is the mean squared residual times the correlation length, in samples (see `NoiseEstimator`). Only the
+        # length depends on the sample interval, so the noise is multiplied by the square root of the ratio of the
+        # lengths.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -373,8 +376,9 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # The prior mean has the weight 1, and the estimated correlation time has `weight`: the number of independent errors
-    # in the samples divided by the number to which the prior mean is equivalent.
+    # A weighted mean is formed. The weight of the prior mean is 1. The weight of the estimated correlation time is the
+    # number of independent errors in the samples divided by `correlation_weight`, the number to which the prior mean is
+    # equivalent.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

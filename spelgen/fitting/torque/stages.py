@@ -110,7 +110,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     # `explained` is the coefficient of determination: the fraction of the squared residual that the regression line
     # explains.
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    # `deviations` is the t statistic of the slope: the slope divided by its standard deviation.
+    # `deviations` is |slope| divided by the standard deviation of the slope: the t statistic of the regression on
+    # velocity.
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
     if not first:
@@ -132,9 +133,9 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
     likelihoods of the fits with and without bristles decide (see `_rejected`), with one exception. If the likelihoods
-    of all joints together favour bristles, rate-only friction of a joint needs further evidence: the joint's torque
-    residual is significantly smaller without bristles on ten blocks of the log. The likelihood ratio of a single joint
-    is unreliable, since the errors of a motion are correlated.
+    of all joints together favour bristles, a joint has rate-only friction only if its torque residual on ten blocks of
+    the log is also significantly smaller without bristles (t test). The reason is that the likelihood ratio of a single
+    joint is unreliable, since the errors of a motion are correlated.
     """
     friction, residual = estimate.problem.jacobian.model.friction, _torque_residual(estimate)
     friction.memoryless.fill_(0.0)
