@@ -305,7 +305,7 @@ class LogChecks:
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
         kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
-        is_shared = entries[first].keys() == {"units"} and 2 * len(entries) > len(kin)
+        is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})
