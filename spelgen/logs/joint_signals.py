@@ -190,7 +190,7 @@ def find_dropouts(signals: JointSignals) -> str | None:
     """Return a message about the first signal of the joint with lost samples or outliers; None if there is none."""
     for name in (*signals.measured, "u") if signals.signal("u").size else signals.measured:
         values = signals.signal(name)
-        rows = np.flatnonzero(outlier_rows(name, values))
+        rows = np.flatnonzero(outlier_rows(name, values, signals.q))
         if rows.size:
             first, sound = rows[0], np.setdiff1d(np.arange(len(values)), rows)
             size = values[first] - values[sound[np.abs(sound - first).argmin()]]

@@ -172,7 +172,7 @@ def _leave_out_outliers(rows: Rows) -> None:
     outliers = np.zeros(len(rows.t), bool)
     dropped, columns = [], rows.columns
     for (quantity, joint), values in columns.items():
-        faulty = outlier_rows(quantity, values)
+        faulty = outlier_rows(quantity, values, columns["q", joint])
         if ("qd", joint) in columns or ("u", joint) in columns:
             others = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
             faulty |= stale_rows(quantity, values, rows.t, *others)
@@ -201,16 +201,20 @@ def _remove_delays(rows: Rows) -> None:
     rows.keep(covered)
 
 
-def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
+def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    quantity: "q", "qd", "tau" or "u". Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands
-    may be 0 for some time; only a single 0 is a lost sample.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may be 0 for some time, and jump: an
+    outlier is a single 0 or a value other than 0, twice as far from the position as all other commands.
+
+    quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
     rows = is_outlier(values, smooth=quantity == "q")
-    if quantity == "u":
+    if quantity == "u" and rows.any():
         present = np.pad(values != 0, 1, constant_values=True)
-        return np.asarray(rows & (present[1:-1] | (present[:-2] & present[2:])))
+        distance = np.abs(values - q)
+        rows &= present[1:-1] | (present[:-2] & present[2:])
+        rows &= distance > 2 * distance[~rows].max(initial=0.0)
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
