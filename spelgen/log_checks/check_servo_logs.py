@@ -15,7 +15,7 @@ from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.statistics import quantisation_step
-from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import Advice, joint_keys, mapping_line
 from spelgen.logs.parquet_files import UNLESS_NORMALISED
@@ -103,7 +103,6 @@ def _are_encoders(steps: np.ndarray) -> bool:
 
 
 ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
-OF_ONE = "other recordings do not have this fault: correct these files, or leave them out"
 UNIT: Check[Sequence[JointReport]] = Check(
     "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
 )

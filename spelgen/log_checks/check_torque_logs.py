@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
-from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
+from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.least_squares import varying
 from spelgen.identification.log_faults import Correction, Fault
@@ -32,7 +33,7 @@ from spelgen.log_checks.robot_checks import (
     fit_gravity,
     torque_factors,
 )
-from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
 from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
@@ -61,6 +62,7 @@ class TorqueLogs:
         self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
+        self._sources: list[tuple[str, Path | None]] = []
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory to the logs that `check` tests. Raises LogError if it has no torques."""
@@ -68,10 +70,12 @@ class TorqueLogs:
         inputs = self._drives.inputs.T
         pieces = []
         for x in split_at_gaps(trajectory, shortest=3):
-            pieces.append(MotionSamples.of(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
+            qdd = np.gradient(x.qd, x.t, axis=0)
+            pieces.append(MotionSamples.of(x.q, x.qd, qdd, x.tau @ inputs, len(self._sources)))
         if pieces:
             # at most 400 samples of a trajectory are kept, which suffice, since gravity and friction change slowly
             self._samples.append(joined_samples(pieces).thinned(400))
+        self._sources.append((trajectory.name, trajectory.file))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
         self._declared.append(set(trajectory.accepted))
@@ -88,14 +92,10 @@ class TorqueLogs:
         """
         # a check is omitted if the mapping accepts its findings, or if the mappings of all trajectories do
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
+        empty = MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
-        completed, evidence = [], []
-        fits = fit_gravity(chain, motion)
-        for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
-            completed.append(replace(report, gravity=gravity))
-            offset = self._mapping.offset("q", coordinate.name)
-            evidence.append(JointEvidence(coordinate, completed[-1], offset))
+        evidence = self._evidence(reports, motion)
+        completed = [joint.report for joint in evidence]
         # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
         # hints.
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
@@ -109,9 +109,16 @@ class TorqueLogs:
             # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
-            problem = None if unscaled else self._problem(motion if moving is None else moving)
-            is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
-            if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
+            samples = motion if moving is None else moving
+            problem = None if unscaled else self._problem(samples)
+            raw = self._problem(motion) if problem is not None and len(self._sources) > 1 else None
+            deviating = [] if raw is None else deviating_recordings(raw)
+            if deviating:
+                is_right = self._check_parts([motion, samples], deviating, reports, accepted, summary)
+            else:
+                flat = FlatTops.joined(self._flat)
+                is_right = problem is None or self._check_geometry(problem, flat, evidence, accepted, summary)
+            if problem is not None and is_right and not deviating and WITHOUT_GRAVITY not in accepted:
                 summary.notes.extend(_without_gravity(problem, completed))
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
@@ -131,6 +138,53 @@ class TorqueLogs:
             where = f"joint {', '.join(map(repr, joints))}, tau"
             summary.add(check, next(iter(joints.values())), where)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
+
+    def _evidence(self, reports: Sequence[JointReport], motion: MotionSamples) -> list[JointEvidence]:
+        """Return the joints with their statistics, to which the fit of gravity to samples of a motion is added."""
+        evidence, coordinates = [], self._arm.chain.coordinates
+        fits = fit_gravity(self._arm.chain, motion)
+        for coordinate, report, gravity in zip(coordinates, reports, fits, strict=True):
+            offset = self._mapping.offset("q", coordinate.name)
+            evidence.append(JointEvidence(coordinate, replace(report, gravity=gravity), offset))
+        return evidence
+
+    def _check_parts(
+        self,
+        samples: Sequence[MotionSamples],
+        deviating: Sequence[int],
+        reports: Sequence[JointReport],
+        accepted: set[str],
+        summary: Findings,
+    ) -> bool:
+        """Return True if no error is found in recordings that contradict the others, nor in the others.
+
+        Each deviating recording is tested by itself, and all others together. Errors of a deviating recording name it,
+        unless the others have errors, too.
+
+        Args:
+            samples: unfiltered samples of all recordings, and filtered ones, which are preferred.
+            deviating: indices of the recordings that contradict the others.
+            reports: statistics of each joint.
+            accepted: codes of the checks that the mapping accepts.
+            summary: findings, to which findings are added.
+        """
+        others = [k for k in range(len(self._sources)) if k not in deviating]
+        for part in (others, *([k] for k in deviating)):
+            motion, *filtered = (x.part(np.isin(x.recording, part)) for x in samples)
+            problems = [self._problem(x, len(part) / len(self._sources)) for x in (*filtered, motion)]
+            problem = next((x for x in problems if x is not None), None)
+            if problem is None:
+                continue
+            flat, found = FlatTops.joined([self._flat[k] for k in part]), Findings()
+            self._check_geometry(problem, flat, self._evidence(reports, motion), accepted, found)
+            (name, file), *_ = (self._sources[k] for k in part)
+            for error in found.errors:
+                where = f"trajectory {name}, {error.element}"
+                partial = replace(error, file=file, element=where, do=OF_ONE)
+                summary.errors.append(error if part is others else partial)
+            if summary.errors and part is others:
+                break
+        return not summary.errors
 
     def _unscaled_currents(self) -> list[Diagnostic]:
         """Return a warning about logged motor currents whose gain is still 1, as in the draft of a mapping.
@@ -155,15 +209,16 @@ class TorqueLogs:
         """Return True if the mapping states the unit of a joint's torque."""
         return self._mapping.unit("tau", joint) is not None
 
-    def _problem(self, samples: MotionSamples) -> GeometryProblem | None:
+    def _problem(self, samples: MotionSamples, share: float = 1.0) -> GeometryProblem | None:
         """Return the least-squares problem of the samples, for the comparison of hypotheses about the log.
 
-        None is returned for too few samples, or if all torques are constant.
+        None is returned for too few samples, or if all torques are constant. share: fraction of the recordings from
+        which the samples are.
         """
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         return GeometryProblem(
-            self._arm.chain, samples, self._drives.speeds, self._seconds, self._stated_hypothesis()
+            self._arm.chain, samples, self._drives.speeds, share * self._seconds, self._stated_hypothesis()
         )
 
     def _stated_hypothesis(self) -> Hypothesis:
@@ -181,6 +236,7 @@ class TorqueLogs:
     def _check_geometry(
         self,
         problem: GeometryProblem,
+        flat: FlatTops,
         evidence: Sequence[JointEvidence],
         accepted: set[str],
         summary: Findings,
@@ -193,6 +249,7 @@ class TorqueLogs:
 
         Args:
             problem: least-squares problem of the samples.
+            flat: flat tops of the positions and torques.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
             summary: findings, to which findings are added.
@@ -211,7 +268,7 @@ class TorqueLogs:
         if unsigned:
             summary.errors.extend(unsigned)
             return False
-        limits = find_limits(problem, FlatTops.joined(self._flat))
+        limits = find_limits(problem, flat)
         summary.notes.extend(limits.notes)
         if limits.errors and CLIPPED not in accepted:
             summary.errors.extend(limits.errors)

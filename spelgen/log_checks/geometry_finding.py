@@ -73,8 +73,7 @@ def find_unexplained(
         "torques that no hypothesis about senses, order, zeros, units and gravity explains: "
         f"{min(remaining, 1.0):.0%} of the variance remains"
     )
-    recordings = 1 + np.count_nonzero(np.diff(problem.samples.times) < 0)
-    do = "check each recording by itself, and " * bool(recordings > 1) + (
+    do = "check each recording by itself, and " * bool(np.ptp(problem.samples.recording)) + (
         "check that the columns are the torques of these joints, with their sign and at the times of the positions"
     )
     if best is None:

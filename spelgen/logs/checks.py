@@ -42,6 +42,8 @@ from spelgen.logs.unit_checks import (
 from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
+# Advice for a fault of some recordings: its settings would be wrong for the others.
+OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
 
 Subject = TypeVar("Subject")
 
