@@ -106,8 +106,11 @@ class LogGeometryTuning:
     unsigned_gain: float = 0.4
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
-    # Zero offsets [rad, m] and tilts of the base [rad] below this bound give warnings, not errors.
+    # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
     serious_angle: float = 0.17
+    # [m] Zero offsets of prismatic joints below this bound give warnings: a link of 0.3 m, tilted by `serious_angle`,
+    # has its end displaced by this distance.
+    serious_shift: float = 0.05
 
 
 TUNING, HINTS, GEOMETRY = IdentificationTuning(), DriveHintTuning(), LogGeometryTuning()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.tuning import GEOMETRY
 from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
@@ -34,7 +35,7 @@ NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] Smallest number of samples of a segment without gaps, for the smoothing polynomial.
 FOLLOWS = SIGNALS.agreement
 # [rad, m] Constant distance of commands from positions that shows another zero; servos deviate less under their load.
-OTHER_ZERO = 0.17
+OTHER_ZERO = {"revolute": GEOMETRY.serious_angle, "prismatic": GEOMETRY.serious_shift}
 # Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
 # step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
 # at each joint: 200 divided by the counts of the joint's calibrated range. NORMALISED_RANGE is the largest magnitude of
@@ -449,7 +450,7 @@ def _command_warning(
         code, message = "idle-command", f"its command {motion}: its servo is not determined"
     elif correlation < 0.5:
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
-    elif abs(offset) > OTHER_ZERO:
+    elif abs(offset) > OTHER_ZERO[report.kind]:
         side = f"{UNITS[report.kind].position} {'above' if offset > 0 else 'below'} its position throughout"
         code = "command-offset"
         message = f"its command is {abs(offset):.3g} {side}: other zeros of q and u, or a servo too soft for its load"

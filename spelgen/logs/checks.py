@@ -90,17 +90,21 @@ class Findings:
         where: str,
         file: Path | None = None,
         keys: Mapping[str, object] | None = None,
+        is_partial: bool = False,
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
         where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
         `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
-        the log without the correction.
+        the log without the correction. is_partial: True if the settings may be wrong for other recordings.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return
-        do = f"{mapping_line(keys) if keys else check.do}; --accept {check.code} if it is right"
+        do = mapping_line(keys) if keys else check.do
+        if is_partial:
+            do = f"{do} if this is true of all recordings; else correct this one, or leave it out"
+        do = f"{do}; --accept {check.code} if it is right"
         self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
@@ -291,7 +295,12 @@ class LogChecks:
                 where += f", joint {', '.join(map(repr, names))}"
             entries = {name: self._results[name, check][0][0].joint for name in names}
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
-            summary.add(check, message, where, file, keys)
+            # Units and columns would be wrong for recordings that have others. Dropped rows, periods and sign bits do
+            # not change sound recordings.
+            is_partial = len(occurrences) < self._count and any(
+                x in str(keys) for x in ("units", "columns", "rate")
+            )
+            summary.add(check, message, where, file, keys, is_partial)
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
