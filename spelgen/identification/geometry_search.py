@@ -56,6 +56,14 @@ def kinds_of_faults(
     )
 
 
+def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
+    """Return the kinds of faults that positions and commands of servos share, such as a joint of the opposite sense."""
+    sense = JointSense(len(arm.coordinates))
+    sense.factors = [factor for factor in sense.factors if (factor[1] < 0).any()]
+    order = WrongOrder("joint-order", "the columns of other joints", (0, 1), starts=3)
+    return order, sense, ZeroOffset(), Gravity()
+
+
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 

@@ -9,10 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from spelgen.arm.actuation import Drives
 from spelgen.errors import Diagnostic, LogError
-from spelgen.identification.tuning import GEOMETRY
+from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_servo_faults
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.motion_samples import DriveLog
+from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
+from spelgen.log_checks.geometry_finding import geometry_finding, stated_hypothesis
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
 from spelgen.log_checks.statistics import quantisation_step
@@ -20,6 +25,7 @@ from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
 from spelgen.logs.joint_signals import Advice, joint_keys, mapping_line
 from spelgen.logs.parquet_files import UNLESS_NORMALISED
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 from spelgen.settings.log_mapping import SCALES
@@ -103,6 +109,8 @@ def _are_encoders(steps: np.ndarray) -> bool:
     return bool(len(counts) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
 
 
+# [s] Delays of the commands, of which the best one is used in the test of senses, order and zeros of the joints.
+COMMAND_DELAYS = (0.0, 0.02, 0.035, 0.05, 0.075, 0.1)
 ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
 UNIT: Check[Sequence[JointReport]] = Check(
     "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
@@ -266,6 +274,8 @@ class ServoLogs:
             wrong = self._check_commands(following, saturation, summary)
             for k in set(range(len(completed))) - wrong:
                 summary.notes.extend(_command_warning(k, completed[k], following, self._logs))
+            if not summary.errors and following.moves.any():
+                self._check_geometry(summary)
         for coordinate, report in zip(self._arm.chain.coordinates, completed, strict=True):
             evidence = JointEvidence(coordinate, report, self._logs[0].mapping.offset("q", coordinate.name))
             for check, found in run_checks(POSITION_CHECKS, evidence):
@@ -277,6 +287,44 @@ class ServoLogs:
                 # the low rate is reported for one trajectory only: logs of one robot have the same sample rate
                 break
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
+
+    def _check_geometry(self, summary: Findings) -> None:
+        """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
+
+        Servos that no hypothesis explains, for example those with backlash, are not tested.
+        """
+        mapping = self._logs[0].mapping
+        problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
+        fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
+        best = min(
+            range(len(fits)), key=lambda k: float(np.log(fits[k] + GEOMETRY.error_floor).sum()), default=-1
+        )
+        if best < 0 or fits[best].max() > GEOMETRY.no_advice:
+            return
+        unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
+        if not better or better[0].errors.max() > GEOMETRY.explained:
+            return
+        if {fault.code for fault in better[0].hypothesis.faults} <= set(self._logs[0].accepted):
+            return
+        finding = geometry_finding(problems[best], mapping, unchanged, better)
+        (summary.notes if isinstance(finding, Diagnostic) else summary.errors).append(finding)
+
+    def _geometry_problem(self, delay: float) -> GeometryProblem | None:
+        """Return the least-squares problem of the torques kp (u - q), with unknown kp of each servo.
+
+        Friction in it includes the damping of the servos. delay: delay of the commands u [s]. None is returned for too
+        few samples.
+        """
+        chain, alone = self._arm.chain, np.eye(len(self._names))
+        collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())
+        for log in self._logs:
+            u = np.stack([np.interp(log.t - delay, log.t, x) for x in require_commands(log).T], axis=1)
+            collected.add(replace(log, tau=u - log.q, u=None))
+        samples, seconds = collected.samples(), sum(log.duration for log in self._logs)
+        if samples is None or len(samples.values) < HINTS.fewest_samples / 4:
+            return None
+        stated = stated_hypothesis(chain, self._logs[0].mapping)
+        return GeometryProblem(chain, samples, alone, seconds, stated, free_gains=True)
 
     def _check_units(self, summary: Findings) -> None:
         """Add an error to `summary` if positions of one or of all recordings have another unit than the mapping states.

@@ -15,15 +15,20 @@ from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
-from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
+from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_faults import Fault
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.geometry_finding import UNEXPLAINED, find_unexplained, geometry_finding
+from spelgen.log_checks.geometry_finding import (
+    UNEXPLAINED,
+    find_unexplained,
+    geometry_finding,
+    stated_hypothesis,
+)
 from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
@@ -217,21 +222,11 @@ class TorqueLogs:
         """
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
-        return GeometryProblem(
-            self._arm.chain, samples, self._drives.speeds, share * self._seconds, self._stated_hypothesis()
-        )
-
-    def _stated_hypothesis(self) -> Hypothesis:
-        """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
-
-        The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
-        """
-        joints, inputs, mapping = self._arm.chain.joint_names, self._drives.inputs, self._mapping
+        joints, inputs = self._arm.chain.joint_names, self._drives.inputs
+        # The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
         gears = np.diag(inputs) if np.count_nonzero(inputs) == len(joints) else np.ones(len(joints))
-        scale = np.array([[mapping.scale(quantity, joint) for joint in joints] for quantity in ("q", "tau")])
-        scale[1] *= np.where(gears, gears, 1.0)
-        offset = np.array([mapping.offset("q", joint) for joint in joints])
-        return replace(Hypothesis.unchanged(self._arm.chain), scale=scale, offset=offset)
+        stated = stated_hypothesis(self._arm.chain, self._mapping, np.where(gears, gears, 1.0))
+        return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
 
     def _check_geometry(
         self,
@@ -291,12 +286,7 @@ class TorqueLogs:
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             summary.notes.extend(_link_notes(problem, unchanged))
-        corrections = []
-        for fit in better:
-            corrections.append(
-                Correction(problem.arm, self._mapping, self._is_bag, problem.unchanged, fit.hypothesis)
-            )
-        finding = geometry_finding(unchanged, better[0], corrections)
+        finding = geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
         if isinstance(finding, Diagnostic):
             summary.notes.append(finding)
         else:
