@@ -111,6 +111,7 @@ def _are_encoders(steps: np.ndarray) -> bool:
 
 # [s] Delays of the commands, of which the best one is used in the test of senses, order and zeros of the joints.
 COMMAND_DELAYS = (0.0, 0.02, 0.035, 0.05, 0.075, 0.1)
+ONE_ZERO = "one zero of positions and commands"
 ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
 UNIT: Check[Sequence[JointReport]] = Check(
     "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
@@ -293,7 +294,6 @@ class ServoLogs:
 
         Servos that no hypothesis explains, for example those with backlash, are not tested.
         """
-        mapping = self._logs[0].mapping
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
         best = min(
@@ -306,8 +306,7 @@ class ServoLogs:
             return
         if {fault.code for fault in better[0].hypothesis.faults} <= set(self._logs[0].accepted):
             return
-        finding = geometry_finding(problems[best], mapping, unchanged, better)
-        (summary.notes if isinstance(finding, Diagnostic) else summary.errors).append(finding)
+        summary.extend([geometry_finding(problems[best], self._logs[0].mapping, unchanged, better)])
 
     def _geometry_problem(self, delay: float) -> GeometryProblem | None:
         """Return the least-squares problem of the torques kp (u - q), with unknown kp of each servo.
@@ -357,31 +356,33 @@ class ServoLogs:
     def _check_commands(self, following: Following, saturation: np.ndarray, summary: Findings) -> set[int]:
         """Add the faults of the commands to `summary`; return the indices of the joints with errors.
 
-        All recordings together are tested and, if there are several, each by itself. A fault of some recordings names
-        them if the joint tracks its commands in another recording.
+        Each recording is tested by itself. A fault names its recordings if the joint tracks its commands in another.
 
         following: tracking of the commands in all recordings. saturation: see `measure_following`.
         """
-        logs = self._logs
-        parts = [(logs, following)]
-        parts += [([log], measure_following([log], saturation)) for log in (logs if len(logs) > 1 else ())]
-        faults = dict[str, dict[int, list[tuple[Sequence[Trajectory], CommandFault]]]]()
-        sound = list[tuple[np.ndarray, dict[int, CommandFault]]]()
-        for part, tracking in parts:
+        faults, sound = dict[str, dict[int, list[tuple[str, CommandFault]]]](), set[int]()
+        for log in self._logs:
+            tracking = following if len(self._logs) == 1 else measure_following([log], saturation)
             if tracking is None:
                 continue
-            found = _command_faults(tracking, part, self._names, len(logs))
-            if len(part) < len(logs):
-                sound.append((tracking.moves & (tracking.correlation.diagonal() > FOLLOWS), found))
+            found = _command_faults(tracking, log, self._names, is_only=len(self._logs) == 1)
+            bounds = [OTHER_ZERO[x] for x in self._arm.chain.joint_types]
+            for k in np.flatnonzero(np.abs(tracking.offset) > bounds).tolist():
+                got = f"commands that are {tracking.offset[k]:.3g} above the positions throughout"
+                found.setdefault(k, CommandFault(got, ONE_ZERO))
             for k, fault in found.items():
-                faults.setdefault(fault.expected, {}).setdefault(k, []).append((part, fault))
+                faults.setdefault(fault.expected, {}).setdefault(k, []).append((log.name, fault))
+            tracks = tracking.moves & (tracking.correlation.diagonal() > FOLLOWS)
+            sound |= {k for k in np.flatnonzero(tracks).tolist() if k not in found}
         wrong = set[int]()
+        # A command offset of all recordings is a warning, since it may be due to the load of a soft servo.
         for by_joint in faults.values():
             groups = dict[tuple[str, ...], dict[int, CommandFault]]()
             for k, occurrences in by_joint.items():
-                names = tuple(part[0].name for part, _ in occurrences if len(part) < len(logs))
-                is_sound = any(tracks[k] and k not in found for tracks, found in sound)
-                groups.setdefault(names if is_sound else (), {})[k] = occurrences[0][1]
+                if occurrences[0][1].expected == ONE_ZERO and k not in sound:
+                    continue
+                names = tuple(name for name, _ in occurrences) if k in sound else ()
+                groups.setdefault(names, {})[k] = occurrences[0][1]
             for names, group in groups.items():
                 wrong |= group.keys()
                 joints = [self._names[k] for k in group]
@@ -401,7 +402,7 @@ def _place(names: Sequence[str]) -> str:
 
 
 def _command_faults(
-    following: Following, logs: Sequence[Trajectory], joints: Sequence[str], recordings: int
+    following: Following, log: Trajectory, joints: Sequence[str], *, is_only: bool
 ) -> dict[int, CommandFault]:
     """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
 
@@ -409,34 +410,34 @@ def _command_faults(
     position.
 
     Args:
-        following: tracking of the commands in `logs`.
-        logs: recordings, one or all.
+        following: tracking of the commands in a recording.
+        log: the recording.
         joints: names of all joints.
-        recordings: number of all recordings.
+        is_only: True if there are no other recordings.
     """
     faults = dict[int, CommandFault]()
-    correlations, mapping = following.correlation.diagonal(), logs[0].mapping
+    correlations, mapping = following.correlation.diagonal(), log.mapping
     is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
     exchanged = np.flatnonzero(is_tracked & (correlations < 0.5)).tolist()
     # In one of several recordings, a joint may rest at an obstacle while another one moves as its command does by
     # chance: at least two joints must track each other's commands.
-    if len(exchanged) > 1 or recordings == len(logs):
+    if len(exchanged) > 1 or is_only:
         for k in exchanged:
             source = int(following.correlation[:, k].argmax())
             is_found = following.correlation[source, k] > FOLLOWS
             keys = {"columns": {"u": mapping.column("u", joints[source])}} if is_found else {}
             got, do = "commands that other joints follow, and these do not", "check the names of the columns"
             faults[k] = CommandFault(got, "their own commands", keys, do)
-    of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, logs)
+    of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, log)
     # Correlation and gain are those at the delay of largest correlation, so that a slow servo is not reported as a
     # fault.
     for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
         if k in faults:
             continue
         if correlation > FOLLOWS and abs(np.log(gain)) > np.log(3):
-            keys = _command_units(gain, mapping.unit("q", joints[k]), mapping.unit("u", joints[k]))
+            units = _command_units(gain, mapping.unit("q", joints[k]), mapping.unit("u", joints[k]))
             got, do = f"positions that move {gain:.3g} times as far as commands", "log both in one unit"
-            faults[k] = CommandFault(got, "both in the same unit", {"units": keys} if keys else {}, do)
+            faults[k] = CommandFault(got, "both in the same unit", {"units": units} if units else {}, do)
         elif correlation < FOLLOWS < of_sum[k]:
             got = f"increments: the position follows the sum of the commands (correlation {of_sum[k]:.2g})"
             do = "log the commanded positions, or add the increments up"
@@ -448,19 +449,17 @@ def _command_faults(
     return faults
 
 
-def _sum_correlations(following: Following, logs: Sequence[Trajectory]) -> np.ndarray:
+def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
     """Return the correlation (n,) of each position with the sum of the commands of its joint.
 
     It is 0 if the position moves neither as far as the sum (commands that are increments) nor as far as the integral
     (commands that are velocities): a sum of periodic commands is correlated with any motion of this period.
     """
-    sums = [x.q[0] + np.cumsum(require_commands(x), axis=0).clip(-1e6, 1e6) for x in logs]
-    summed = measure_following(
-        [replace(x, u=u) for x, u in zip(logs, sums, strict=True)], following.saturation
-    )
+    u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
+    summed = measure_following([replace(log, u=u)], following.saturation)
     if summed is None:
         return np.zeros(len(following.gain))
-    factors = summed.gain[:, None] / [1.0, 1.0 / logs[0].sample_rate]
+    factors = summed.gain[:, None] / [1.0, 1.0 / log.sample_rate]
     is_sum = ((factors > 0.5) & (factors < 2)).any(axis=1)
     return np.where(is_sum, summed.correlation.diagonal(), 0.0)
 

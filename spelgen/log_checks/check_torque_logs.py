@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic, LogError, SpelgenError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
@@ -25,10 +25,11 @@ from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
 from spelgen.log_checks.geometry_finding import (
     UNEXPLAINED,
+    WARNINGS,
     find_unexplained,
     geometry_finding,
     stated_hypothesis,
-)
+)  # fmt: skip
 from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
@@ -52,6 +53,9 @@ if TYPE_CHECKING:
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
+SMALL_MOTION = "small-motion"
+# Codes of warnings after which the drives are not tested: the torques may not be those of the joints.
+UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
 class TorqueLogs:
@@ -114,17 +118,10 @@ class TorqueLogs:
             # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
-            samples = motion if moving is None else moving
-            problem = None if unscaled else self._problem(samples)
-            raw = self._problem(motion) if problem is not None and len(self._sources) > 1 else None
-            deviating = [] if raw is None else deviating_recordings(raw)
-            if deviating:
-                is_right = self._check_parts([motion, samples], deviating, reports, accepted, summary)
-            else:
-                flat = FlatTops.joined(self._flat)
-                is_right = problem is None or self._check_geometry(problem, flat, evidence, accepted, summary)
-            if problem is not None and is_right and not deviating and WITHOUT_GRAVITY not in accepted:
-                summary.notes.extend(_without_gravity(problem, completed))
+            samples = [motion, motion if moving is None else moving]
+            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted)
+            summary.extend(geometry)
+            is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
@@ -153,43 +150,43 @@ class TorqueLogs:
             evidence.append(JointEvidence(coordinate, replace(report, gravity=gravity), offset))
         return evidence
 
-    def _check_parts(
-        self,
-        samples: Sequence[MotionSamples],
-        deviating: Sequence[int],
-        reports: Sequence[JointReport],
-        accepted: set[str],
-        summary: Findings,
-    ) -> bool:
-        """Return True if no error is found in recordings that contradict the others, nor in the others.
+    def _geometry_findings(
+        self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
+    ) -> list[LogError | Diagnostic]:
+        """Return the findings about the geometry of the logs: of all recordings together, if their torques agree.
 
-        Each deviating recording is tested by itself, and all others together. Errors of a deviating recording name it,
-        unless the others have errors, too.
+        Recordings that contradict the others are tested by themselves, and the others together. Errors of such a
+        recording name it, unless the others have errors, too.
 
         Args:
-            samples: unfiltered samples of all recordings, and filtered ones, which are preferred.
-            deviating: indices of the recordings that contradict the others.
-            reports: statistics of each joint.
+            samples: unfiltered samples, and filtered ones, which are preferred.
+            evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
-            summary: findings, to which findings are added.
         """
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 else None
+        deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
         others = [k for k in range(len(self._sources)) if k not in deviating]
+        findings = list[LogError | Diagnostic]()
         for part in (others, *([k] for k in deviating)):
-            motion, *filtered = (x.part(np.isin(x.recording, part)) for x in samples)
-            problems = [self._problem(x, len(part) / len(self._sources)) for x in (*filtered, motion)]
+            chosen = [x.part(np.isin(x.recording, part)) if deviating else x for x in samples]
+            problems = (self._problem(x, len(part) / len(self._sources)) for x in reversed(chosen))
             problem = next((x for x in problems if x is not None), None)
             if problem is None:
                 continue
-            flat, found = FlatTops.joined([self._flat[k] for k in part]), Findings()
-            self._check_geometry(problem, flat, self._evidence(reports, motion), accepted, found)
-            (name, file), *_ = (self._sources[k] for k in part)
-            for error in found.errors:
-                where = f"trajectory {name}, {error.element}"
-                partial = replace(error, file=file, element=where, do=OF_ONE)
-                summary.errors.append(error if part is others else partial)
-            if summary.errors and part is others:
-                break
-        return not summary.errors
+            joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
+            flat = FlatTops.joined([self._flat[k] for k in part])
+            found = list(self._findings(problem, flat, joints, accepted))
+            if part is others:
+                findings += found
+                if any(isinstance(x, LogError) for x in found):
+                    break
+                continue
+            name, file = self._sources[part[0]]
+            for error in found:
+                if isinstance(error, LogError):
+                    where = f"trajectory {name}, {error.element}"
+                    findings.append(replace(error, file=file, element=where, do=OF_ONE))
+        return findings
 
     def _unscaled_currents(self) -> list[Diagnostic]:
         """Return a warning about logged motor currents whose gain is still 1, as in the draft of a mapping.
@@ -228,26 +225,20 @@ class TorqueLogs:
         stated = stated_hypothesis(self._arm.chain, self._mapping, np.where(gears, gears, 1.0))
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
 
-    def _check_geometry(
-        self,
-        problem: GeometryProblem,
-        flat: FlatTops,
-        evidence: Sequence[JointEvidence],
-        accepted: set[str],
-        summary: Findings,
-    ) -> bool:
-        """Return True if the torques agree with the mapping: they are not cut off, and no hypothesis fits much better.
+    def _findings(
+        self, problem: GeometryProblem, flat: FlatTops, evidence: Sequence[JointEvidence], accepted: set[str]
+    ) -> Iterator[LogError | Diagnostic]:
+        """Yield the findings about the geometry of recordings, in the order of the tests.
 
-        Hypotheses are, for example, other signs, orders or zeros of the joints. For torques that do not agree, the
-        finding is added to `summary`, and False is returned. Warnings about mechanical stops and about inertials of the
-        URDF are added to `summary`, too.
+        The tests end with a finding that explains the torques, or that leaves them unexplained. Tested are the motion,
+        signs and limits of the torques, then hypotheses about senses, order, zeros, units and gravity, and, if the
+        torques agree with the mapping, the inertials of the URDF.
 
         Args:
             problem: least-squares problem of the samples.
             flat: flat tops of the positions and torques.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
-            summary: findings, to which findings are added.
         """
         motion = problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
@@ -257,41 +248,34 @@ class TorqueLogs:
                 f"all joints stay within {TUNING.smallest_motion:g} rad or m: too little motion to test senses, order, "
                 "zeros, units and gravity"
             )
-            summary.notes.append(Diagnostic("warning", "small-motion", "logs", None, message))
-            return False
-        unsigned = find_unsigned(problem) if UNSIGNED not in accepted else []
-        if unsigned:
-            summary.errors.extend(unsigned)
-            return False
-        limits = find_limits(problem, flat)
-        summary.notes.extend(limits.notes)
-        if limits.errors and CLIPPED not in accepted:
-            summary.errors.extend(limits.errors)
-            return False
+            yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
+            return
+        wrong: Sequence[SpelgenError] = find_unsigned(problem) if UNSIGNED not in accepted else []
+        if not wrong:
+            limits = find_limits(problem, flat)
+            yield from limits.notes
+            wrong = limits.errors if CLIPPED not in accepted else []
+        yield from (x for x in wrong if isinstance(x, LogError))
+        if wrong:
+            return
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
-        if isinstance(unexplained, LogError):
-            summary.errors.extend([unexplained] if UNEXPLAINED not in accepted else [])
-            return UNEXPLAINED in accepted
-        if unexplained:
-            summary.notes.append(unexplained)
-            return False
-        if not better:
-            summary.notes.extend(_link_notes(problem, unchanged))
-            return True
-        faults = better[0].hypothesis.faults
-        if {fault.code for fault in faults} <= accepted:
-            return True
+        if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
+            return
+        if unexplained is not None:
+            yield unexplained
+            return
+        faults = better[0].hypothesis.faults if better else ()
+        if not better or {fault.code for fault in faults} <= accepted:
+            yield from () if better else _link_notes(problem, unchanged)
+            if WITHOUT_GRAVITY not in accepted:
+                yield from _without_gravity(problem, [joint.report for joint in evidence])
+            return
         # the evidence for another unit of one torque is gravity, which a wrong link of the URDF may change as well
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
-            summary.notes.extend(_link_notes(problem, unchanged))
-        finding = geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
-        if isinstance(finding, Diagnostic):
-            summary.notes.append(finding)
-        else:
-            summary.errors.append(finding)
-        return False
+            yield from _link_notes(problem, unchanged)
+        yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test, with candidates for wrong units of torques and positions.

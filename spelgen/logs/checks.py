@@ -83,6 +83,14 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
+    def extend(self, found: Iterable[Diagnostic | SpelgenError]) -> None:
+        """Add errors and notes."""
+        for each in found:
+            if isinstance(each, Diagnostic):
+                self.notes.append(each)
+            else:
+                self.errors.append(each)
+
     def add(
         self,
         check: AnyCheck,
