@@ -12,6 +12,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_servo_faults
+from spelgen.identification.least_squares import varying
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog
 from spelgen.identification.tuning import GEOMETRY, HINTS
@@ -299,7 +300,7 @@ class ServoLogs:
         best = min(
             range(len(fits)), key=lambda k: float(np.log(fits[k] + GEOMETRY.error_floor).sum()), default=-1
         )
-        if best < 0 or fits[best].max() > GEOMETRY.no_advice:
+        if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
             return
         unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
         if not better or better[0].errors.max() > GEOMETRY.explained:
@@ -320,7 +321,11 @@ class ServoLogs:
             u = np.stack([np.interp(log.t - delay, log.t, x) for x in require_commands(log).T], axis=1)
             collected.add(replace(log, tau=u - log.q, u=None))
         samples, seconds = collected.samples(), sum(log.duration for log in self._logs)
-        if samples is None or len(samples.values) < HINTS.fewest_samples / 4:
+        if (
+            samples is None
+            or len(samples.values) < HINTS.fewest_samples / 4
+            or not varying(samples.tau).any()
+        ):
             return None
         stated = stated_hypothesis(chain, self._logs[0].mapping)
         return GeometryProblem(chain, samples, alone, seconds, stated, free_gains=True)

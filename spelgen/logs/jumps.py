@@ -244,11 +244,13 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
+    is_whole = bool((values == values.round()).all())
     for size in sizes:
-        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise).
-        # Words with a sign bit have values above the sign bit, which represent negative numbers.
+        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise, if
+        # they are not whole numbers). Words with a sign bit have values above the sign bit, which represent negative
+        # numbers.
         readings = []
-        if np.ptp(values) < 1.01 * size:
+        if np.ptp(values) < (size if is_whole else 1.01 * size):
             readings.append(Word("period", size, decoded(values, "period", size)))
         if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, signed(values, size)))
