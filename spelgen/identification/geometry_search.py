@@ -119,26 +119,28 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     coarse = problem.thinned(GEOMETRY.confirming_samples)
     number, unchanged = coarse.samples.recording, coarse.unchanged
     tau = unchanged.signals(coarse.samples).tau
-    kept, deviating = np.unique(number).tolist(), list[int]()
+    remaining, deviating = np.unique(number).tolist(), list[int]()
 
     def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
         """Return {recording: squared residual (n,) of a fit to the recordings `fitted`, relative to the variance}."""
         counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
         residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
         scale = np.maximum(tau.var(axis=0), 1e-30)
-        return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in kept}
+        return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
 
-    while 2 * len(deviating) + 1 < len(kept) + len(deviating):
-        present = errors(kept)
-        worst = max(kept, key=lambda x: float(present[x].max()))
+    while 2 * len(deviating) + 1 < len(remaining) + len(deviating):
+        present = errors(remaining)
+        worst = max(remaining, key=lambda x: float(present[x].max()))
         if present[worst].max() < GEOMETRY.unexplained / 5:
             break
-        others = [x for x in kept if x != worst]
-        without = errors(others)
-        rest = np.mean([without[x] for x in others], axis=0)
-        if not ((without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * rest)).any():
+        reduced = [x for x in remaining if x != worst]
+        without = errors(reduced)
+        usual = np.mean([without[x] for x in reduced], axis=0)
+        if not (
+            (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
+        ).any():
             break
-        kept, deviating = others, [*deviating, worst]
+        remaining, deviating = reduced, [*deviating, worst]
     return deviating
 
 

@@ -220,9 +220,9 @@ class GeometryProblem:
         for gram, product, power in zip(normal, right, variance, strict=True):
             columns = np.flatnonzero(gram.diagonal()[bodies:] > 0) + bodies
             friction = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-9, hermitian=True)
-            both = gram[columns, :bodies] @ x[:bodies]
-            load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - both @ friction @ both)
-            agreement = float(product[:bodies] @ x[:bodies] - both @ friction @ product[columns])
+            coupled = gram[columns, :bodies] @ x[:bodies]
+            load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - coupled @ friction @ coupled)
+            agreement = float(product[:bodies] @ x[:bodies] - coupled @ friction @ product[columns])
             # The factor is positive, and at most 1,000 times the one with which loads are as large as the torques. It
             # is 1 if the bodies do not load the joint.
             agreement = max(agreement, 1e-3 * float(np.sqrt(max(load, 0.0) * power)))

@@ -196,8 +196,8 @@ class DriveLog:
         around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[ENDS:-ENDS, ..., ::2]
         times = start + np.arange(len(samples.q)) / FREQUENCY
         bent, numbers = inner.z / self._reach.values, np.full(len(around), self._index)
-        found = MotionSamples(around, bent, inner.direction, times[ENDS:-ENDS], numbers)
-        return found.part(moving[:: self._every])
+        moved = MotionSamples(around, bent, inner.direction, times[ENDS:-ENDS], numbers)
+        return moved.part(moving[:: self._every])
 
     @property
     def _count(self) -> int:

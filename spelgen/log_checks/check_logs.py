@@ -82,15 +82,15 @@ def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
     """Return the notes on logs; notes on several joints with the same text are one note, which names these joints."""
     groups = dict[tuple[Severity, str, str, str], list[str]]()
     for note in notes:
-        place, joint, name = note.where.partition("joint '")
+        prefix, joint, name = note.where.partition("joint '")
         groups.setdefault(
-            (note.severity, note.code, place if joint else note.where, note.message), []
+            (note.severity, note.code, prefix if joint else note.where, note.message), []
         ).append(joint + name)
     joined = []
-    for (severity, code, place, message), names in groups.items():
+    for (severity, code, prefix, message), names in groups.items():
         listed = ", ".join(x.removeprefix("joint ") for x in names)
         joined.append(
-            Diagnostic(severity, code, f"{place}joint {listed}" if names[0] else place, None, message)
+            Diagnostic(severity, code, f"{prefix}joint {listed}" if names[0] else prefix, None, message)
         )
     return tuple(joined)
 

@@ -12,7 +12,6 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_servo_faults
-from spelgen.identification.least_squares import varying
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog
 from spelgen.identification.tuning import GEOMETRY, HINTS
@@ -80,18 +79,13 @@ def find_servo_unit(logs: Sequence[Trajectory], joints: Sequence[str], unit: str
         if unit == "deg" and other == "rad" and width < 0.1 and 0.5 < width * factor < 4 * np.pi:
             return Advice(message, keys=keys)
     low, high = NORMALISED_STEPS
-    found = steps[np.isfinite(steps)]
-    is_normalised = unit == "deg" and np.abs(q).max() <= np.radians(NORMALISED_RANGE) and len(found) > 1
-    if (
-        not is_normalised
-        or found.min() < low
-        or found.max() > high
-        or np.ptp(found) < SAME_STEP * found.max()
-    ):
+    is_normalised = unit == "deg" and np.abs(q).max() <= np.radians(NORMALISED_RANGE)
+    is_normalised &= np.isfinite(steps).sum() > 1 and np.nanmin(steps) >= low and np.nanmax(steps) <= high
+    if not is_normalised or np.nanmax(steps) - np.nanmin(steps) < SAME_STEP * np.nanmax(steps):
         return None
     listed = ", ".join(f"{x} {step:.4f}" for x, step in zip(joints, steps, strict=True) if np.isfinite(step))
     return Advice(
-        f"degrees of another step for each joint ({listed}), as LeRobot's normalised positions have"
+        f"degrees of another step for each joint ({listed}), as normalised positions of LeRobot have"
     )
 
 
@@ -297,9 +291,8 @@ class ServoLogs:
         """
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
-        best = min(
-            range(len(fits)), key=lambda k: float(np.log(fits[k] + GEOMETRY.error_floor).sum()), default=-1
-        )
+        logarithms = [float(np.log(errors + GEOMETRY.error_floor).sum()) for errors in fits]
+        best = int(np.argmin(logarithms)) if fits else -1
         if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
             return
         unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
@@ -321,11 +314,7 @@ class ServoLogs:
             u = np.stack([np.interp(log.t - delay, log.t, x) for x in require_commands(log).T], axis=1)
             collected.add(replace(log, tau=u - log.q, u=None))
         samples, seconds = collected.samples(), sum(log.duration for log in self._logs)
-        if (
-            samples is None
-            or len(samples.values) < HINTS.fewest_samples / 4
-            or not varying(samples.tau).any()
-        ):
+        if samples is None or len(samples.values) < HINTS.fewest_samples / 4 or not samples.tau.any():
             return None
         stated = stated_hypothesis(chain, self._logs[0].mapping)
         return GeometryProblem(chain, samples, alone, seconds, stated, free_gains=True)
@@ -340,21 +329,18 @@ class ServoLogs:
         if len(units) > 1 or not units <= set(ANGLES) or summary.errors:
             return
         (unit,) = units
-        found = [(log, find_servo_unit([log], self._names, unit)) for log in self._logs]
-        findings = {str(finding.keys): (log, finding) for log, finding in found if finding}
-        for log, finding in findings.values():
+        findings = [(log, find_servo_unit([log], self._names, unit)) for log in self._logs]
+        is_sound = any(_are_encoders(_steps([log])) for log, finding in findings if not finding)
+        for log, finding in {str(x.keys): (log, x) for log, x in findings if x}.values():
             check = UNIT if finding.keys else NORMALISED
-            is_sound = [_are_encoders(_steps([x])) for x, finding in found if not finding]
             # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
             # states more.
             summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
             if check.code in log.accepted:
                 continue
-            if any(is_sound):
-                names = [x.name for x, other in found if other and other.keys == finding.keys]
-                summary.add(
-                    replace(check, severity="error", do=OF_ONE), finding.message, _place(names), log.file
-                )
+            names = ", ".join(x.name for x, y in findings if y and y.keys == finding.keys)
+            if is_sound:
+                summary.add(replace(check, do=OF_ONE), finding.message, f"trajectory {names}", log.file)
             else:
                 summary.add(check, finding.message, "all joints", keys=finding.keys)
 
@@ -370,40 +356,32 @@ class ServoLogs:
             tracking = following if len(self._logs) == 1 else measure_following([log], saturation)
             if tracking is None:
                 continue
-            found = _command_faults(tracking, log, self._names, is_only=len(self._logs) == 1)
+            new = _command_faults(tracking, log, self._names, is_only=len(self._logs) == 1)
             bounds = [OTHER_ZERO[x] for x in self._arm.chain.joint_types]
             for k in np.flatnonzero(np.abs(tracking.offset) > bounds).tolist():
                 got = f"commands that are {tracking.offset[k]:.3g} above the positions throughout"
-                found.setdefault(k, CommandFault(got, ONE_ZERO))
-            for k, fault in found.items():
+                new.setdefault(k, CommandFault(got, ONE_ZERO))
+            for k, fault in new.items():
                 faults.setdefault(fault.expected, {}).setdefault(k, []).append((log.name, fault))
             tracks = tracking.moves & (tracking.correlation.diagonal() > FOLLOWS)
-            sound |= {k for k in np.flatnonzero(tracks).tolist() if k not in found}
-        wrong = set[int]()
-        # A command offset of all recordings is a warning, since it may be due to the load of a soft servo.
-        for by_joint in faults.values():
-            groups = dict[tuple[str, ...], dict[int, CommandFault]]()
+            sound |= set(np.flatnonzero(tracks).tolist()) - new.keys()
+        groups = dict[tuple[str, str], dict[int, CommandFault]]()
+        for expected, by_joint in faults.items():
             for k, occurrences in by_joint.items():
-                if occurrences[0][1].expected == ONE_ZERO and k not in sound:
-                    continue
-                names = tuple(name for name, _ in occurrences) if k in sound else ()
-                groups.setdefault(names, {})[k] = occurrences[0][1]
-            for names, group in groups.items():
-                wrong |= group.keys()
-                joints = [self._names[k] for k in group]
-                first = next(iter(group.values()))
-                entries = {self._names[k]: fault.keys for k, fault in group.items() if fault.keys}
-                do = mapping_line(joint_keys(entries, self._names)) if entries else first.do
-                where = f"{_place(names)}, " * bool(names) + f"joint {', '.join(map(repr, joints))}"
-                summary.errors.append(
-                    LogError(first.got, element=where, expected=first.expected, do=OF_ONE if names else do)
-                )
-        return wrong
-
-
-def _place(names: Sequence[str]) -> str:
-    """Return the words for recordings with these names in a message."""
-    return f"trajectory {', '.join(names)}"
+                names = ", ".join(name for name, _ in occurrences) if k in sound else ""
+                # A command offset of all recordings is a warning: it may be due to the load of a soft servo.
+                if names or expected != ONE_ZERO:
+                    groups.setdefault((expected, names), {})[k] = occurrences[0][1]
+        for (expected, names), group in groups.items():
+            fault = next(iter(group.values()))
+            entries = {self._names[k]: x.keys for k, x in group.items() if x.keys}
+            do = mapping_line(joint_keys(entries, self._names)) if entries else fault.do
+            joints = f"joint {', '.join(repr(self._names[k]) for k in group)}"
+            where = f"trajectory {names}, {joints}" if names else joints
+            summary.errors.append(
+                LogError(fault.got, element=where, expected=expected, do=OF_ONE if names else do)
+            )
+        return {k for group in groups.values() for k in group}
 
 
 def _command_faults(

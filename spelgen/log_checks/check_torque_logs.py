@@ -165,24 +165,24 @@ class TorqueLogs:
         """
         unfiltered = self._problem(samples[0]) if len(self._sources) > 1 else None
         deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
-        others = [k for k in range(len(self._sources)) if k not in deviating]
+        agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
-        for part in (others, *([k] for k in deviating)):
-            chosen = [x.part(np.isin(x.recording, part)) if deviating else x for x in samples]
-            problems = (self._problem(x, len(part) / len(self._sources)) for x in reversed(chosen))
+        for numbers in (agreeing, *([k] for k in deviating)):
+            chosen = [x.numbers(np.isin(x.recording, numbers)) if deviating else x for x in samples]
+            problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
             problem = next((x for x in problems if x is not None), None)
             if problem is None:
                 continue
             joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
-            flat = FlatTops.joined([self._flat[k] for k in part])
-            found = list(self._findings(problem, flat, joints, accepted))
-            if part is others:
-                findings += found
-                if any(isinstance(x, LogError) for x in found):
+            flat = FlatTops.joined([self._flat[k] for k in numbers])
+            results = list(self._findings(problem, flat, joints, accepted))
+            if numbers is agreeing:
+                findings += results
+                if any(isinstance(x, LogError) for x in results):
                     break
                 continue
-            name, file = self._sources[part[0]]
-            for error in found:
+            name, file = self._sources[numbers[0]]
+            for error in results:
                 if isinstance(error, LogError):
                     where = f"trajectory {name}, {error.element}"
                     findings.append(replace(error, file=file, element=where, do=OF_ONE))

@@ -83,13 +83,13 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
-    def extend(self, found: Iterable[Diagnostic | SpelgenError]) -> None:
+    def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add errors and notes."""
-        for each in found:
-            if isinstance(each, Diagnostic):
-                self.notes.append(each)
+        for finding in findings:
+            if isinstance(finding, Diagnostic):
+                self.notes.append(finding)
             else:
-                self.errors.append(each)
+                self.errors.append(finding)
 
     def add(
         self,

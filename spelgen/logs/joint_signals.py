@@ -285,17 +285,20 @@ def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
     jumps of this joint is preferred. A single jump, or noise at an end of the register, does not determine the
     decoding. name: signal, "q", "qd", "tau" or "u".
     """
-    own, raw = _reading(signals, name), signals.raw(name)
+    present, raw = _reading(signals, name), signals.raw(name)
     if not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
-        return own
-    others = [
-        _reading(signals._replace(number=k), name) for k in range(len(signals.joints)) if k != signals.number
-    ]
-    for reading, _ in Counter(x for x in (own, *others) if x is not None).most_common():
-        limit = 0.4 * reading.size
+        return present
+    numbers = [k for k in range(len(signals.joints)) if k != signals.number]
+    readings = Counter([present, *(_reading(signals._replace(number=k), name) for k in numbers)])
+    for reading, _ in readings.most_common():
+        if reading is None:
+            continue
         is_possible = np.ptp(raw) < 1.01 * reading.size if reading.key == "period" else raw.min() >= 0
-        before, after = (np.abs(np.diff(x)) > limit for x in (raw, decoded(raw, reading.key, reading.size)))
-        if reading == own or (is_possible and np.count_nonzero(after) < 0.5 * np.count_nonzero(before)):
+        signal_and_decoded = raw, decoded(raw, reading.key, reading.size)
+        jumps_of_both = [
+            np.count_nonzero(np.abs(np.diff(x)) > 0.4 * reading.size) for x in signal_and_decoded
+        ]
+        if reading == present or (is_possible and jumps_of_both[1] < 0.5 * jumps_of_both[0]):
             return reading
     return None
 
@@ -310,9 +313,9 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
         turns = [2 * np.pi / abs(mapping.scale(name, signals.joint)), *([] if has_unit else [360.0])]
     # Lost samples and outliers are removed before the search for register words, because their jumps have other causes
     # than register words.
-    kept = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
+    is_valid = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
     for turn in turns:
-        word = read_as_words(signals.raw(name)[kept], turn)
+        word = read_as_words(signals.raw(name)[is_valid], turn)
         if word is not None:
             # A multiple 2^k of 360 without a stated unit is a number of revolutions in degrees.
             in_degrees = 360.0 in turns and bool(

@@ -174,8 +174,8 @@ def _leave_out_outliers(rows: Rows) -> None:
     for (quantity, joint), values in columns.items():
         faulty = outlier_rows(quantity, values, columns["q", joint])
         if ("qd", joint) in columns or ("u", joint) in columns:
-            others = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
-            faulty |= stale_rows(quantity, values, rows.t, *others)
+            motion = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
+            faulty |= stale_rows(quantity, values, rows.t, *motion)
         if faulty.any():
             outliers |= faulty
             dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[faulty])}")
