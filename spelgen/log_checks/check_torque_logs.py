@@ -168,7 +168,7 @@ class TorqueLogs:
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
         for numbers in (agreeing, *([k] for k in deviating)):
-            chosen = [x.numbers(np.isin(x.recording, numbers)) if deviating else x for x in samples]
+            chosen = [x.part(np.isin(x.recording, numbers)) if deviating else x for x in samples]
             problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
             problem = next((x for x in problems if x is not None), None)
             if problem is None:

@@ -318,7 +318,7 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
         word = read_as_words(signals.raw(name)[is_valid], turn)
         if word is not None:
             # A multiple 2^k of 360 without a stated unit is a number of revolutions in degrees.
-            in_degrees = 360.0 in turns and bool(
+            in_degrees = len(turns) > 1 and bool(
                 np.isclose(np.log2(word.value / 360) % 1, [0, 1], atol=1e-6).any()
             )
             return WordReading(word.key, plain_number(word.value, 12), in_degrees)
