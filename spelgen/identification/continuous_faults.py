@@ -98,8 +98,10 @@ class ZeroOffset(Fault):
 
     def minor_code(self, correction: Correction) -> str:
         """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
-        shifts = correction.hypothesis.offset - correction.unchanged.offset
-        return self.code if np.abs(shifts).max() < GEOMETRY.serious_angle else ""
+        shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
+        is_revolute = np.array(correction.arm.joint_types) == "revolute"
+        bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
+        return self.code if (shifts < bounds).all() else ""
 
 
 class Delay(Fault):

@@ -57,6 +57,14 @@ def kinds_of_faults(
     )
 
 
+def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
+    """Return the kinds of faults that positions and commands of servos share, such as a joint of the opposite sense."""
+    sense = JointSense(len(arm.coordinates))
+    sense.factors = [factor for factor in sense.factors if (factor[1] < 0).any()]
+    order = WrongOrder("joint-order", "the columns of other joints", (0, 1), starts=3)
+    return order, sense, ZeroOffset(), Gravity()
+
+
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
@@ -105,6 +113,39 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     # only three hypotheses are confirmed, since a message lists at most three
     confirmed = _weighed(finer, [finer.fit(fit.hypothesis) for fit in likely[:3]], unchanged)
     return unchanged, *_likely(unchanged, confirmed)
+
+
+def deviating_recordings(problem: GeometryProblem) -> list[int]:
+    """Return the indices of the recordings whose torques contradict those of the other recordings; at most half of all.
+
+    Without the recording, the torques of the others determine parameters that explain them, and not the recording.
+    """
+    coarse = problem.thinned(GEOMETRY.confirming_samples)
+    number, unchanged = coarse.samples.recording, coarse.unchanged
+    tau = unchanged.signals(coarse.samples).tau
+    remaining, deviating = np.unique(number).tolist(), list[int]()
+
+    def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
+        """Return {recording: squared residual (n,) of a fit to the recordings `fitted`, relative to the variance}."""
+        counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
+        residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
+        scale = np.maximum(tau.var(axis=0), 1e-30)
+        return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
+
+    while 2 * len(deviating) + 1 < len(remaining) + len(deviating):
+        present = errors(remaining)
+        worst = max(remaining, key=lambda x: float(present[x].max()))
+        if present[worst].max() < GEOMETRY.unexplained / 5:
+            break
+        reduced = [x for x in remaining if x != worst]
+        without = errors(reduced)
+        usual = np.mean([without[x] for x in reduced], axis=0)
+        if not (
+            (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
+        ).any():
+            break
+        remaining, deviating = reduced, [*deviating, worst]
+    return deviating
 
 
 def _weighed(

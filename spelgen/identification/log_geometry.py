@@ -36,6 +36,8 @@ class GeometryProblem:
         speeds: np.ndarray,
         seconds: float,
         unchanged: Hypothesis | None = None,
+        *,
+        free_gains: bool = False,
     ) -> None:
         """Define the least-squares problem of the torques in logs of an arm with n joints.
 
@@ -45,6 +47,8 @@ class GeometryProblem:
             speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
+            free_gains: True for torques up to an unknown positive factor per joint, which each fit estimates, such as
+                the position errors of servos.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
@@ -59,6 +63,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
+        self._free_gains = free_gains
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
         self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
@@ -181,16 +186,20 @@ class GeometryProblem:
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
-        for _ in range(6):  # number of reweightings: further ones change the cost by less than 0.1
-            weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
+        x, gains = mean, np.ones(len(normal))
+        # Number of reweightings: further ones change the cost by less than 0.1. Gains converge more slowly.
+        for _ in range(12 if self._free_gains else 6):
+            if self._free_gains:
+                gains = self._gains(x, normal, right, variance)
+            weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ flat).reshape(precision.shape)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
             drives = np.diagonal(matrix)[self._bodies :]
             ridge = np.append(np.zeros(self._bodies), 1e-9 * drives + 1e-9)
             matrix += scale * precision
             np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
-            x = solution(matrix, weights @ right + scale * precision @ mean)
-            squares = total - 2 * right @ x + (normal @ x) @ x
+            x = solution(matrix, (weights * gains) @ right + scale * precision @ mean)
+            squares = total - 2 * (right @ x) / gains + (normal @ x) @ x / gains**2
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
@@ -199,6 +208,30 @@ class GeometryProblem:
         cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
+
+    def _gains(
+        self, x: np.ndarray, normal: np.ndarray, right: np.ndarray, variance: np.ndarray
+    ) -> np.ndarray:
+        """Return the factors (n,) on the logged torques that fit the torques of the bodies best, with free friction.
+
+        Args:
+            x: (K,) parameters, of which the inertial ones are used.
+            normal: (n, K, K) Gram matrices of the regressor per joint.
+            right: (n, K) products of the regressor and the logged torques per joint.
+            variance: (n,) sums of squared deviations of the logged torques from their means.
+        """
+        bodies, gains = self._bodies, []
+        for gram, product, power in zip(normal, right, variance, strict=True):
+            columns = np.flatnonzero(gram.diagonal()[bodies:] > 0) + bodies
+            friction = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-9, hermitian=True)
+            coupled = gram[columns, :bodies] @ x[:bodies]
+            load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - coupled @ friction @ coupled)
+            agreement = float(product[:bodies] @ x[:bodies] - coupled @ friction @ product[columns])
+            # The factor is positive, and at most 1,000 times the one with which loads are as large as the torques. It
+            # is 1 if the bodies do not load the joint.
+            agreement = max(agreement, 1e-3 * float(np.sqrt(max(load, 0.0) * power)))
+            gains.append(load / agreement if load > 1e-9 * power and agreement > 0 else 1.0)
+        return np.array(gains)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.

@@ -78,6 +78,9 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
+    # [1] Smallest ratio of a recording's squared torque residual to that of the other recordings, to which the model is
+    # fitted, if the recording has another fault than the others.
+    deviation: float = 5.0
     # [1] Relative residual variance of a joint above which a hypothesis does not explain its torque, so that its
     # correction is not advised. With the right correction, logs of recorded arms have at most 0.07 in the mean of the
     # joints, and at most 0.27 at a joint whose torque is mostly friction.
@@ -108,8 +111,11 @@ class LogGeometryTuning:
     unsigned_gain: float = 0.4
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
-    # Zero offsets [rad, m] and tilts of the base [rad] below this bound give warnings, not errors.
+    # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
     serious_angle: float = 0.17
+    # [m] Zero offsets of prismatic joints below this bound give warnings: a link of 0.3 m, tilted by `serious_angle`,
+    # has its end displaced by this distance.
+    serious_shift: float = 0.05
 
 
 TUNING, HINTS, GEOMETRY = IdentificationTuning(), DriveHintTuning(), LogGeometryTuning()

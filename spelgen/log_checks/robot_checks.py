@@ -239,10 +239,9 @@ def find_one_way(joint: JointEvidence) -> str | None:
     # velocity that does not agree with dq/dt does not show the direction of motion.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
-    unit = UNITS[joint.coordinate.joint_type].velocity
     return (
-        f"moves one way only, qd from {joint.report.low['qd']:.3g} to {joint.report.high['qd']:.3g} {unit}: its dry "
-        "friction is indistinguishable from gravity and a torque offset; record its motion both ways"
+        "moves one way only: dry friction is indistinguishable from gravity and a torque offset; record motion in both "
+        "directions"
     )
 
 

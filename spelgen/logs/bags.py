@@ -86,7 +86,10 @@ def _of_one_arm(
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
     if not of_arm:
         logged = list(dict.fromkeys(name for x in messages for name in x.state.name))
-        got = f"joint states of {', '.join(logged) or 'no joint'} only"
+        if not logged:
+            got = f"{counted(len(messages), 'joint state')}, none with names of joints"
+            raise LogError(got, file=path, expected=f"joint states of {', '.join(names)}")
+        got = f"joint states of {', '.join(logged)} only"
         raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, logged))
     joints_of: dict[str, set[str]] = {}
     for message in of_arm:

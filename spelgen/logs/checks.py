@@ -42,6 +42,8 @@ from spelgen.logs.unit_checks import (
 from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
+# Advice for a fault of some recordings: its settings would be wrong for the others.
+OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
 
 Subject = TypeVar("Subject")
 
@@ -81,6 +83,14 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
+    def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
+        """Add errors and notes."""
+        for finding in findings:
+            if isinstance(finding, Diagnostic):
+                self.notes.append(finding)
+            else:
+                self.errors.append(finding)
+
     def add(
         self,
         check: AnyCheck,
@@ -88,17 +98,21 @@ class Findings:
         where: str,
         file: Path | None = None,
         keys: Mapping[str, object] | None = None,
+        is_partial: bool = False,
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
         where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
         `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
-        the log without the correction.
+        the log without the correction. is_partial: True if the settings may be wrong for other recordings.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return
-        do = f"{mapping_line(keys) if keys else check.do}; --accept {check.code} if it is right"
+        do = mapping_line(keys) if keys else check.do
+        if is_partial:
+            do = f"{do} if this is true of all recordings; else correct this one, or leave it out"
+        do = f"{do}; --accept {check.code} if it is right"
         self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
@@ -289,7 +303,12 @@ class LogChecks:
                 where += f", joint {', '.join(map(repr, names))}"
             entries = {name: self._results[name, check][0][0].joint for name in names}
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
-            summary.add(check, message, where, file, keys)
+            # Units and columns would be wrong for recordings that have others. Dropped rows, periods and sign bits do
+            # not change sound recordings.
+            is_partial = len(occurrences) < self._count and any(
+                x in str(keys) for x in ("units", "columns", "rate")
+            )
+            summary.add(check, message, where, file, keys, is_partial)
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
@@ -305,7 +324,7 @@ class LogChecks:
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
         kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
-        is_shared = entries[first].keys() == {"units"} and 2 * len(entries) > len(kin)
+        is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})

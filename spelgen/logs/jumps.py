@@ -45,6 +45,14 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
     return np.where(words >= sign_bit, sign_bit - words, words)
 
 
+def decoded(words: np.ndarray, key: str, size: float) -> np.ndarray:
+    """Return the numbers that register words (T,) represent.
+
+    key: "sign_bit" or "period", the type of the words. size: the sign bit or the period.
+    """
+    return signed(words, size) if key == "sign_bit" else centred(unwrapped(words, size), size)
+
+
 def is_lost(values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples, for which loggers write exactly 0 between values far from 0."""
     lost = np.zeros(len(values), bool)
@@ -112,7 +120,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
-def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
+def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin: int = 0) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
     Stale values form a block of equal values that is more than 20 times as long as the median block, and within which
@@ -120,6 +128,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     such a signal, the step at the end of a stale block must also be larger than four typical steps.
 
     values: the signal (T,). changes: another signal (T,), which shows that the measured quantity must have changed.
+    margin: number of samples at both ends of a block in which the changes do not count.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -131,9 +140,9 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     is_quantised = len(np.unique(values)) < len(starts) / 2
     is_long &= (steps > 4.0 * _typical_step(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
-        rows = slice(start + 1, start + length)
-        if np.ptp(changes[rows]) > min_change:
-            stale[rows] = True
+        inside = changes[start + 1 + margin : start + length - margin]
+        if inside.size and np.ptp(inside) > min_change:
+            stale[start + 1 : start + length] = True
     return stale
 
 
@@ -237,12 +246,14 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
+    is_whole = bool((values == values.round()).all())
     for size in sizes:
-        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise).
-        # Words with a sign bit have values above the sign bit, which represent negative numbers.
+        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise, if
+        # they are not whole numbers). Words with a sign bit have values above the sign bit, which represent negative
+        # numbers.
         readings = []
-        if np.ptp(values) < 1.01 * size:
-            readings.append(Word("period", size, centred(unwrapped(values, size), size)))
+        if np.ptp(values) < (size if is_whole else 1.01 * size):
+            readings.append(Word("period", size, decoded(values, "period", size)))
         if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, signed(values, size)))
         for reading in readings:

@@ -31,7 +31,7 @@ WORDS = {
         ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
-        ("tau", "tau τ torque torques trq tq tor eff effort efforts force forces qfrc moment load current currents "
+        ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
                 "curr cur drehmoment strom couple par 力矩 扭矩"),
     )
 }  # fmt: skip

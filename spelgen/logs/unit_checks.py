@@ -73,6 +73,9 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
+            # Without velocities, whole numbers may be counts or degrees.
+            if not _knows_ratio(signals):
+                return message
     # `distance`: implausibility of a combination of units. Of combinations whose distances differ by rounding only, the
     # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
@@ -84,7 +87,16 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
+    # Commands have the unit of q by default, unless they move much less: then they are in the SI unit.
+    if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
+        keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     return Advice(f"{message}: {units}", keys) if keys else None
+
+
+def _knows_ratio(signals: JointSignals) -> bool:
+    """Return True if velocities were logged and are proportional to dq/dt, so that their ratio shows units."""
+    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -99,8 +111,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
     # unknown, only the range of q indicates a unit.
-    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
-    is_known &= "qd" in mapping.quantities
+    is_known = _knows_ratio(signals)
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
     stated = mapping.unit("q", joint)
     # A wrong unit in the mapping, such as deg for positions in rad, makes the motion of all joints implausibly small.

@@ -58,6 +58,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     elif not foreign.all():
         bad &= ~foreign[:, None]
     if layout.mapping.dropouts == "dropped" and np.isfinite(data).all(axis=1).any():
+        data[np.isinf(data)] = np.nan
         bad &= ~np.isnan(data)
     if bad.any():
         first, k = np.argwhere(bad)[0]
@@ -146,7 +147,8 @@ def _nanoseconds(texts: Column) -> pa.Array | None:
         numbers, units = (pa.compute.struct_field(groups, name) for name in ("number", "unit"))
         factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
         return pa.array(_numbers(numbers) * factors / TIMES["ns"])
-    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)$"
+    zone = r"(?: ?Z| ?UTC| ?[+-]\d\d:?\d\d)?$"
+    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)" + zone
     if not re.match(clock, first):
         return None
     groups = pa.compute.extract_regex(texts, clock)

@@ -147,6 +147,8 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         (trajectory,) = trajectories
         t = trajectory.t
         cut = int(np.searchsorted(t, t[-1] - fraction * trajectory.duration))
+        if not cut:
+            raise trajectory.error("1 sample", "a motion: samples to fit, and others for validation")
         message = (
             f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
             f"validation on the last {t[-1] - t[cut]:.3g} s"
