@@ -135,22 +135,18 @@ class PositionActuators:
     drives: np.ndarray
     offset: np.ndarray
     delay: float
-    about = (
-        "position actuators on the URDF's bodies; kp, kv, armature, frictionloss, offsets and delay fitted to windows "
-        "of the training logs by mujoco.minimize, the least squares of mujoco.sysid"
-    )
 
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions (T, n) [rad, m] after the first row of each part of a log.
 
         Args:
-            parts: logs and the rows of each to predict, from their commands.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
+            segments: logs and the rows of each to predict, from their commands.
+            q: (segments, n) initial positions [rad, m].
+            qd: (segments, n) initial velocities [rad/s, m/s].
         """
         model = self.model()
         positions: list[np.ndarray] = []
-        for k, (log, rows) in enumerate(parts):
+        for k, (log, rows) in enumerate(segments):
             steps = steps_between(log, FIT_STEP)
             model.opt.timestep = float(np.diff(log.t[rows]).mean()) / steps
             commands = delayed_commands(log, rows, self.delay, steps) + self.offset

@@ -4,9 +4,9 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
-# {name of the API: module that defines it}, from the imports in the stub file `__init__.pyi`: type checkers read the
-# same file, so that both agree. A module is imported at the first use of a name (PEP 562), so that `import spelgen` is
-# fast.
+# {name of the API: module that defines it}. The names are read from the stub file `__init__.pyi`: type checkers read
+# this file, too, so that the API is listed only once. A module is imported at the first use of a name (PEP 562), so
+# that `import spelgen` is fast.
 _HOME = {
     alias.name: str(node.module)
     for node in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body

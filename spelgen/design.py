@@ -5,8 +5,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, get_args, get_type_hints
 
-from spelgen.errors import SettingsError, collect, suggestion
-from spelgen.settings.yaml_document import YamlDocument, read_document
+from spelgen.errors import SettingsError, collect
+from spelgen.settings.yaml_document import YamlDocument, read_document, unknown_name
 
 Preset = Literal["hybrid", "closed-form", "minimal", "spel", "spel-kan", "phnode"]
 """The presets of spelgen."""
@@ -31,12 +31,16 @@ PRESETS = Path(__file__).parent / "presets"
 class Design:
     """The form of a model: how each quantity of the equations of motion (M, V, friction, G) is represented.
 
+    V is the potential energy, G the input matrix. The types of the fields list the possible representations of each
+    quantity.
+
     ``derived``: the structure of the arm determines which entries of the quantity are zero, are constant, or depend on
-    which joints; networks learn only the entries that vary. ``dense``: a network learns the whole quantity without
-    knowledge of the arm (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024). The suffix
-    ``3n``: the quantity has three rows per joint, one for each axis of the joint's frame. ``closed-form``: rigid bodies
-    with trained inertial parameters, and networks for residual terms, if any. ``constants``: a friction model with
-    trained constants.
+    which joints; networks learn only the entries that vary. ``dense`` (of V) and ``dense-n`` (of friction, as an n x n
+    matrix): a network learns the whole quantity without knowledge of the arm. ``dense-3n``: a network learns rows for
+    all three axes of each joint's frame, as in the publications of such models, although a joint moves only about or
+    along one axis (Wang et al., Sci Rep 15:33179, 2025, and Duong et al., IEEE T-RO 40:3695, 2024). ``closed-form``:
+    rigid bodies with trained inertial parameters, and networks for residual terms, if any. ``per-joint``: friction of
+    each joint with a network. ``constants``: a friction model with trained constants.
 
     Raises SettingsError for an inconsistent combination.
     """
@@ -95,19 +99,13 @@ def validate(values: Mapping[str, object], document: YamlDocument | None = None)
     ``document``: the parsed file of the values; errors state the file and the line.
     """
     file = None if document is None else document.path
-
-    lines = {name: None if document is None else document.line((name,)) for name in {*values, *CHOICES}}
-    errors = []
-    for name in values:
-        if name not in CHOICES:
-            do = suggestion(str(name), CHOICES)
-            errors.append(SettingsError(f"unknown key {name!r}", file=file, line=lines[name], do=do))
+    lines = {name: None if document is None else document.line((name,)) for name in CHOICES}
+    unknown = [name for name in values if name not in CHOICES]
+    errors = [unknown_name((name,), "key", str(name), CHOICES, document) for name in unknown]
     for name, choices in CHOICES.items():
         if values.get(name) not in choices:
-            got, expected = (
-                repr(values[name]) if name in values else "nothing",
-                f"one of {', '.join(choices)}",
-            )
+            got = repr(values[name]) if name in values else "nothing"
+            expected = f"one of {', '.join(choices)}"
             errors.append(SettingsError(got, file=file, line=lines[name], element=name, expected=expected))
     # Errors of single values are raised before conflicts: the rules for pairs of values require valid values.
     collect(errors)

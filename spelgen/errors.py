@@ -31,7 +31,8 @@ class SpelgenError(Exception):
         # `class(*args)`.
         super().__init__(self.got)
         # Callers give the file as text or as a path. `SpelgenErrors` compares the files of errors, so both become text.
-        self.file = None if self.file is None else str(self.file)
+        if self.file is not None:
+            self.file = str(self.file)
 
     def __str__(self) -> str:
         statement = _truncated(self.got)
@@ -159,5 +160,5 @@ class Diagnostic:
         return f"{self.severity}: {self.where}: {self.message}"
 
     def to_dict(self) -> dict[str, object]:
-        """Return the five fields of the diagnostic as a JSON object; their order is part of the public interface."""
+        """Return severity, code, where, line, message as a JSON object; this order is part of the public interface."""
         return asdict(self)

@@ -23,7 +23,10 @@ MAX_BYTES = 2**25
 
 
 def require_regular_file(path: Path, error: type[SpelgenError], expected: str | None = None) -> None:
-    """Raise ``error`` unless a path is a regular file: reading a pipe or a device may not end."""
+    """Raise ``error`` unless a path is a regular file: reading a pipe or a device may not end.
+
+    expected: description of the expected file, for the message.
+    """
     if not path.is_file():
         raise error("no regular file", file=path, expected=expected)
 
@@ -102,9 +105,9 @@ def limited_memory(size: int) -> Iterator[None]:
 def replacing(path: Path | str) -> Iterator[Path]:
     """Context manager that yields a hidden file, which at the end replaces `path` atomically, even if power fails.
 
-    An absent folder is created. If `path` is in the local copy of an address, the file is also uploaded. An interrupted
-    or failed write does not change `path`. Raises OSError with the path if the file cannot be written, for instance on
-    a full disk.
+    An absent folder is created. If `path` is in the local copy of a remote address such as `s3://bucket/logs`, the file
+    is also uploaded. An interrupted or failed write does not change `path`. Raises OSError with the path if the file
+    cannot be written, for instance on a full disk.
     """
     path = Path(path)
     with naming(path):
@@ -131,9 +134,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager in which an OSError gets the file name `path`, unless it names another file.
+    """Context manager in which an OSError about `path` gets this file name; an OSError about another file is unchanged.
 
-    An error on a full disk names no file; an error in `replacing` names the hidden file.
+    An error without a file name, such as the error on a full disk, is regarded as an error about `path`, as is an error
+    about the hidden file of `replacing`: the name of the hidden file contains the name of `path`.
     """
     try:
         yield
@@ -256,6 +260,8 @@ def _fetch(address: str) -> Path:
 
 def _inside(folder: Path, name: str, address: str) -> Path:
     """Return the path of the key `name` in a folder. Raises SpelgenError if the path is outside the folder.
+
+    address: address of the archive or object store, for the error.
 
     Archives and object stores accept any text as a key, such as `../../.bashrc`.
     """

@@ -152,7 +152,7 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name of a predictor whose predictions include the disturbance that a momentum observer estimates."""
+    """Return the name for predictions of ``predictor`` that include the disturbance of a momentum observer."""
     return f"{predictor} + observer"
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # where a long name may be wrapped
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # matches places at which names may be wrapped
 
 
 @dataclass(frozen=True)

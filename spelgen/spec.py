@@ -71,6 +71,11 @@ class JointSpec:
     potential_sensitivity: float
     """Change of V with the position of this joint, divided by the largest such change of all joints."""
 
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Lower and upper position limit [rad, m]; None for a joint without limits, or with only one of them."""
+        return None if self.lower is None or self.upper is None else (self.lower, self.upper)
+
 
 @dataclass(frozen=True)
 class LinkSpec:

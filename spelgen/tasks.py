@@ -63,7 +63,10 @@ def run_tasks(
 
 @contextmanager
 def _ray(jobs: int, address: str | None) -> Iterator[ModuleType]:
-    """Context manager that starts Ray on this machine, or connects to a cluster, and yields the module `ray`."""
+    """Context manager that starts Ray on this machine, or connects to a cluster, and yields the module `ray`.
+
+    jobs: number of cores to use on this machine. address: address of the cluster; None: this machine.
+    """
     if find_spec("ray") is None:
         do = "pip install 'spelgen[parallel]', or --jobs 1"
         raise RunError("several runs at a time without Ray", expected="the extra parallel", do=do)

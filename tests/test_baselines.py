@@ -215,7 +215,7 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     quick = ["--set", "progress=false", "--set", "max_minutes=5"]
     run_command("train", str(module), "--robot", str(robots / "rpr.urdf"), *logs, "-o", str(folder), *quick)
     trained = digests(folder)
-    run_command("evaluate", str(folder), *logs, "--quick", "-o", str(tmp_path / "found.csv"))
+    run_command("evaluate", str(folder), *logs, "--quick")
     text = run_command("evaluate", str(folder), *logs)
     after = digests(folder)
     assert after.pop("evaluation.json"), "the one file that evaluate writes"
@@ -240,9 +240,6 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     parts = sum(np.array(part) for part in trace["parts"].values())
     # the parts sum to the prediction, except the torque offset, which is not listed
     np.testing.assert_allclose(parts, trace["predicted"]["model"], atol=0.05)
-    energy = {name: np.array(x) for name, x in trace["energy"].items()}
-    left = energy["work of the drives"] - energy["stored"] - energy["friction"] - energy["not explained"]
-    assert np.abs(left).max() < 1e-3
-    assert "nMSE over all test samples" in (tmp_path / "found.csv").read_text()
+    assert "nMSE over all test samples" in text
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Base parameters" in page and "without epochs" in page and "Masses, centres of mass" in page

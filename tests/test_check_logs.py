@@ -27,6 +27,7 @@ from spelgen.logs.dynamics_samples import dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.windows import split_validation
 from spelgen.render.arm_pages import logs_page
 from spelgen.settings.log_mapping import LogMapping
 
@@ -240,7 +241,7 @@ def test_the_command_fails_where_logs_cannot_be_trained_on(spelgen, robots, arm,
     write_logs(tmp_path / "logs.csv", [replace(log, qd=1.3 * log.qd)], names)
     assert spelgen("logs", "logs.csv", "--robot", robots / "rpr.urdf").exit_code == 0
     strict = spelgen("logs", "logs.csv", "--robot", robots / "rpr.urdf", "--strict")
-    assert (strict.exit_code, strict.stderr) == (1, "3 warnings, and --strict allows none\n")
+    assert (strict.exit_code, strict.stderr) == (1, "1 warning, and --strict allows none\n")
 
 
 def test_settings_that_logs_do_not_need_may_have_errors(spelgen, robots, arm, log, tmp_path):
@@ -534,3 +535,20 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)
     notes = require_sound_logs([log[: int(np.searchsorted(log.t, log.t[0] + 5.4))]], tx40)
     assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]
+
+
+def test_notes_of_several_joints_with_one_text_are_one_note(loaded, log):
+    forward = replace(log, q=np.abs(log.qd).cumsum(axis=0) * 0.01, qd=np.abs(log.qd))
+    (finding,) = (x for x in check_logs([forward], loaded).findings if x.code == "one-way")
+    assert finding.where == f"joint {', '.join(map(repr, loaded.chain.joint_names))}"
+
+
+def test_a_constant_velocity_is_not_frozen(loaded, log):
+    t = log.t[:, None]
+    ramp = replace(log, q=0.05 * t + 0 * log.q, qd=0 * log.qd + 0.05)
+    assert not any("always" in str(error) for error in check_logs([ramp], loaded).errors)
+
+
+def test_a_recording_of_one_sample_is_not_split(log):
+    with pytest.raises(LogError, match="got 1 sample, expected a motion"):
+        split_validation([log[:1]], 0.2, 0)

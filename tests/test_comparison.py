@@ -6,8 +6,7 @@ import os
 import signal
 import threading
 import time
-from dataclasses import asdict, replace
-from itertools import pairwise
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,12 @@ from html_page import Page
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.predictor import Predictor
-from spelgen.baselines.registry import hold_velocity
 from spelgen.cli.main import app
 from spelgen.comparison import jobs
-from spelgen.comparison.arms import ComparedArm, Comparison, ablation_designs, arm_inputs, load_comparison
-from spelgen.comparison.figures import predict_example, spread_windows
+from spelgen.comparison.arms import ComparedArm, Comparison, arm_inputs, load_comparison
+from spelgen.comparison.figures import spread_windows
 from spelgen.comparison.study import prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
-from spelgen.design import load_design
 from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation import rollout
@@ -108,16 +104,6 @@ def test_models_of_simulated_arms_know_only_the_kinematics(study):
         assert set(JOINTS) <= {joint.name for joint in known.joints}
         assert all(link.inertial is None for link in known.links)
         assert "joints" not in yaml.safe_load(job.inputs.urdf.with_suffix(".yaml").read_text())
-
-
-def test_the_ablation_changes_one_thing_at_a_time():
-    designs = [load_design(design) for design in ablation_designs().values()]
-    changes = [
-        {key for key, value in asdict(a).items() if value != asdict(b)[key]} for a, b in pairwise(designs)
-    ]
-    assert changes[:3] == [{"dissipation"}, {"input"}, {"mass"}]
-    assert changes[3] == {"potential", "encoding"}
-    assert designs[-1] == load_design("hybrid")
 
 
 def test_training_logs_are_the_first_seconds_of_other_motions_than_the_test_logs(study):
@@ -281,19 +267,6 @@ def test_the_page_opens_with_the_sentence_and_the_table(study):
     assert "64 + " not in text and "5 + 20 steps" in " ".join(text.split())
 
 
-def test_the_page_shows_predictions_and_m_with_the_true_m(study, results):
-    page = write_comparison(study, arm_sections(study)).read_text()
-    learned = page[page.index("The mass matrix along this motion") :]
-    assert learned.count('<svg class="chart"') == 3
-    for name in ("M11", "M21", "M22"):
-        assert f'aria-label="{name}"' in learned
-    assert learned.count("<title>true</title>") == 3
-    figures = results["hybrid"].simulated
-    q = torch.tensor(figures.example.q, dtype=torch.float64)
-    model = trained(next(job for job in study.jobs if job.preset == "hybrid"))
-    np.testing.assert_allclose(figures.mass, model.mass_matrix(q).detach(), rtol=1e-12)
-
-
 def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
     result = results["hybrid"]
     losses = dict.fromkeys(result.simulated.losses)
@@ -304,8 +277,8 @@ def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
     assert arm_sentence([result, broken, broken]) == "No model has a finite prediction loss, 1 s."
 
 
-def test_decimated_windows_and_examples_start_at_a_multiple_of_the_decimation():
-    """Decimated windows and examples start at multiples of the decimation, as torques that a controller holds do.
+def test_decimated_windows_start_at_a_multiple_of_the_decimation():
+    """Decimated windows start at multiples of the decimation, as torques that a controller holds do.
 
     The torque is constant over four samples, so each decimated window contains the complete input.
     """
@@ -316,9 +289,6 @@ def test_decimated_windows_and_examples_start_at_a_multiple_of_the_decimation():
     windows = spread_windows([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
-    example = predict_example(Predictor("", hold_velocity), [log], 10, 4)
-    assert [x % 4 for (x,) in example.q] == [0] * 11
-    np.testing.assert_allclose(example.t, 0.008 * np.arange(11), atol=1e-12)
 
 
 def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_matrix(robots, quick):
@@ -503,7 +473,6 @@ def test_the_command_compares_logs_of_one_arm(robot, logs, tmp_path, short_epoch
     ("arguments", "message"),
     [
         (["two_link.urdf", "--presets", "spell"], "the preset 'spell'"),
-        (["two_link.urdf", "--ablation", "--presets", "spel"], "--ablation: names the presets itself"),
         (["arms.yaml", "--data", "."], "in a YAML file each arm has its own"),
         (["servo.urdf"], "give logs of the arm with --data"),
     ],

@@ -32,7 +32,10 @@ from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
+from spelgen.settings.fits import TorqueFit
 from spelgen.settings.log_mapping import LogMapping
+from spelgen.simulation.as_built import as_built
+from spelgen.simulation.simulate import simulate
 
 # matrix from torques of the last two motors to torques of the last two joints
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])
@@ -353,6 +356,18 @@ def test_gains_of_currents_are_found(uncoupled, tmp_path):
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
     np.testing.assert_allclose(found / gains, 1.0, atol=0.15)
     assert np.abs(np.log(found)).max() > 0.2  # the estimated gains are not their initial values of 1
+
+
+def test_intervals_contain_unknown_gains_if_the_masses_of_the_urdf_are_wrong(uncoupled, tmp_path):
+    """Only the masses of the URDF fix the scale of unknown gains, and all of them are about 30 % wrong."""
+    gains = np.array([30.0, 60.0, 15.0, 20.0, 10.0, 5.0])
+    log = simulate(as_built(uncoupled, 1, tmp_path / "true.urdf")).train[0]
+    model = trained_gains(tmp_path, uncoupled.chain.joint_names)
+    fitted = fit(model, [replace(log, tau=log.tau / gains)], TorqueFit(), arm=load_arm(tmp_path / "arm.urdf"))
+    found = fitted.posterior.drives["gain"]
+    assert all(x.low <= gain <= x.high for x, gain in zip(found, gains, strict=True))
+    # The scale has the relative error of a mean of six masses that are 30 % wrong, and not of a single one.
+    assert abs(np.log([x.value / gain for x, gain in zip(found, gains, strict=True)]).mean()) < 0.3
 
 
 def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):

@@ -122,9 +122,7 @@ def test_the_same_arguments_give_the_same_motion(loaded):
 
 def test_effort_limits_are_kept_where_they_can_be(robots):
     found = excite(load_arm(robots / "rpr.urdf"), **CHOICE | {"harmonics": 3}, trials=60)
-    assert (found.first_efforts > 1).any()
     assert (found.efforts < 1).all()
-    assert "(which overran effort limits)" in found.text()
 
 
 def test_an_arm_without_limits_gets_modest_ones(tmp_path):

@@ -1,14 +1,11 @@
 """Export to URDF is exact for closed-form models; for others the exported rigid bodies are the nearest ones."""
 
-import re
-
 import numpy as np
 import pytest
 import torch
 import yaml
 from emitted import ROBOTS
 from exported_runs import saved_run
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
@@ -19,7 +16,6 @@ from spelgen.errors import RunError
 from spelgen.exporting.export import export
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 from spelgen.structure.base_parameters import base_parameters
-from spelgen.urdf.read import read_urdf
 
 pytest.importorskip("pinocchio")
 
@@ -156,33 +152,6 @@ def test_exported_bodies_have_the_models_base_parameters(robot, tmp_path):
     assert list(exact) == list(learned)
     np.testing.assert_allclose(list(exact.values()), list(learned.values()), rtol=1e-8, atol=1e-9)
     assert max(abs(exact[name] - before[name]) for name in exact) > 0.01
-
-
-def test_inertials_of_fixed_links_have_no_orientation(tmp_path):
-    """<inertial> elements of fixed links have no rotation, which some readers ignore; the tensor remains equal."""
-    inertial = (
-        '<inertial><origin xyz="0.1 0 -0.2" rpy="0.4 1.1 -0.7"/><mass value="2"/>'
-        '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" izz="0.05"/></inertial>'
-    )
-    text, count = re.subn(
-        r'<link name="base"\s*/>',
-        f'<link name="base">{inertial}</link>',
-        (ROBOTS / "two_link.urdf").read_text(),
-    )
-    assert count == 1
-    (tmp_path / "arm.urdf").write_text(text)
-    arm = load_arm(tmp_path / "arm.urdf")
-    export(build(arm, "closed-form"), arm=arm).write(tmp_path / "learned.urdf")
-    before, after = (
-        next(x.inertial for x in read_urdf(tmp_path / name).links if x.name == "base")
-        for name in ("arm.urdf", "learned.urdf")
-    )
-    (xx, xy, xz, yy, yz, zz), turn = before.tensor, Rotation.from_euler("xyz", before.rpy).as_matrix()
-    expected = turn @ [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]] @ turn.T
-    assert (after.mass, after.rpy) == (2.0, (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(after.com, before.com, atol=1e-12)
-    np.testing.assert_allclose(after.tensor, expected[np.triu_indices(3)], atol=1e-12)
-    assert 'rpy="0.4' not in (tmp_path / "learned.urdf").read_text()
 
 
 def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):

@@ -373,3 +373,38 @@ def test_weights_of_servos_without_effort_limits_are_accepted(tmp_path):
     for name, value in (("servo.limit", float("nan")), ("servo.log_kp", float("inf"))):
         with pytest.raises(RunError, match="no finite numbers"):
             _require_finite({name: torch.tensor([value])}, tmp_path)
+
+
+def test_times_of_lerobot_that_contradict_the_frame_rate_are_an_error(tmp_path):
+    folder = dataset(tmp_path / "set", np.degrees(Q) * 3, fps=30)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    (folder / "meta" / "info.json").write_text(json.dumps(info | {"fps": 60}))
+    degrees = POSITION | {"units": {"q": "deg"}}
+    with pytest.raises(LogError, match=r"30 times per second for 60 frames per second.*'sample_rate: 60'"):
+        read_logs(folder, JOINTS, degrees)
+    (log,) = read_logs(folder, JOINTS, degrees | {"sample_rate": 60})
+    assert log.sample_rate == pytest.approx(60, rel=1e-6)
+
+
+def test_a_bag_without_names_of_joints_is_called_so(tmp_path):
+    messages = [(x[0], (), *x[2:]) for x in states()]
+    with pytest.raises(LogError, match="400 joint states, none with names of joints"):
+        read_logs(bag_of(messages, tmp_path / "bag"), JOINTS)
+
+
+def test_texts_of_times_may_have_a_zone_and_infinite_values_are_dropped_on_request(tmp_path):
+    table = {
+        f"{x}_{joint}": y[:, k]
+        for x, y in (("q", Q), ("qd", QD), ("tau", TAU))
+        for k, joint in enumerate(JOINTS)
+    }
+    for zone in ("Z", "+02:00", " UTC"):
+        texts = [f"2026-01-01T10:00:{x:09.6f}{zone}" for x in T]
+        pa.parquet.write_table(pa.table({"t": texts, **table}), tmp_path / "log.parquet")
+        (log,) = read_logs(tmp_path / "log.parquet", JOINTS)
+        np.testing.assert_allclose(log.t, T, atol=1e-6)
+    broken = TAU[:, 0].copy()
+    broken[100] = np.inf
+    pa.parquet.write_table(pa.table({"t": T, **table, "tau_shoulder": broken}), tmp_path / "log.parquet")
+    (log,) = read_logs(tmp_path / "log.parquet", JOINTS, {"dropouts": "dropped"})
+    assert len(log) == len(T) - 1

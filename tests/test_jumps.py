@@ -8,6 +8,7 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import yaml
+from servo_arm import write_servo_arm
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SpelgenError
@@ -200,6 +201,19 @@ def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):
     assert errors([decoded], arm) == ""
 
 
+def test_the_line_of_a_period_keeps_the_stated_periods_of_other_signals(arm, tmp_path):
+    columns, joint = motion(arm, 0), arm.chain.joint_names[0]
+    load, counts = (
+        np.round(columns[f"tau_{joint}"] * 100 / 3),
+        np.round(columns[f"q_{joint}"] * 4096 / (2 * np.pi)),
+    )
+    words = columns | {f"tau_{joint}": load % 65536, f"q_{joint}": counts % 65536}
+    base = {"gain": 0.03, "counts_per_turn": 4096, "units": {"q": "counts"}, "period": {"tau": 65536}}
+    (log,) = read_logs(written(words, tmp_path / "log.csv"), arm.chain.joint_names, {"joints": {joint: base}})
+    line = advised(errors([log], arm)).joints[joint].model_dump(exclude_unset=True)
+    assert line["period"] == {"tau": 65536.0, "q": 65536.0}
+
+
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("quantity", ["q", "qd", "tau"])
 def test_outliers_of_any_size_are_named_and_dropped_on_request(arm, tmp_path, form, quantity):
@@ -352,3 +366,33 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
         assert log.u is not None
         assert log.u - log.q == pytest.approx(followed, abs=1e-9)
         assert np.abs(np.diff(log.q, axis=0)).max() < 0.2
+
+
+@pytest.mark.parametrize("form", ["degrees", "two's complement", "sign and magnitude"])
+def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
+    """One finding decodes positions and commands of all joints, also of a joint that hardly leaves 0."""
+    arm = load_arm(write_servo_arm(tmp_path))
+    t, rng = 0.02 * np.arange(1500), np.random.default_rng(0)
+    motion = {"shoulder": 0.9 * np.sin(t), "elbow": -0.004 * (t > 15) + 0.003 * rng.standard_normal(len(t))}
+    counts = {joint: np.round(4096 / (2 * np.pi) * q) for joint, q in motion.items()}
+    words = {
+        "degrees": lambda x: 360 / 4096 * x % 360,
+        "two's complement": lambda x: x % 65536,
+        "sign and magnitude": lambda x: np.where(x < 0, 32768 - x, x),
+    }[form]
+    columns = {"t": t}
+    for joint, x in counts.items():
+        late = np.concatenate([x[:1].repeat(4), x[:-4]])
+        columns |= {f"q_{joint}": words(late), f"u_{joint}": words(x)}
+    base = {"units": {"q": "deg" if form == "degrees" else "counts"}}
+    if form != "degrees":
+        base["joints"] = {joint: {"counts_per_turn": 4096} for joint in motion}
+    file = written(columns, tmp_path / "log.csv")
+    told = errors(read_logs(file, arm, base), arm)
+    assert told.count("write '") == 1 and "joint 'shoulder', 'elbow': got q that jumps" in told
+    lines = advised(told).model_dump(exclude_unset=True)["joints"]
+    joints = {joint: base.get("joints", {}).get(joint, {}) | line for joint, line in lines.items()}
+    (log,) = read_logs(file, arm, base | {"joints": joints})
+    assert errors([log], arm) == ""
+    for k, joint in enumerate(motion):
+        assert log.u[:, k] == pytest.approx(2 * np.pi / 4096 * counts[joint], abs=1e-9)

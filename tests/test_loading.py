@@ -108,18 +108,9 @@ def test_the_remedy_for_an_edited_module_works(tmp_path):
 def test_what_is_no_module_is_refused(tmp_path):
     path = tmp_path / "module.py"
     assert refusal(path) == f"{path}: no such file; build it with `spelgen build`"
-    for text, reason in (
-        ("x = 1\n", ""),
-        ("1 / 0\n", ""),
-        ("def\n", " (SyntaxError)"),
-        ("SPEC = f'{1}'\n", ""),
-        ("(" * 10_000, " ("),
-        ("x = '\0'\n", " ("),
-    ):
+    for text in ("x = 1\n", "1 / 0\n", "def\n", "SPEC = f'{1}'\n", "(" * 10_000, "x = '\0'\n"):
         path.write_text(text)
-        told = refusal(path)
-        assert told.startswith(f"{path}: got no specification of spelgen in it{reason}"), told
-        assert told.endswith(f"{REMEDY}, or check the path") and "\n" not in told
+        assert refusal(path) == f"{path}: got no specification of spelgen in it, {REMEDY}, or check the path"
     path.write_bytes(b"\xff\xfe")
     assert refusal(path).startswith(f"{path}: got no specification of spelgen in it (UnicodeDecodeError)")
     robot = ROBOTS / "rpr.urdf"
@@ -130,9 +121,7 @@ def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_pat
     """Modules of earlier formats, or without a specification, are refused with the advice to build and train again."""
     old = tmp_path / "old.py"
     old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
-    assert refusal(old) == (
-        f"{old}: got a module of an earlier version of spelgen, {REMEDY} with `spelgen build`, and train it again"
-    )
+    assert refusal(old) == f"{old}: got no specification of spelgen in it, {REMEDY}, or check the path"
     assert not (tmp_path / "mark").exists()
     text = module.read_text(encoding="utf-8")
     assert text.count('"format":9') == 1

@@ -124,9 +124,9 @@ def test_zero_terms_are_removed():
     """If residual terms are zero, the prepared model of hybrid omits them, and the model itself is unchanged."""
     model = build(arm_of("rpr"), "hybrid").requires_grad_(False)
     q, qd, x = states(4)
-    assert residual_terms(model.prepared()._model) is None
+    assert residual_terms(model.prepared().model) is None
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))
     model.residuals.raw_torque_splines[1] += 1.0
-    assert model.prepared()._model.residuals.mass is None
+    assert model.prepared().model.residuals.mass is None
     assert model.residuals.mass is not None
     torch.testing.assert_close(model.prepared().forward_dynamics(q, qd, x), model.forward_dynamics(q, qd, x))

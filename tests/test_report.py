@@ -41,13 +41,12 @@ def traces(name):
     covered = {"low": -1.0, "high": 1.0, "counts": [1] * 24}
     return {
         "coverage": {"seconds": 1.0, "q": [covered] * 3, "qd": [covered] * 3},
-        "growth": {"seconds": [0.1, 1.0], "windows": 9, "relative": {"model": grown, "URDF": grown}, "tip_mm": {}},
+        "growth": {"seconds": [0.1, 1.0], "windows": 9, "relative": {"model": grown, "URDF": grown}},
         "trajectories": [{"which": "typical", "trajectory": name, "start": 0.0, "error": 0.1, "t": t, "q": wave,
                           "qd": wave, "predicted_q": near, "predicted_qd": [[None] * 3, *near[1:]]}],
         "torques": [{"which": "typical", "trajectory": name, "t": t, "q": wave, "qd": wave, "measured": near,
                      "predicted": both,
-                     "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave),
-                     "energy": dict.fromkeys(("work of the drives", "stored", "friction", "not explained"), one)}],
+                     "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave)}],
         "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries}}},
         "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3}},
     }  # fmt: skip
@@ -121,9 +120,9 @@ def test_page_is_complete_and_self_contained(run):
     assert all(link.startswith("#") or link == "data:," for link in page.links)
     assert "url(" not in path.read_text(encoding="utf-8")
     charts = path.read_text(encoding="utf-8").count('<svg class="chart"')
-    loss, growth, torques, energy, states, friction, coverage = 1, 1, 9, 1, 12, 3, 6
+    loss, growth, torques, states, friction, coverage = 1, 1, 9, 12, 3, 6
     mass = 5  # number of entries of M that are not always zero
-    assert charts == loss + growth + torques + energy + states + mass + friction + coverage
+    assert charts == loss + growth + torques + states + mass + friction + coverage
     assert "default-src 'none'" in path.read_text(encoding="utf-8")
 
 
@@ -269,14 +268,6 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
-
-
-def test_a_constant_entry_of_the_mass_matrix_has_the_value_in_the_table(run, robots):
-    model = build(robots / "rpr.urdf", "spel", width=8)
-    write_model(run, model)
-    entry = model.mass_matrix(torch.tensor([0.3, 0.2, 0.1]).double())[1, 1] - model.mass.armature()[1]
-    row = rf'<th scope="row">M22</th><td[^>]*>{entry.item():.4g}</td><td[^>]*>kg</td>'
-    assert re.search(row, render_report(run))
 
 
 def test_the_report_is_available_as_json(run, robots):

@@ -234,6 +234,14 @@ def test_reported_intervals_cover_the_truth(fitted):
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
+def test_every_ratio_that_is_open_is_named():
+    """A dead zone that the logs do not determine is named, also if the dry friction of its joint is determined."""
+    sure = {"value": 0.1, "low": 0.09, "high": 0.11, "determined": True}
+    joint = {"joint": "elbow", "kp": {"value": 20.0}, "dry": sure, "dead_zone": sure | {"determined": False}}
+    text = servo_summary({"joints": [joint], "delay": {"value": 0.01, "half": 0.001}, "rms": [0.002]}).text
+    assert "Not determined by these logs: half dead zone of elbow" in " ".join(text.split())
+
+
 def servo_truth(servos, q):
     """Return the true gravity torque / kp at q (T, 2), and the elbow's true inertia / kp, of simulated servos."""
     first, second = (np.sin(q[:, 0]), np.sin(q[:, 0] + q[:, 1]))

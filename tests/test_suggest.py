@@ -202,6 +202,7 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
         ("temps", "position", "vitesse", "couple"),
         ("时间", "位置", "速度", "力矩"),
         ("time", "qpos", "qvel", "qfrc_actuator"),
+        ("time", "pos", "vel", "eff"),
     ],
 )
 def test_words_of_other_languages(scara, tmp_path, words):
@@ -245,6 +246,21 @@ def test_the_command_writes_the_mapping_and_uses_it(robots, tmp_path):
     assert told.stdout.startswith(
         f"wrote {tmp_path}/map.yaml; check it, then pass it by --mapping\nscara: 1 trajectory"
     )
+
+
+def test_words_for_commands_in_names_of_joints_are_not_commands(scara, tmp_path):
+    """A servo's measured positions are found if its joints are named by words for commands."""
+    text = (scara.robot.path).read_text()
+    names = ["d", "target", "e", "set"]
+    for k, name in enumerate(names):
+        text = text.replace(f'"joint{k + 1}"', f'"{name}"')
+    (tmp_path / "arm.urdf").write_text(text)
+    head = ["t", *(f"{x}_{name}" for x in ("q", "cmd") for name in names)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, Q]))
+    draft = suggest_mapping(path, names, commands=True)
+    assert not draft.missing
+    for name in names:
+        assert f'"q": "q_{name}", "u": "cmd_{name}"' in draft.text
 
 
 @pytest.mark.parametrize("command, measured", [("u", "q"), ("goal_position", "present_position")])

@@ -49,9 +49,10 @@ class Drives(NamedTuple):
 class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
-    couplings: nonzero entries of the matrix of joint torques per motor torque, for motors that drive several joints, if
-    the logs contain joint torques. G is then the identity for these joints, and only the motor speeds depend on the
-    couplings.
+    A motor that drives several joints has an entry, joint torque per motor torque, for each of its joints. If the logs
+    contain motor torques, the entries of such motors are in ``entries``, with all other entries of G. If the logs
+    contain joint torques, G is the identity for the driven joints; the entries of such motors are then in ``couplings``
+    and determine only the motor speeds (see `drives`).
     """
 
     joints: int
@@ -74,8 +75,9 @@ class Actuation:
     def drives(self) -> Drives:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, the input matrix G is the identity for coupled joints. To compute the motor speeds,
-        # the rows of these joints are replaced by the couplings.
+        # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds G^T qd need
+        # the joint torques per motor torque: in `torques`, a copy of G, the rows of coupled joints are replaced by the
+        # couplings.
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -87,15 +89,16 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
     """Return the matrix C of the motor speeds C qd at the joint velocities qd.
 
     Args:
-        inputs: joint torques per motor torque, (n, n).
+        inputs: matrix G of joint torques per motor torque, (n, n).
 
     Returns:
-        C (n, n), row i for motor i. The speed of a motor is divided by its gear ratio to the joint on which the motor
-        has the largest torque: C is the identity if each motor moves only its own joint. For a passive joint, which has
-        no motor, the row of C is the row of the identity.
+        C (n, n): G^T, row i for motor i, with each row divided by its element of largest magnitude, the gear ratio to
+        the joint on which the motor has the largest torque. C is the identity if each motor moves only its own joint. A
+        passive joint has no motor: its row of C is the row of the identity.
     """
-    # Motors and joints have equal power: tau_m . speed_m = tau . qd, and tau = G tau_m, so that speed_m = G^T qd. C is
-    # G^T with each row divided by its element of largest magnitude.
+    # Motors and joints have equal power: tau_m . speed_m = tau . qd, and tau = G tau_m, so that the motor speeds are
+    # speed_m = G^T qd. Each row of G^T is divided by its element of largest magnitude: friction is then a function of
+    # the speed on the joint side of the gear.
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
     speeds: np.ndarray = (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
@@ -116,8 +119,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Entries of the input matrix G for joints that are driven by several motors are in `couplings`, whose matrices
-    # include the gears.
+    # A joint that is driven by several motors gets no entry here: its entries of the input matrix G are in `couplings`,
+    # and include the gear ratios.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

@@ -179,7 +179,7 @@ def make_arm(
 
 
 def _require_small(robot: Robot, chain: ChainChoice) -> None:
-    """Raise ArmError for an arm whose structure would take more than some seconds to derive."""
+    """Raise ArmError for more than 16 joints or 48 mimic joints, whose structure would take too long to derive."""
     # The time to derive the structure of an arm increases with about the fifth power of the number of joints.
     moving, largest, most_followers = len(chain.joints), 16, 48
     if moving > largest:
@@ -259,7 +259,11 @@ def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> Lump
 
 
 def _total(placement: Placement, links: Sequence[UrdfLink]) -> TenVector | None:
-    """Return the inertial parameters (10,) of the links of one body together, in its frame; None without links."""
+    """Return the sum of the inertial parameters (m, m c, I) of the links of one body, (10,) [kg, kg m, kg m2].
+
+    The result is in the frame of the body; ``placement`` has the pose of each link in this frame. None if no link has
+    an <inertial>.
+    """
     tens = [placement.inertia(link, link.inertial) for link in links if link.inertial]
     if not tens:
         return None
@@ -314,10 +318,10 @@ def _dependent_remarks(
 ) -> Iterator[Diagnostic]:
     """Yield a warning for each locked joint that may be part of a parallelogram linkage of the arm.
 
-    URDF has no closed loops: a linkage is opened. Its two joints then have the same parent body and parallel axes, and
-    one of them is not in the chain.
+    URDF has no closed loops, so a linkage is opened at a joint. Two revolute joints then have the same parent body and
+    parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links in their bodies.
     """
-    roots: dict[str, str] = {}  # first link of the branch to which a link belongs
+    roots: dict[str, str] = {}  # {link: first link of its branch}, to group joints by branch
     branches: dict[str, list[UrdfJoint]] = {}
     for joint in locked:
         if joint.moves or joint.parent in roots:
@@ -328,7 +332,8 @@ def _dependent_remarks(
         if joint.mimic is not None or any(x.type not in ("revolute", "continuous") for x in branch):
             continue
         beside = _parallel_beside(placement.frames[joint.parent], moved, axes[0])
-        # All joints of a linkage turn in one plane; a head pans and tilts.
+        # The joints of a linkage have parallel axes. A branch with other axes, such as a head that pans and tilts, is
+        # no linkage and causes no warning.
         if beside and all(_are_parallel(axes[0], axis) for axis in axes):
             message = (
                 f"turns parallel to {beside[0]!r} beside it, and has no <mimic>: "
@@ -338,7 +343,10 @@ def _dependent_remarks(
 
 
 def _axis(frame: Frame, joint: UrdfJoint) -> np.ndarray:
-    """Return the direction (3,) of a joint's axis in the frame of its parent body. frame: frame of its parent link."""
+    """Return the direction (3,) of a joint's axis in the frame of the body that carries its parent link.
+
+    frame: pose of the parent link in the frame of this body.
+    """
     rotation = np.array(frame.rotation, dtype=float) @ rotation_from_rpy(joint.rpy)
     return np.asarray(rotation @ np.array(joint.axis) / np.linalg.norm(joint.axis))
 
@@ -349,7 +357,7 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of the revolute joints on the body of ``frame`` with an axis parallel to ``axis`` (3,)."""
+    """Return the names of revolute joints in ``moved`` whose parent is the body of ``frame``, parallel to ``axis``."""
     # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
     return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

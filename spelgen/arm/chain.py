@@ -147,9 +147,10 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    If several chains are the longest, and only one of them has effort limits for all joints, this chain is returned;
-    otherwise ArmError is raised. Exception: the last joint is omitted if it is one of a pair of jaws. Jaws are
-    prismatic joints with the same parent link: a joint and its mimic joint, or the last joints of all longest chains.
+    1. If the last joint is a jaw of a gripper, it is omitted. Jaws are two or more prismatic joints with the same
+       parent link: the last joint with its mimic joints, and the last joints of the other longest chains.
+    2. If there are no jaws and several chains are the longest, the chain with effort limits of all joints is returned.
+       Raises ArmError if no chain, or more than one, has these limits.
     """
     # The end of each branch may be the tip. The longest chain is the arm, because hands, tools and sensors are on
     # shorter branches.
@@ -188,9 +189,10 @@ def _longest(robot: Robot) -> ChainChoice:
 def _possible_gripper(robot: Robot, last: UrdfJoint, is_pair: bool) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    The joint may open a gripper if it is prismatic and moves by at most 0.1 m, if it is one of a pair of jaws
-    (``is_pair``), or if its child link has the name of a gripper, and no joint of the robot has such a name. A joint
-    with a range of more than half a turn rotates the gripper as a whole, because no jaw opens that far.
+    The joint may open a gripper in three cases: it is prismatic and moves by at most 0.1 m; it is one of a pair of jaws
+    (``is_pair``); or its child link has the name of a gripper. Names of links are used only if no joint of the robot
+    has the name of a gripper: joints with such names are excluded from the chain already. A joint with a range of more
+    than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
     """
     travel = last.upper - last.lower if last.lower is not None and last.upper is not None else 0.0
     is_named = bool(_GRIPPER.search(last.child)) and not any(map(_GRIPPER.search, robot.joint))

@@ -47,8 +47,8 @@ class AngleRounding:
     @property
     def rotation_error(self) -> float:
         """Largest permitted error of the rational approximation of a rotation [rad]."""
-        # If rounding is disabled, the rational approximation must not round either: with an error of 1e-11, an angle of
-        # 1.57079632679 would become pi/2, from which it differs by 5e-12.
+        # If rounding is disabled, the rational approximation must not round either: with a permitted error of 1e-11,
+        # the rotation by 1.57079632679 would become a quarter turn, since this angle differs from pi/2 by 5e-12.
         return TUNING.rotation_error if self.tolerance else 1e-15
 
     def origin(
@@ -56,7 +56,7 @@ class AngleRounding:
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the position (3,) [m] and rotation (3, 3) of an <origin>; the rotation is None if all angles are zero.
 
-        where, line: name and line of the element in diagnostics.
+        xyz, rpy: attributes of the element [m, rad]. where, line: name and line of the element in diagnostics.
         """
         written = np.array(list(map(exact, xyz)))
         offset = self.position(written)
@@ -93,7 +93,8 @@ class AngleRounding:
         unit: np.ndarray = np.array(joint.axis) / np.linalg.norm(joint.axis)
         if self.tolerance == 0.0:
             return unit
-        # Components of an axis below 1e-3 are set to 0, because some CAD exporters print three digits.
+        # Components of the unit vector below 1e-3 are set to 0: some CAD exporters print three digits, so that a
+        # component of 0.001 may be a rounding error.
         rounded = np.where(np.abs(unit) < 1e-3, 0.0, unit)
         # The axis is normalised again, because components were set to 0.
         rounded /= np.linalg.norm(rounded)
@@ -103,7 +104,7 @@ class AngleRounding:
         return rounded
 
     def position(self, vector: np.ndarray) -> np.ndarray:
-        """Return a position (3,) [m] with components below 1 nm, which are rounding errors of rotations, set to 0."""
+        """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
         # [m] Bound of the rounding errors that composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
@@ -124,7 +125,7 @@ def _in_pi(angle: float) -> str:
 
 
 def _text(values: Sequence[float] | np.ndarray) -> str:
-    """Return a vector (3,) as text for a message, with six digits per component."""
+    """Return a vector (3,) as text for a message, with six significant digits per component."""
     return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
@@ -134,8 +135,9 @@ class Frame(NamedTuple):
     Attributes:
         body: index of the body of the link, -1 for the root link.
         rotation, position: exact rotation (3, 3) and position (3,) [m] of the link in the frame of this body.
-        composed: float64 rotation (3, 3) of the link relative to the start of the segment, which is the last body with
-            a revolute joint on the path from the root to the link.
+        composed: float64 rotation (3, 3) of the link relative to the start of its segment: the last body with a
+            revolute joint on the path from the root to the link, or the root. The exact rotations of the segment are
+            approximated from `composed`.
     """
 
     body: int
@@ -154,9 +156,9 @@ class Placement:
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # A segment starts at the root, or at a body with a revolute joint; bodies with prismatic joints continue the
-        # segment. `_segments[body + 1]` has an element for each body from the start of the segment to this body: its
-        # rotation relative to the start of the segment, in float64 and exact. Index 0 is the root (body -1).
+        # A segment starts at the root (body -1) or at a body with a revolute joint; bodies with prismatic joints
+        # continue the segment. `_segments[body + 1]` has a pair for each body from the start of the segment to this
+        # body: the rotation relative to the start of the segment in float64, and its rational approximation.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
@@ -168,13 +170,14 @@ class Placement:
             if joint.type == "prismatic":
                 offset = exact(value) * np.array(list(map(exact, axis.tolist())))
             else:
-                # A revolute joint that is not locked at zero rotates the frames of all later links by a constant angle.
+                # A revolute joint that is locked at a nonzero angle rotates the frames of all later links by this
+                # angle.
                 turn = rotation_about(axis, rounded_angle(value, self._rounding.tolerance))
             frame = self._displaced(frame, offset, turn)
         self.frames[joint.child] = frame
 
     def move(self, joint: UrdfJoint) -> tuple[int, np.ndarray, np.ndarray]:
-        """Add a moving joint and the pose of its child link, which start a body.
+        """Add to ``frames`` the pose of the child link of a moving joint; the link starts a new body.
 
         Bodies are numbered in the order of the calls.
 
@@ -189,8 +192,8 @@ class Placement:
         rotation = self._in_body(frame.body, aligned)
         body = len(self._segments) - 1
         if joint.type == "prismatic":
-            # A prismatic joint does not rotate, so that the rotations before and after it compose to a constant one:
-            # the segment continues.
+            # A prismatic joint does not rotate: the product of the rotations before and after it is constant and is
+            # approximated as a whole, so the body continues the segment of its parent.
             segment = self._segments[frame.body + 1]
             self._segments.append((*segment, (aligned, segment[-1][1] @ rotation)))
             composed = frame.composed
@@ -230,29 +233,32 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return a joint's position (3,) [m] in the parent body, with rounding errors in both frames replaced by 0.
+        """Return a joint's position (3,) [m] in the parent body, without tiny components due to rounding errors.
 
-        A position may have components that should be 0 in the frame of the parent body, or in the joint's own frame.
         Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly parallel to the rational
-        approximation of the axis. The result is ``position`` if the components cannot be 0 in both frames.
+        approximation of the axis. Tiny components are set to 0 along the axes of the joint's frame, then along the axes
+        of the body's frame. If the second step changes the components in the joint's frame again, the zeros in the two
+        frames contradict each other, and ``position`` is returned unchanged.
 
         Args:
             rotation: exact rotation (3, 3) of the joint's frame in the frame of the parent body.
-            position: exact position (3,) [m] in the frame of the parent body, whose tiny components are 0 already.
+            position: exact position (3,) [m] in the frame of the parent body; its tiny components in this frame are 0
+                already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components of a position are set to 0 in both frames: a rounding error would make a zero entry of M
-        # nonzero.
+        # Tiny components of the joint's position are set to 0 in the joint's frame and in the body's frame: a rounding
+        # error in either would make a zero entry of M nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the exact rotation (3, 3) of a frame relative to a body, from its rotation in float64.
 
-        Relative to each body of the segment (see the docstring of the module), the rotation may have zero elements: two
-        axes are normal to each other. A rational approximation relative to one body preserves its zeros, but may lose
-        the zeros relative to another body. The rotation is therefore approximated relative to each body of the segment
-        in turn, and the approximation that loses the fewest zeros is used.
+        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. Such zeros may
+        occur relative to each body of the segment, the bodies since the last revolute joint. A rational approximation
+        of the rotation relative to one body preserves the zeros relative to this body only. The rotation is therefore
+        approximated relative to each body of the segment in turn, and the approximation that preserves most zeros is
+        used.
 
         Args:
             body: index of the body, -1 for the root link.

@@ -90,7 +90,8 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     """Return a rotation R (3, 3) with R z = ``axis``, a unit vector (3,).
 
     For an axis along +-x, +-y or +-z, R is a signed permutation. For any other axis, R is the signed permutation for
-    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``, which preserves zeros.
+    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``: if a component of
+    ``axis`` is zero, four elements of R are zero.
     """
     index = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[index] > 0 else -1.0
@@ -176,9 +177,9 @@ def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
     be 1. error: largest error of an element.
     """
     # The angle is split into exact quarter turns and a remainder: only the remainder is approximated, so that the
-    # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is between -0.7 and 0.87 rad
-    # (`eighth` [rad]), not between -45 and 45 degrees: rounding errors of +-45 degrees, which are common angles, would
-    # change the number of quarter turns.
+    # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is in [-`eighth`, pi/2 -
+    # `eighth`), from -40 to 50 degrees. `eighth` is less than an eighth turn: with bounds of +-45 degrees, rounding
+    # errors would change the number of quarter turns of angles of +-45 degrees, which are common.
     eighth = 0.7
     quarter, angle = divmod(atan2(sine, cosine) + eighth, pi / 2)
     tangent = tan((angle - eighth) / 2)

@@ -14,14 +14,13 @@ class DelayedCommand:
     """Predictor of joint positions: the position at time t is the command at time t - delay. delay: [s]."""
 
     delay: float
-    about = "the commands themselves, after the delay by which they are nearest to the positions of the training logs"
 
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the delayed commands as predicted positions, (K, n) [rad, m] per segment of K sample intervals.
 
-        parts: the segments, (log, slice of its samples) each. The initial states q and qd are not used.
+        segments: the segments, (log, slice of its samples) each. The initial states q and qd are not used.
         """
-        return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in parts]
+        return [delayed_commands(log, rows, self.delay, 1)[:, 0] for log, rows in segments]
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,8 @@ class LinearServos:
         damping: Damping ratio of each joint, (n,) [1].
         delay: Delay of the command of each joint, (n,) [s].
         offset: Offset of the position of each joint, (n,) [rad, m].
-        late: Delay of the other baseline, `DelayedCommand`, which is the same for all joints [s].
+        late: Delay of the baseline `DelayedCommand`, the same for all joints [s]. It is here because a run stores the
+            parameters of both baselines in one record.
     """
 
     frequency: Sequence[float]
@@ -41,18 +41,17 @@ class LinearServos:
     delay: Sequence[float]
     offset: Sequence[float]
     late: float
-    about = "a linear second-order servo at each joint, fitted to windows of the training logs"
 
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions, (K, n) [rad, m] per segment of K sample intervals.
 
         Args:
-            parts: the segments, (log, slice of its samples) each.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
+            segments: the segments, (log, slice of its samples) each.
+            q: (segments, n) initial positions [rad, m].
+            qd: (segments, n) initial velocities [rad/s, m/s].
         """
         frequency, damping, result = np.array(self.frequency), np.array(self.damping), []
-        for start, speed, (log, rows) in zip(q, qd, parts, strict=True):
+        for start, speed, (log, rows) in zip(q, qd, segments, strict=True):
             # All sample intervals are replaced by their mean, so that one transition matrix serves for all intervals.
             dt = float(np.diff(log.t[rows]).mean())
             columns = [delayed_commands(log, rows, late, 1)[:, 0, k] for k, late in enumerate(self.delay)]

@@ -33,9 +33,9 @@ def roll_out_stiff(
 
     Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
     with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
-    approximation is the Jacobian of friction only. Damping and bristles of any stiffness (light links with dry
-    friction) then need no smaller steps, and the error of an explicit method is not confused with an error of the
-    dynamics.
+    approximation is the Jacobian of friction only. Even stiff damping and bristles, which occur with light links and
+    dry friction, then need no smaller steps. An explicit method would need them; otherwise its integration error would
+    be confused with an error of the dynamics.
 
     Args:
         dynamics: dynamics of the arm, see `equations_of`.
@@ -81,7 +81,7 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with the disturbance included.
+        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with `disturbance` of `_stepper`.
 
         pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
         """
@@ -89,9 +89,10 @@ def _stepper(
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Return the state after one step, with the approximate Jacobian A = [[0, 1], [-M^-1 K, -M^-1 D]] of (q, qd).
+        """Return the state after one step of ROS2 (see `roll_out_stiff`).
 
-        D = d friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
+        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
+        friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -107,14 +108,15 @@ def _stepper(
         def solve(velocity: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
             """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each.
 
-            A is the approximate Jacobian of (q, qd), and h = GAMMA times the step length.
+            A is the approximate Jacobian (see `step`), and h = GAMMA times the step length, with the parameter GAMMA of
+            ROS2.
             """
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u) with the approximate Jacobian A: the next state is u + step (3 k1 + k2) / 2, where (1 - h
-        # A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # ROS2 for u' = F(u) with the approximate Jacobian A and h = GAMMA * step: the next state is u + step (3 k1 +
+        # k2) / 2, where (1 - h A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -132,13 +134,19 @@ def _stepper(
 def _friction_slopes(
     dynamics: object, pose: MotionEquations, qd: Tensor, z: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the derivatives D of joint friction with respect to velocity, and K with respect to position.
+    """Return the derivatives of joint friction with respect to velocity (damping) and to position (stiffness).
 
-    D and K are (W, n) [Nm s/rad, N s/m; Nm/rad, N/m] for W windows, the diagonals of Jacobian matrices: the friction of
-    a joint depends only on the motion of the joint. Friction depends on position through the bristles. width: (n,)
-    finite-difference steps of velocity [rad/s, m/s].
+    Damping [Nm s/rad, N s/m] and stiffness [Nm/rad, N/m] are (W, n) for W windows, the diagonals of Jacobian matrices:
+    the friction of a joint depends only on the motion of the joint, and on its position through the bristles.
+
+    Args:
+        dynamics: dynamics of the arm.
+        pose: equations of motion at the current positions, with the function of friction.
+        qd, z: velocities (W, n) [rad/s, m/s] and friction state (W, n, K) [rad, m] of K bristles.
+        width: finite-difference steps of velocity, (n,) [rad/s, m/s].
     """
-    # Central differences are used, because dry friction changes steeply at standstill.
+    # Central differences are used, because the slope of dry friction changes fast near standstill: their error is of
+    # second order in `width`.
     slope = (pose.friction(qd + width, z) - pose.friction(qd - width, z)) / (2 * width)
     # Negative damping (friction that decreases with velocity) is omitted from the friction derivative D, so that the
     # matrix M + h D + h^2 K of a Rosenbrock step remains positive definite. The method then treats this part of
@@ -164,8 +172,9 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value reported errors change by a thousandth.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS velocity error that is multiplied by `tolerance`, as a fraction of the RMS change of
-    # velocity in the windows.
+    # [1] Lower bound of the RMS error of predicted velocities, with which `tolerance` is multiplied, divided by the RMS
+    # change of velocity in the windows: an exact model, with an error of zero, would otherwise need the largest number
+    # of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -187,7 +196,8 @@ States = tuple[Tensor, Tensor]
 class Solver:
     """Integrator of predicted motion by the Rosenbrock method (`roll_out_stiff`).
 
-    The integrator takes the fewest steps per sample interval that are accurate in the `probe` windows.
+    dynamics: the integrated dynamics. probe: measured windows from which the number of integrator steps per sample
+    interval is chosen, see `substeps`.
     """
 
     dynamics: RigidDynamics
@@ -207,10 +217,10 @@ class Solver:
 
     @cached_property
     def substeps(self) -> int:
-        """Number of integrator steps per sample interval, chosen at the first use: evaluations of torques need none.
+        """Number of integrator steps per sample interval; it is computed when motion is predicted for the first time.
 
-        A number of steps is accurate enough if twice as many steps change the predictions of the `probe` windows by
-        less than `TUNING.tolerance` times the error of the predictions.
+        The number is doubled until twice as many steps change the predictions of the `probe` windows by less than
+        `TUNING.tolerance` times the error of the predictions.
         """
         windows = thinned(self.probe, TUNING.probed_windows)
         motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
@@ -247,18 +257,15 @@ def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands. about: text for users about the predictor and its fit."""
+    """Predictor of positions under position commands."""
 
-    @property
-    def about(self) -> str: ...
-
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment at the end of each sample interval.
 
         Args:
-            parts: segments of logs; K is the number of sample intervals of a segment.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
+            segments: segments of logs; K is the number of sample intervals of a segment.
+            q: (segments, n) initial positions [rad, m].
+            qd: (segments, n) initial velocities [rad/s, m/s].
 
         Returns:
             One array of positions per segment, (K, n) [rad, m].

@@ -28,7 +28,7 @@ LinearServoRecord = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class EvaluatedArm:
-    """The information about an arm under torques that baselines may use.
+    """The information that baselines may use about an arm whose inputs are torques.
 
     Attributes:
         joints: Names of the joints in the order of q.
@@ -78,7 +78,7 @@ def urdf_values(arm: EvaluatedArm) -> list[Predictor]:
 
         plain = urdf_dynamics(arm.urdf, arm.joints)
         predictors = [of_dynamics(URDF, plain, arm.probe)]
-        # Without rotors and friction the second baseline would be equal to the first one.
+        # The baseline with rotors and friction is omitted if the settings specify neither: it would equal `plain`.
         if drives_known(arm.urdf, arm.joints):
             driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
             predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))

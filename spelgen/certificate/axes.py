@@ -1,8 +1,8 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results prove reasons for the structure of M and V. A relation, such as parallel axes, is tested in exact arithmetic
-at two random rational configurations. A relation that is not true at all configurations fails this test with a
-probability above 1 - 1e-9 (Schwartz 1980, Zippel 1979).
+The results are proofs of the reasons for the structure of M and the potential energy V. A relation, such as parallel
+axes, is tested in exact arithmetic at two random rational configurations. A relation that is false at some
+configurations passes this test with a probability below 1e-9 (Schwartz 1980, Zippel 1979).
 """
 
 import random
@@ -46,12 +46,15 @@ class Axes:
         self.arm = arm
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # The seed is constant, so that reports are reproducible.
-        # Each configuration has the directions (n, 3) and the twists (n, 6) of the axes. Two configurations suffice:
-        # the probability that a false relation is true by chance at one configuration is about (degree of the
-        # relation's polynomial) / 1e6.
-        self._configurations = [_configuration(arm, generator) for _ in range(2)]
-        # The balance of the last body is tested if its joint is revolute and its inertials are known. In all other
-        # cases its inertial parameters are set to 1, for which all attributes about the last body are False.
+        # Two configurations suffice: a relation is a polynomial equation in random numbers below 1e6 (see
+        # `_configuration`). If the relation is false and the polynomial has the degree d, it is true by chance at one
+        # configuration with a probability of about d / 1e6.
+        configurations = [_configuration(arm, generator) for _ in range(2)]
+        # Exact fractions: directions (2, n, 3) and twists (2, n, 6) of the axes of the n joints.
+        self._directions, self._twists = map(np.array, zip(*configurations, strict=True))
+        # The mass balance of the last body is tested if its joint is revolute and its inertials are known. In all other
+        # cases its ten inertial parameters are set to 1: since none of the ten is zero, all attributes about the last
+        # body are False.
         last = arm.bodies[-1]
         inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
         if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
@@ -63,61 +66,59 @@ class Axes:
         self.without_inertia = not zz
 
     def parallel(self, a: int, b: int) -> bool:
-        return all(_are_parallel(axes[a], axes[b]) for axes, _ in self._configurations)
+        return _are_parallel(self._directions[:, a], self._directions[:, b])
 
     def perpendicular(self, a: int, b: int) -> bool:
-        return self._cosines(a, b) == {0}
+        return not self._cosines(a, b).any()
 
     def fixed_angle(self, a: int, b: int) -> bool:
-        return len(self._cosines(a, b)) == 1
+        return len(set(self._cosines(a, b))) == 1
 
-    def _cosines(self, a: int, b: int) -> set[Fraction]:
-        return {axes[a] @ axes[b] for axes, _ in self._configurations}
+    def _cosines(self, a: int, b: int) -> np.ndarray:
+        return np.asarray((self._directions[:, a] * self._directions[:, b]).sum(axis=-1))
 
     def opposed(self, a: int, b: int) -> bool:
         """Return True if the axes of joints ``a`` and ``b`` have opposite directions; the axes must be parallel."""
         # The cosine of the angle between unit vectors that are always parallel is 1 or -1 at all configurations.
-        return max(self._cosines(a, b)) < 0
+        return bool((self._cosines(a, b) < 0).all())
 
     def same_twist(self, a: int, b: int) -> bool:
-        """Return True if joints ``a`` and ``b`` have equal or opposite twists: coaxial or, if prismatic, parallel axes.
+        """Return True if joints ``a`` and ``b`` have equal or opposite twists.
 
-        A body that both joints carry then has equal or opposite velocities for unit velocities of the two joints.
+        Two revolute joints then are coaxial, and two prismatic joints are parallel. A body that both joints carry then
+        has equal or opposite velocities for unit velocities of the two joints.
         """
-        return all(_are_parallel(twists[a], twists[b]) for _, twists in self._configurations)
+        return _are_parallel(self._twists[:, a], self._twists[:, b])
 
     def commute(self, a: int, b: int) -> bool:
         """Return True if the motions of joints ``a`` and ``b`` commute: the Lie bracket of their twists is zero."""
-        for _, twists in self._configurations:
-            (v, w), (v_b, w_b) = np.split(twists[a], 2), np.split(twists[b], 2)
-            if np.cross(w, w_b).any() or (np.cross(w, v_b) - np.cross(w_b, v)).any():
-                return False
-        return True
+        v, w = np.split(self._twists[:, a], 2, axis=-1)
+        v_b, w_b = np.split(self._twists[:, b], 2, axis=-1)
+        return not np.cross(w, w_b).any() and not (np.cross(w, v_b) - np.cross(w_b, v)).any()
 
     def keep_offset(self, slider: int, hinge: int) -> bool:
-        """Return True if all points that joint ``slider`` carries have constant signed distances from a plane.
+        """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        ``hinge`` is a revolute joint, ``slider`` a prismatic joint farther from the root. The plane contains the axis
-        of ``hinge``, is parallel to the axis of ``slider``, and moves with the child link of ``hinge``. The distances
-        must be constant for any motion of the joints between ``hinge`` and the tip. The entry of M in the row of
-        ``slider`` and the column of ``hinge`` is then constant.
+        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
+        ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
+        the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
+        constant: if ``hinge`` rotates, the velocity of a point along ``slider`` is proportional to its distance from
+        the plane.
         """
+        # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
+        # any plane that is fixed to the child link of `hinge`.
         if not all(self.prismatic[hinge + 1 : slider]):
-            return False  # A revolute joint between ``hinge`` and ``slider`` could change the direction of ``slider``.
+            return False
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]
-        for axes, twists in self._configurations:
-            normal = np.cross(axes[slider], axes[hinge])
-            if not all(_is_orthogonal(twists[joint], normal) for joint in later):
-                return False
-        return True
+        normal = np.cross(self._directions[:, slider], self._directions[:, hinge])
+        return all(_is_orthogonal(self._twists[:, joint], normal) for joint in later)
 
     def is_weightless(self, joint: int) -> bool:
         """Return True if a motion of ``joint`` does no work against gravity.
 
         The joint then slides horizontally, or rotates about a vertical axis, at all configurations.
         """
-        gravity = np.array(self.arm.gravity)
-        return all(_is_orthogonal(twists[joint], gravity) for _, twists in self._configurations)
+        return _is_orthogonal(self._twists[:, joint], np.array(self.arm.gravity))
 
 
 def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -149,12 +150,12 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
 
 
 def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return True if two vectors, (k,) each, are parallel."""
-    products = np.outer(a, b)
-    return not (products - products.T).any()
+    """Return True if two vectors are parallel at both configurations, (2, k) each."""
+    products = a[:, :, None] * b[:, None, :]
+    return not (products - products.mT).any()
 
 
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
-    """Return True if no point of a body with ``twist``, (6,), has a velocity along ``direction``, (3,)."""
-    v, w = np.split(twist, 2)
-    return not v @ direction and not np.cross(w, direction).any()
+    """Return True if no point of a body with ``twist``, (2, 6), has a velocity along ``direction``, (2, 3) or (3,)."""
+    v, w = np.split(twist, 2, axis=-1)
+    return not (v * direction).sum(axis=-1).any() and not np.cross(w, direction).any()

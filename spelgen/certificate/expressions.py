@@ -1,10 +1,10 @@
 """SymPy expressions of closed forms from polynomials of an arm, and their output as text, LaTeX and Python.
 
-The polynomials are entries of M, or V, in sines, cosines and positions of joints. For consecutive joints with parallel
-axes, products of cosines and sines are expressed as cosines and sines of sums of angles. Other simplifications (powers
-of single angles, common factors of several terms) are not used: they shorten long formulas by 20 %, but not the
-formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits; Python for SymPy has
-exact fractions.
+The polynomials are entries of M, or the potential energy V, in sines, cosines and positions of joints. For consecutive
+joints with parallel axes, products of cosines and sines are expressed as cosines and sines of sums of angles. Other
+simplifications (powers of single angles, common factors of several terms) are not used: they shorten long formulas by
+20 %, but not the formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits.
+Python for SymPy has exact fractions, except for fractions with more than 17 digits.
 """
 
 import re
@@ -50,7 +50,7 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Conversion of polynomials of an arm, coefficients of inertial parameters in M or V, to SymPy terms.
+    """Conversion of polynomials, coefficients of inertial parameters in M or in the potential energy, to SymPy terms.
 
     The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position of each coordinate (see
     `Expansion`).
@@ -160,8 +160,8 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # The coefficients of a function with a single parameter are not normalised: they are lengths of the arm, which
-        # users recognise.
+        # The function of a group with a single parameter keeps its coefficients: the coefficients are lengths of the
+        # arm, which users recognise. The function of several parameters is divided by its first coefficient.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))
@@ -183,7 +183,7 @@ def latex(expression: Expr) -> str:
 
 
 def python(expression: Expr) -> str:
-    """Return an expression as Python code for SymPy; fractions with more than 17 digits are rounded."""
+    """Return an expression as Python code for SymPy, with exact fractions up to 17 digits; longer ones are decimals."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(
         _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
     )

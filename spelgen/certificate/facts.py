@@ -25,7 +25,7 @@ EntryReason = Callable[[Axes, MassEntry], Reason]
 
 @dataclass(frozen=True)
 class Fact:
-    """A property of M or V that is true at all configurations, as text.
+    """A property of M or the potential energy V that is true at all configurations, as text.
 
     Attributes:
         statement: sentence with the property, such as "M21 is always zero".
@@ -44,7 +44,7 @@ class Fact:
 
 
 def facts(arm: Chain, structure: Structure) -> tuple[Fact, ...]:
-    """Return the facts about M and V of an arm: properties at all configurations, with geometric reasons if found."""
+    """Return the facts about M and the potential energy V: properties at all q, with geometric reasons if found."""
     # Reasons are about pairs of joint axes, so they are not valid for a coordinate that moves several joints (mimic
     # joints).
     words = _Sentences(structure, Axes(arm, structure.assume) if is_plain(arm) else None)
@@ -65,8 +65,8 @@ class _Sentences:
 
     Attributes:
         structure: structure of the arm.
-        axes: tests of the joint axes that prove reasons; None for an arm with branches or mimic joints, whose facts
-            have no reasons.
+        axes: tests of the joint axes, which prove the reasons of facts; None for an arm with branches or mimic joints,
+            whose facts have no reasons.
     """
 
     structure: Structure
@@ -92,11 +92,12 @@ class _Sentences:
         for entry in self.structure.entries:
             if entry.kind == kind:
                 groups.setdefault(self._reason(why, entry), []).append(entry)
-        # Entries without a reason are listed last.
+        # The entries of M whose value has no known geometric reason are listed last, after the explained ones.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The placeholders in the reason are replaced by the joint of each entry's column or, if this joint is
-                # prismatic, by the joint of its row.
+                # A reason names one joint of an entry and has a placeholder for the other joint (see `zero_reason`,
+                # `balance_reason`): the other joint is the joint of the column or, if the joint of the column is
+                # prismatic, the joint of the row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -165,7 +166,7 @@ def zero_reason(axes: Axes, entry: MassEntry) -> Reason:
 
 
 def constant_reason(axes: Axes, entry: MassEntry) -> Reason:
-    """Return the geometric reason why an entry of M is constant; None if no reason is found."""
+    """Return the geometric reason why an entry of M is constant, as text, or None if no reason is found."""
     later, earlier = entry.row, entry.column
     if later == earlier:
         return _diagonal_reason(axes, later)
@@ -225,8 +226,10 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    The bodies that the joint of the row carries have the same velocity field for unit velocities of the joints of all
-    columns. If the joint of the row carries one balanced body, the same angular velocity suffices.
+    Let c be the joint of the row. The first possible reason is that the joints of the columns are coaxial or, if
+    prismatic, parallel: each of these joints gives the bodies that c carries the same velocity field, up to its sign.
+    The second is that c is the last joint, its body is dynamically balanced, and the joints of the columns are revolute
+    and parallel: the entries then depend only on the angular velocities, which are equal up to sign.
 
     entries: (row, column) of each entry, counted from 0.
     """
@@ -262,7 +265,7 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
 
 
 def weightless_reason(axes: Axes, joint: int) -> Reason:
-    """Return the geometric reason why V does not depend on the position of ``joint``; None if no reason is found."""
+    """Return the geometric reason why the potential energy V does not depend on ``joint``; None if none is found."""
     if axes.is_weightless(joint):
         if axes.prismatic[joint]:
             return "gravity does no work in a translation orthogonal to it"
@@ -274,7 +277,7 @@ def weightless_reason(axes: Axes, joint: int) -> Reason:
 
 
 def potential_reason(axes: Axes) -> Reason:
-    """Return the reason why V is zero at all configurations; None if no reason is found."""
+    """Return the reason why the potential energy V is zero at all configurations; None if no reason is found."""
     if not any(axes.arm.gravity):
         return "gravity is zero"
     if all(axes.is_weightless(joint) for joint in range(len(axes.prismatic))):

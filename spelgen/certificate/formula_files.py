@@ -1,4 +1,4 @@
-"""Output of closed forms of M and V: text for a terminal, a JSON object, LaTeX with amsmath, and Python for SymPy.
+"""Output of closed forms of M and the potential energy V: text, a JSON object, LaTeX with amsmath, SymPy code.
 
 Names of symbols consist of letters and numbers of joints. Names from the URDF occur in files only in comments, as JSON
 strings without line ends and control characters.

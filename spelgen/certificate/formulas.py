@@ -1,4 +1,4 @@
-"""Closed forms of M(q) and V(q), linear in the base inertial parameters, as SymPy expressions.
+"""Closed forms of M(q) and the potential energy V(q), linear in the base inertial parameters, as SymPy expressions.
 
 Each entry of M, and V, is expanded exactly to polynomials (``structure.expansion``). Its terms are collected per base
 parameter (``structure.base_parameters``) and expressed with cosines and sines of sums of angles (``expressions``). For
@@ -39,12 +39,12 @@ Entry = tuple[int, int] | Literal["V"]
 
 @dataclass(frozen=True)
 class Formula:
-    """Closed form of an entry of the lower triangle of M, or of V.
+    """Closed form of an entry of the lower triangle of M, or of the potential energy V.
 
     Attributes:
         entry: (row, column) counted from 1, or "V".
         terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
-            expansion exceeds its budget.
+            expansion would exceed the permitted number of multiplications (`Expansion.budget`).
         expression: SymPy expression; None if the entry is too long.
     """
 
@@ -54,7 +54,7 @@ class Formula:
 
     @property
     def name(self) -> str:
-        """Name of the entry of M, such as ``M21``, or ``V``."""
+        """Name of the entry of M, such as ``M21``, or ``V`` for the potential energy."""
         return "V" if self.entry == "V" else entry_name(self.entry[0] - 1, self.entry[1] - 1)
 
     @property
@@ -67,7 +67,7 @@ class Formula:
 
 @dataclass(frozen=True, repr=False)
 class Formulas:
-    """Closed forms of M, and of V up to a constant, in the base parameters of an arm.
+    """Closed forms of M, and of the potential energy V up to a constant, in the base parameters of an arm.
 
     Attributes:
         arm: the arm.
@@ -104,7 +104,7 @@ class Formulas:
 
     @property
     def potential(self) -> Expr | None:
-        """Expression of V(q) [J]; None if V has no expression."""
+        """Expression of the potential energy V(q) [J]; None if V has no expression."""
         return next((row.expression for row in self.written if row.entry == "V"), None)
 
     @property
@@ -127,19 +127,23 @@ class Formulas:
 
     @property
     def trusted(self) -> str:
-        """Text that states for which inertial parameters the formulas are valid: any, or with the zeros of the URDF."""
+        """Text that states for which inertial parameters the formulas are valid.
+
+        The formulas are valid for parameters of any values or, with ``assume="inertials"``, for parameters with the
+        zeros and symmetries of the URDF's parameters.
+        """
         if self.assume == "inertials":
             return "the URDF's inertial zeros and symmetries"
         return "any inertial values"
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The entries of M, and V, that have an expression."""
+        """The formulas with an expression, of entries of M or of the potential energy V."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The entries of M, and V, that have no expression, because they are too long."""
+        """The formulas without an expression: entries of M, or the potential energy V, with too long closed forms."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -157,7 +161,7 @@ class Formulas:
 def formulas(
     arm: Chain, structure: Structure, *, entry: Entry | None = None, longest: int | None = None
 ) -> Formulas:
-    """Return closed forms of all entries of M and of V, or only of one entry.
+    """Return closed forms of all entries of M and of the potential energy V, or only of one entry.
 
     Args:
         arm: The arm.
@@ -193,7 +197,7 @@ def formulas(
 
 
 class _Writer:
-    """Computes closed forms of single entries of M, or of V; the expansion of an arm is prepared once for all entries.
+    """Computes closed forms of entries of M and of the potential energy V; the expansion is prepared only once.
 
     Attributes:
         base: base parameters in the closed forms.
@@ -206,9 +210,10 @@ class _Writer:
         self._writer = PolynomialWriter(arm, self._expansion.context)
 
     def formula(self, entry: Entry, longest: int) -> Formula:
-        """Return the closed form of an entry of M, or of V.
+        """Return the closed form of an entry of M, or of the potential energy V.
 
-        It has no expression if it has more than ``longest`` terms, or if its expansion exceeds the budget.
+        It has no expression if it has more than ``longest`` terms, or if its expansion to polynomials would exceed the
+        permitted number of multiplications (`Expansion.budget`).
         """
         try:
             polynomials = self._polynomials(entry)
@@ -228,7 +233,7 @@ class _Writer:
         """Return {base parameter: coefficient of this parameter in an entry of M, or in V without its constant}.
 
         A coefficient is a polynomial in sines, cosines and positions of the joints. Raises TooLarge if the expansion
-        exceeds the budget.
+        would exceed the permitted number of multiplications (`Expansion.budget`).
         """
         energies = self._expansion.energies
         element = energies.potential if entry == "V" else energies.mass[entry[0] - 1, entry[1] - 1]
@@ -245,8 +250,8 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # For the inertials of the URDF, terms of different base parameters with the same monomial may cancel each
-        # other. Monomials whose total coefficient is zero are removed.
+        # The formulas are for the inertials of the URDF only: terms of different base parameters with the same monomial
+        # may cancel each other for these values. Monomials whose total coefficient is then zero are removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

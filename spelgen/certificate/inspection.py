@@ -32,7 +32,7 @@ class Inspection:
 
     Attributes:
         arm: the arm.
-        structure: structure of M and V.
+        structure: structure of the mass matrix M and the potential energy V.
         actuation: entries of the input matrix G.
         diagnostics: remarks of the reading of the URDF, such as rounded angles.
         input: "torque", or "position" for an arm with position servos.
@@ -46,11 +46,11 @@ class Inspection:
 
     @property
     def facts(self) -> tuple[Fact, ...]:
-        """Facts about the structure of M and V as sentences, with geometric reasons."""
+        """Facts about the structure of M and the potential energy V as sentences, with geometric reasons."""
         return facts(self.arm, self.structure)
 
     def closed_forms(self, entry: PlaceOfEntry | None = None, *, longest: int | None = None) -> Formulas:
-        """Return M and V, or one entry, as SymPy expressions.
+        """Return M and the potential energy V, or one entry of M, as SymPy expressions.
 
         Args:
             entry: (row, column) of an entry of M, counted from 1, or "V"; None: all entries and V.
@@ -91,7 +91,7 @@ class Inspection:
         }
 
     def text(self) -> str:
-        """Return the result as a report for a terminal: joints, pattern of M, needs of the model, facts, remarks."""
+        """Return the result as text for a terminal: joints, kinds of entries of M, functions to learn, facts."""
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
@@ -133,8 +133,8 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        # Logs of torques determine all base parameters. Logs of position servos determine only ratios of parameters, so
-        # the undetermined parameters are listed.
+        # Logs of torques determine all base parameters. Logs of position servos determine some parameters only in ratio
+        # to kp, or together with the inertial parameters: for such logs the JSON object lists these parameters, too.
         rank = servo_rank(self.arm)
         undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
         ratios = list(map(self._names, rank.groups))
@@ -208,7 +208,7 @@ class Inspection:
     def needs(self) -> dict[str, str]:
         """Return {quantity: text for users about the functions and constants that a model needs for it}.
 
-        The quantities are "M(q)", "V(q)", "G" (the inputs) and "base" (the number of base inertial parameters).
+        The quantities are "M(q)", "V(q)", "G" (the input matrix) and "base" (the number of base inertial parameters).
         """
         structure = self.structure
         # Outputs (varying terms of M) are counted per set of joints, because one network computes all outputs that
@@ -217,7 +217,7 @@ class Inspection:
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
-        # An arm with constant M has no outputs, so there is nothing to list.
+        # If M is constant, its model has no outputs, so there are no sets of joints to list.
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"

@@ -44,8 +44,8 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     stated = parse_spec(text, module)
     path = Path(urdf) if urdf is not None else find_urdf(module, stated.urdf)
     arm = arm_of_spec(stated, path)
-    # The URDF is compared by its digest. The path of the URDF is copied from the module to `spec` before the
-    # comparison, since the file may have been moved since the build.
+    # The URDF is compared by its digest. A different path is no difference, since the file may have been moved since
+    # the build: the newly derived `spec` gets the path that the module states.
     spec = replace(derive_spec(arm, stated.options), urdf=stated.urdf)
     reasons = []
     if spec.urdf_sha256 != stated.urdf_sha256:
@@ -55,8 +55,9 @@ def check(module: str | Path, urdf: str | Path | None = None) -> CheckResult:
     # The text of the module is compared with both forms, standalone or not, because it does not state its form.
     if text not in (module_text(spec, standalone=is_standalone) for is_standalone in (False, True)):
         reasons.append("the text of the module differs from that of `spelgen build`")
-    # A comparison of texts cannot detect an error of the derivation of the structure, which both texts would contain.
-    # The verification by Pinocchio is independent of the derivation.
+    # The comparison of the module with its newly generated text cannot detect an error in the derivation of the
+    # structure, since both texts would contain the same error. The verification by Pinocchio is independent of the
+    # derivation.
     proof = verify(arm.robot, arm.chain, derive(arm.chain, stated.options.assume))
     reasons += [str(difference) for difference in proof.differences]
     return CheckResult(path, not reasons, tuple(reasons), proof)

@@ -74,7 +74,7 @@ def draw(arm: Chain, count: int, rng: np.random.Generator, *, random_inertials: 
     diagonal = np.abs(np.diagonal(mass, axis1=2, axis2=3)).mean(axis=(0, 1))
     scale = np.sqrt(np.outer(diagonal, diagonal))[rows, columns]
     scale[scale == 0] = 1.0
-    # Without gravity, all gravity torques are zero, and they are divided by 1.
+    # Gravity torques are divided by their largest magnitude, but by 1 if all are zero (no gravity), to avoid 0 / 0.
     largest = np.abs(gravity).max() or 1.0
     mass = mass[:, :, rows, columns] / scale
     return NumericSamples(mass, scale, gravity / largest, mass[1:] - mass[0])
@@ -120,26 +120,12 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
     return replace(arm, bodies=tuple(bodies))
 
 
-@dataclass(frozen=True)
-class ReadingDifference:
-    """Largest relative differences of a quantity between Pinocchio's and spelgen's readings of a URDF.
+def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tuple[float, float]]:
+    """Return {quantity, such as "masses and inertias": largest relative differences of two readings of the URDF}.
 
-    Attributes:
-        quantity: name of the quantity, such as "masses and inertias".
-        difference: difference between Pinocchio and spelgen's chain without rounding of angles.
-        rounding: difference between spelgen's chains with and without rounding of angles.
-    """
-
-    quantity: str
-    difference: float
-    rounding: float
-
-
-def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingDifference]:
-    """Return the differences between the chain of ``arm`` and Pinocchio's reading of the URDF.
-
-    Joint axes, masses and inertias are compared at random configurations. Raises the exceptions of Pinocchio, and
-    ValueError if the file has changed.
+    The first difference is between Pinocchio and spelgen's chain without rounding of angles, the second between
+    spelgen's chains with and without rounding. Joint axes, masses and inertias are compared at random configurations.
+    Raises the exceptions of Pinocchio, and ValueError if the file has changed.
 
     robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random configurations.
     """
@@ -151,14 +137,14 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> list[ReadingD
     written, ours = (_compared_values(_arm_dynamics(variant), arm, q) for variant in (as_written, arm))
     if all(body.inertia is None for body in arm.bodies):
         del written["masses and inertias"]
-    differences = []
+    differences = {}
     for quantity, values in written.items():
         # Each difference of two numbers is divided by the magnitude of the number, so that errors of light bodies are
         # detected. A thousandth of the largest magnitude is added to the divisor, so that rounding errors of numbers
         # close to zero are not reported.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
-        pair = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
-        differences.append(ReadingDifference(quantity, *(float(apart.max()) for apart in pair)))
+        difference, rounding = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
+        differences[quantity] = float(difference.max()), float(rounding.max())
     return differences
 
 
@@ -193,7 +179,9 @@ def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> 
     """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
-    (S, B, B + 1): M of the B joints with doubled diagonal entries, then the gravity torque as the last column.
+    (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
+    column. M is the sum of its upper triangle, which Pinocchio computes, and the transposed triangle. The sum doubles
+    the diagonal entries, which has no effect, because each entry is compared relative to its own magnitude.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -28,7 +28,7 @@ _MARKS = {"agrees": "ok", "differs": "DIFFERS", "undecided": "open"}
 
 @dataclass(frozen=True)
 class FactCheck:
-    """Result of the numerical verification of one derived fact about M or V.
+    """Result of the numerical verification of one derived fact about M or the potential energy V.
 
     Attributes:
         fact: name of the fact, such as "zero entries".
@@ -190,20 +190,20 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
     # [1] The tolerance of the comparison is 1e-9 per joint: the chain omits offsets below 1e-9 m, and the errors of its
     # rational rotations are 1e-11 rad each.
     allowed = 1e-9 * len(robot.joints)
-    for difference in differences:
+    for quantity, (difference, rounding) in differences.items():
         verdict: Verdict = "agrees"
-        if difference.difference > allowed or (difference.rounding > allowed and not is_rounded):
+        if difference > allowed or (rounding > allowed and not is_rounded):
             verdict = "differs"
-        result = f"at most {size_text(difference.difference)} of their magnitude apart"
+        result = f"at most {size_text(difference)} of their magnitude apart"
         if is_rounded:
-            result += f"; the reported roundings change them by {size_text(difference.rounding)}"
-        yield FactCheck(f"{difference.quantity} in the file", "as Pinocchio reads them", result, verdict)
+            result += f"; the reported roundings change them by {size_text(rounding)}"
+        yield FactCheck(f"{quantity} in the file", "as Pinocchio reads them", result, verdict)
 
 
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield the facts which entries of M are zero, and on which joints each entry depends.
+    """Yield two facts about the entries of M: the zero entries, if any, and the joints on which each entry depends.
 
-    Each fact has the numbers that test it: the entries in `samples`, and their changes if only one joint moves.
+    The first fact is tested by the entries in `samples`, and the second by their changes if only one joint moves.
     """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
@@ -237,10 +237,12 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         functional = row_of(term.functional, n)
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
-        # The value of a term, f_j or c_k, is a linear functional of M. Changes of the value are divided by the sum of
-        # the magnitudes of the functional's summands.
+        # A term of the minimal form is a function f_j(q) or a constant c_k. Its value is a weighted sum of the entries
+        # of M, with the weights `functional`. Changes of the value if one joint moves, (n,), are divided by the sum
+        # over the entries of |weight| times scale, to which rounding errors are proportional.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # Changes of a term caused by its own joints are allowed; only changes by other joints contradict the fact.
+        # A term may change if one of its own joints moves; the minimal form is wrong only if another joint changes the
+        # term.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
@@ -252,31 +254,34 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
 
 
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix of samples.
+    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
 
-    The numbers are: outputs (terms that vary with q); outputs and constants; and, for k = 0, 1, ..., the outputs that
-    do not depend on the first k joints.
+    Outputs are the terms that vary with q, constants the other terms; all terms are linearly independent. A matrix has
+    one column per entry of M. First, the number of outputs must be the rank of the changes of M, with one row per
+    configuration and moved joint. Second, the number of outputs and constants must be the rank of M itself, with one
+    row per configuration. Third, for each k, the number of outputs that depend on any of the first k joints must be the
+    rank of the changes due to these joints.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The outputs are derived such that, for each k, the largest possible number of outputs does not depend on the first
-    # k joints. This number is verified for each k.
+    # The derivation of the structure maximises, for each k, the number of outputs (terms of M that vary with q) that do
+    # not depend on the first k joints. A rank shows for each k that no larger number is possible.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # Outputs are linearly independent functions of q. Therefore the rank of the changes of M due to the first k
-        # joints must equal the number of outputs that depend on any of these joints.
+        # The outputs are linearly independent functions of q. The number of outputs that depend on any of the first k
+        # joints must therefore equal the rank of the changes of M due to these joints.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that V depends on the derived joints only, with the numbers that test it.
+    """Return the fact that the potential energy V depends only on the derived joints, with the numbers that test it.
 
     The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
     """
@@ -289,12 +294,12 @@ def _potential(structure: Structure, samples: numeric_samples.NumericSamples) ->
 
 
 def _rank(fact: str, rows: np.ndarray, rank: int) -> _DerivedFact:
-    """Return the fact, with singular values, that a matrix has a derived rank: its number of nonzero singular values.
+    """Return the fact that a matrix has the rank derived from the structure, with the singular values that test it.
 
     Args:
         fact: name of the fact.
         rows: the matrix, (m, k).
-        rank: derived rank.
+        rank: derived rank: the first `rank` singular values must be nonzero, all others zero.
     """
     if len(rows) > rows.shape[1]:
         # The matrix is replaced by the triangular factor of its QR decomposition, which has the same singular values

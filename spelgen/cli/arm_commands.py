@@ -58,7 +58,8 @@ def inspect(
         # written. Text and LaTeX contain formulas up to the default length.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
-    # The result is printed before --strict and a failed proof end the command with an error code.
+    # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
+    # error.
     deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(
@@ -72,7 +73,11 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the text of the inspection in a format, with a line end. closed: closed-form formulas of M and V."""
+    """Return the text of the inspection in a format, with a line end.
+
+    closed: closed forms of M and of the potential energy V. proof: verification of the structure. urdf: path of the
+    URDF, whose shapes an HTML page shows.
+    """
     if closed:  # SymPy is slow to import, so it is imported only if formulas are written.
         from spelgen.certificate import formula_files
     if format == "html":

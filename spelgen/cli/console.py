@@ -66,7 +66,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 
     for option in options:
         _name_values(option.annotation, option.default)
-    # Typer reads the options of a command from its signature and annotations, so both are replaced.
+    # Typer reads the options of a command from the signature and annotations of its function: both are set for `run`.
     parameters = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {option.name: option.annotation for option in options}
@@ -76,7 +76,8 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
 def _name_values(annotation: object, info: object) -> None:
     """Set the placeholder of an option's value in the help.
 
-    It is N for an integer, X for a float, TEXT, FILE for a path, or the list of the choices.
+    It is N for an integer, X for a float, TEXT, FILE for a path, or the list of the choices. annotation: type of the
+    option's value. info: declaration of the option for typer, which is changed.
     """
     value_type = get_args(annotation)[0] if NoneType in get_args(annotation) else annotation
     if isinstance(info, OptionInfo) and info.metavar is None and value_type is not bool:
@@ -99,7 +100,8 @@ def fail(error: BaseException, *, debug: bool = False) -> NoReturn:
         raise typer.Exit(BROKEN_PIPE)
     if debug:
         traceback.print_exception(error)
-    # An interrupt needs no traceback. Compiled modules convert it to an ImportError while they are imported.
+    # An interrupt (Ctrl-C) is no failure, and has an exit code of its own. If it arrives while a compiled module is
+    # imported, the module raises an ImportError whose cause is the KeyboardInterrupt.
     if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
         note("interrupted")
         raise typer.Exit(INTERRUPTED)
@@ -170,7 +172,7 @@ def deliver(text: str, output: Path | None) -> None:
 
 
 def refuse_warnings(subject: str, count: int) -> None:
-    """Exit with code 1 and a message about `subject` if there is any warning: the effect of the option --strict."""
+    """Exit with code 1 and a message about `subject` if `count`, the number of warnings, is not 0 (--strict)."""
     if count:
         note(f"{subject}{counted(count, 'warning')}, and --strict allows none")
         raise typer.Exit(FAILED)

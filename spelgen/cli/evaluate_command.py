@@ -13,14 +13,14 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
-from spelgen.evaluation.tables import LIMITS, csv_text, figures, summary
+from spelgen.evaluation.tables import LIMITS, limit_figures, summary
+from spelgen.files import write_json, write_text
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
 
 
-Format = Literal["text", "json", "csv"]
 LIMIT_EXCEEDED = 3  # Exit code if an error exceeds --limit. Code 2 is used by usage errors.
 LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
@@ -31,7 +31,7 @@ def evaluate(
     data: list[Path] | None = options.DATA,
     mapping: Path | None = options.MAPPING_FILE,
     filter: float | None = options.FILTER,
-    format: Format | None = options.result_format(),
+    format: Literal["text", "json"] | None = options.result_format(),
     output: Path | None = options.OUTPUT,
     limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
     truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
@@ -48,7 +48,6 @@ def evaluate(
     from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
-    from spelgen.files import write_json
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
@@ -72,13 +71,12 @@ def evaluate(
     # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
-    forms = {"text": results.text, "csv": lambda: csv_text(results).removesuffix("\n")}
-    options.write_result(format, output, forms | {"json": lambda: json.dumps(record)})
+    options.write_result(format, output, {"text": results.text, "json": lambda: json.dumps(record)})
     # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
-    values = {figure.name: figure.value for figure in figures(results)}
+    values = limit_figures(results)
     exceeded = []
     for name, limit_value in limits:
-        value = values.get(name)
+        value = values[name]
         if value is None or value > limit_value:
             text = "not known" if value is None else f"{value:.4g}"
             exceeded.append(f"limit exceeded: {name} is {text}, expected at most {limit_value:g}")
@@ -169,10 +167,10 @@ def report(
         options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
     from spelgen.evaluation.results import Results
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.render.report_page import write_report, write_runs
+    from spelgen.render.report_page import render_runs, write_report
 
     if len(runs) > 1:
-        say(f"wrote {write_runs(runs, output or Path('runs.html'))}")
+        say(f"wrote {write_text(output or 'runs.html', render_runs(runs))}")
         return
     path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
     if folder.evaluation.exists():
@@ -194,9 +192,6 @@ def compare(
     seeds: int | None = option("", "Number of runs of each preset.", min=1),
     splits: int | None = option("", "Folds of a cross-validation over trajectories; default: 1.", min=1),
     steps: int | None = option("", "Training steps of each run on a simulated arm.", min=1),
-    ablation: bool = flag(
-        "--ablation", "Compare designs from phnode to hybrid that differ by one change each."
-    ),
     jobs: int | None = option(
         "", "Number of parallel runs, one core each, by Ray; default: all cores if Ray is installed.", min=1
     ),
@@ -207,25 +202,22 @@ def compare(
     An arm without logs is simulated by the protocol of its settings. The same command resumes an interrupted
     comparison, and reruns only changed runs.
     """
-    from spelgen.comparison.arms import ablation_designs
     from spelgen.comparison.study import prepare_study, run_study
     from spelgen.comparison.tables import arm_sections
     from spelgen.fitting.process import locked, termination_as_interrupt
     from spelgen.render.comparison_page import write_comparison
     from spelgen.tasks import default_jobs
 
-    if ablation and presets is not None:
-        raise UsageError("--ablation: names the presets itself, omit --presets")
     paths = options.logs(data, extra_logs) if data or extra_logs else []
     names = options.names(presets)
     values = {
-        "presets": tuple(ablation_designs()) if ablation else names and tuple(names),
+        "presets": names and tuple(names),
         "seeds": seeds, "splits": splits, "steps": steps,
     }  # fmt: skip
     # Options on the command line replace the values in the file of the comparison.
     changes = {name: value for name, value in values.items() if value is not None}
     comparison = _comparison(target, paths, mapping).model_copy(update=changes)
-    name = target.stem + ("-logs" if paths else "") + ("-ablation" if ablation else "")
+    name = f"{target.stem}-logs" if paths else target.stem
     # The path of the output folder must be absolute, since workers have other working directories.
     folder = (output or Path("comparisons") / name).absolute()
     # All cores are used by default, because a comparison takes hours on one core.

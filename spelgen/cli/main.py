@@ -49,7 +49,7 @@ class CommandGroup(TyperGroup):
     """The group of all commands. A usage error suggests the nearest command, option or choice."""
 
     def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Parse the options before the name of the command; a usage error names the nearest option or choice."""
+        """Parse the options that precede the name of a command; a usage error names the nearest option or choice."""
         with _suggestions():
             return super().make_context(*arguments, **options)
 

@@ -55,17 +55,16 @@ def flag(name: str, text: str) -> Declared:
 
 
 def argument(metavar: str, text: str, default: object = ...) -> Declared:
-    """Return the declaration of a positional argument of a command; without a default it is required."""
+    """Return the declaration of a positional argument, `metavar` in the help; without a default it is required."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 
 def output_option(metavar: str, text: str, default: object = None) -> Declared:
-    """Return the option `-o` of a command, which names the output file or folder."""
+    """Return the option `-o` of a command, the output file or folder; `metavar` is its value in the help."""
     return option(metavar, text, "-o", "--output", default=default)
 
 
-SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".csv": "csv", ".html": "html", ".tex": "latex"}
-SUFFIXES |= {".py": "sympy"}
+SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".html": "html", ".tex": "latex", ".py": "sympy"}
 """{suffix of an output file: format of its content}; a name without a suffix means text."""
 
 TextOrJson = Literal["text", "json"]
@@ -132,7 +131,7 @@ def names(text: str | None) -> list[str] | None:
 
 
 def numbers(text: str | None, option: str) -> list[float] | None:
-    """Return the numbers in a text such as `0, 1.5`, and None for None. Raises a usage error for any other text."""
+    """Return the numbers in a text such as `0, 1.5`; None for None. Other texts: a usage error about `option`."""
     try:
         return None if text is None else [float(number) for number in text.split(",")]
     except ValueError:
@@ -174,7 +173,8 @@ def log_mapping(arm: LoggedArm, mapping: Path | LogMapping | None, codes: Sequen
             hint = suggestion(code, get_args(Accepted))
             raise typer.BadParameter(f"unknown code {code!r}; {hint}", param_hint="'--accept'")
     chosen = log_source(arm, mapping).mapping
-    # Accepted codes are collected in a dict, which preserves the order, so that the record of a run is deterministic.
+    # The codes of log errors to accept, from the mapping and from --accept, are collected in a dict without duplicates.
+    # A dict preserves their order, so that the record of a run is deterministic.
     accepted = dict.fromkeys((*chosen.accept, *(codes or ())))
     return chosen.model_copy(update={"accept": tuple(accepted)})
 

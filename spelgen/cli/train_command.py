@@ -109,11 +109,12 @@ def train(
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
-    """Write the noise levels of the estimator into the run folder; return the payload in the logs if it is estimated.
+    """Write the noise levels of the live estimator into the run folder; return the payload in the logs, or None.
 
-    source: the run that was adapted; None: the fit is new, and its noise levels are estimated from its own logs. An
-    adapted run gets a copy of the noise levels of `source`. The payload is estimated only for `adapt=load`, by the
-    model and the noise levels of `source`; otherwise, or if `source` has no noise levels, the result is None.
+    A new fit of rigid bodies to torques estimates the noise levels from its logs. A run that was adapted from the run
+    in the folder `source` gets a copy of the noise levels of that run, if there are any. The payload is estimated only
+    for `adapt=load`, with the model and the noise levels of `source`; in all other cases the result is None. `source`
+    is None for a new fit.
     """
     from spelgen.live.levels import cross_validated_levels
     from spelgen.live.noise import keep_levels, stored_levels
@@ -176,11 +177,9 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
     if not isinstance(config, Rollout):
-        summary = None
-        if fit.record.servo is not None:
-            from spelgen.fitting.servo.report import servo_summary
+        from spelgen.fitting.servo.report import servo_summary
 
-            summary = servo_summary(fit.record.servo)
+        summary = servo_summary(fit.record.servo)
         if summary is not None:
             result = summary.text
         elif not fit.record.validation_windows:
@@ -195,9 +194,10 @@ def _outcome(fit: Fit) -> tuple[str, str]:
 
 
 def _warm_start(request: Request) -> Request:
-    """Return the request of a fit that starts from a fitted model: by default the load is adapted by a torque fit.
+    """Return the request of a fit that starts from a fitted model, with default values for keys that are not set.
 
-    The default objective is "torque". The key `adapt`, by default "load", applies only to this objective.
+    The default objective is "torque" and, for this objective only, the default of `adapt` is "load". Raises UsageError
+    if `adapt` is set with another objective.
     """
     objective, values = request.objective or "torque", dict(request.values)
     if objective == "torque":

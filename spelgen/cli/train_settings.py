@@ -34,8 +34,9 @@ class UsageError(typer.BadParameter):
 class Assignments(TrainingSettings):
     """The keys of the option `--set`: the training settings of a robot, and options of a single fit.
 
-    adapt: parameters of a fitted model to update (load, friction or unit). device, threads: device and number of
-    threads of torch. progress: whether a progress bar is shown.
+    adapt: change to which a fitted model is adapted: "load" (a payload), "friction" (another day), or "unit" (another
+    arm of the same type). device, threads: device and number of threads of torch. progress: whether a progress bar is
+    shown.
     """
 
     adapt: Adaptation | None = None
@@ -67,7 +68,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
     key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by the option --objective.
+    keys = Assignments.model_fields.keys() - {"objective"}  # The option --objective sets it: no key of --set.
     # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
@@ -111,7 +112,8 @@ def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptio
         # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # The logs determine the objective later, and some objectives have no time limit. For these objectives the
-        # option `max_minutes` would be an error; as a setting, which is only a default value, it is ignored.
+        # No objective is given: the logs determine the objective after this point, and some objectives have no time
+        # limit. Among `options`, a time limit would then be an error; among `settings`, which are only default values,
+        # it is ignored.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

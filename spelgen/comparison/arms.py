@@ -3,7 +3,6 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -13,7 +12,7 @@ from lxml import etree
 from pydantic import Field, StringConstraints
 
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.design import PRESET_NAMES, Design, load_design
+from spelgen.design import PRESET_NAMES
 from spelgen.errors import LogError, RunError, SettingsError, collect, suggestion
 from spelgen.files import read_json, remove, write_bytes, write_json, write_text
 from spelgen.logs.arm_mapping import log_source
@@ -76,20 +75,6 @@ class Comparison(Group):
     steps: Count | None = None
 
 
-def ablation_designs() -> dict[str, str | Design]:
-    """Return {name: design} from phnode to hybrid; each design differs from the one before in one property."""
-    friction = replace(load_design("phnode"), dissipation="per-joint")
-    inputs = replace(friction, input="derived")
-    return {
-        "phnode": "phnode",
-        "per-joint-friction": friction,
-        "known-inputs": inputs,
-        "fewest-outputs": replace(inputs, mass="derived"),
-        "minimal": "minimal",
-        "hybrid": "hybrid",
-    }
-
-
 def load_comparison(path: Path) -> Comparison:
     """Return the comparison that a YAML file specifies. Paths in the file are relative to the folder of the file.
 
@@ -103,7 +88,8 @@ def load_comparison(path: Path) -> Comparison:
         errors.append(SettingsError(got, file=path, line=line, element=element, do=do))
     collect(errors)
     arms = {name: arm.in_folder(path.parent) for name, arm in comparison.arms.items()}
-    # A preset is a name or the path of a YAML file. Only paths are relative to the folder.
+    # A preset is a name or the path of a YAML file. A path is relative to the folder of the comparison's file; a name
+    # is not changed.
     presets = comparison.presets
     if presets is not None:
         presets = tuple(str(path.parent / name) if _is_file(name) else name for name in presets)
@@ -117,7 +103,7 @@ def _is_file(preset: str) -> bool:
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
     """Yield (location in the YAML file, error, advice) for each unknown preset and for each absent file."""
     for number, preset in enumerate(comparison.presets or ()):
-        if preset not in (*PRESET_NAMES, *ablation_designs()) and not _is_file(preset):
+        if preset not in PRESET_NAMES and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
     for name, arm in comparison.arms.items():
         paths = {"urdf": [arm.urdf], "data": arm.data, "mapping": [arm.mapping] if arm.mapping else []}
@@ -182,6 +168,7 @@ def arm_inputs(
     """Return the input files of the runs on an arm: URDF, mapping and logs.
 
     If the arm has no logs, logs are simulated and written to ``folder``, together with the URDF that models may use.
+    splits: number of folds; LogError if there are too few trajectories. progress: argument of `simulate`.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """

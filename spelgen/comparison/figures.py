@@ -8,15 +8,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import torch
 
 from spelgen.arm.configured_arm import load_arm
-from spelgen.baselines.predictor import Predictor, of_dynamics
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.emission.assemble import ArmModel
-from spelgen.evaluation.drawn_motions import PredictedMotion, predicted_motion
-from spelgen.evaluation.plain import Curve, finite
+from spelgen.evaluation.plain import finite
 from spelgen.evaluation.rollout import energy_rise, mass_error, smallest_eigenvalue, true_mass
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
@@ -59,28 +58,28 @@ NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"
 
 @dataclass(frozen=True)
 class SimulatedFigures:
-    """Numbers by which models of a simulated arm are compared, for one model.
+    """Results of one model of a simulated arm, for the comparison with other models.
 
     Attributes:
         losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
-        sizes: {row of a table: size of a network, duration of a training step, or invariant}.
-        mass: Learned M at the measured positions of `example`, (T, n, n); None without an example.
-        example: A test motion and its prediction; None if no test motion lasts 1 s.
+        sizes: {row of a table: size of a network, duration of a training step, smallest eigenvalue of M, or rise of
+            energy}.
     """
 
     losses: Figures
     sizes: Figures
-    mass: Curve | None
-    example: PredictedMotion | None
 
 
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
 ) -> SimulatedFigures:
-    """Return the numbers by which models of a simulated arm are compared. truth: URDF with the true parameters."""
+    """Return the results of a model of a simulated arm, whose true parameters are in the URDF ``truth``.
+
+    training: logs for the training loss and the duration of a step. testing: logs for all other results.
+    """
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
-    config = fit.config if isinstance(fit.config, Rollout) else Rollout()
+    config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only
@@ -89,13 +88,11 @@ def simulated_figures(
     ranges = [x.working_range for x in load_arm(truth, joints).chain.coordinates]
     low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
-    example = predict_example(of_dynamics("", model, far), testing, steps, decimation)
-    mass = None if example is None else model.mass_matrix(torch.from_numpy(example.q)).numpy()
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
     losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
-    # The training loss and the test loss are computed from windows as long as the windows of the training, and not from
-    # windows of 1 s.
+    # The training loss is the loss that the fit minimises. The windows of training loss and test loss are therefore as
+    # long as the windows of the fit; only the prediction loss is over 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]
@@ -104,11 +101,14 @@ def simulated_figures(
     with torch.no_grad():
         rows["smallest eigenvalue of M / mean"] = smallest_eigenvalue(model, low, high)
         rows["rise of energy, no input"] = energy_rise(model, far)
-    return SimulatedFigures(losses, rows, mass, example)
+    return SimulatedFigures(losses, rows)
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:
-    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included."""
+    """Return the median time to compute the loss of a batch and its gradient [s]; the optimizer is not included.
+
+    config: length of the windows and size of the batch. decimation: log samples per sample of a window.
+    """
     windows = spread_windows(logs, config.window, decimation)[: config.batch or DEFAULTS.batch]
     scales = loss_scales(windows, model.joint_types)
     # Parameters of loaded models are frozen, but a training step needs gradients.
@@ -123,7 +123,7 @@ def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, d
 
 
 def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) -> Windows:
-    """Return windows that are evenly spread over the logs, about `TUNING.windows` at most.
+    """Return windows that are evenly spread over the logs, at most `TUNING.windows` plus one per log.
 
     A window contains `samples` samples: every `decimation`-th sample of a log.
     """
@@ -137,10 +137,10 @@ def spread_windows(logs: Sequence[Trajectory], samples: int, decimation: int) ->
 def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[float | None, ...]:
     """Return the total, the position and the velocity error of predictions from the first sample of each window.
 
-    The position error is the squared error of q, summed over joints and averaged over windows and samples; the error of
-    a revolute position is the geodesic distance. The velocity error is computed from qd in the same way. The total is
-    the sum of the position and the velocity error (eq. 8 of the paper). Units are rad, m and s. An error that is not
-    finite is None. substeps: integrator steps per sample.
+    The position error is the squared error of q [rad^2, m^2], summed over joints and averaged over windows and samples;
+    the error of a revolute position is the geodesic distance. The velocity error is computed from qd [rad/s, m/s] in
+    the same way. The total is the sum of the numbers of the position and the velocity error, eq. 8 of Wang et al.
+    (2025). An error that is not finite is None. substeps: integrator steps per sample.
     """
     with torch.no_grad():
         q, qd = roll_out(model, windows, substeps)
@@ -153,11 +153,11 @@ def prediction_loss(model: ArmModel, windows: Windows, substeps: int) -> tuple[f
 def sizes(model: ArmModel) -> Figures:
     """Return {row of a table: size of the model}.
 
-    The rows are the number of outputs of each network (of M, D, G and V, residual networks included), the number of
-    inputs of the network of M, and the number of trained parameters.
+    The rows are the number of outputs of each network (of M, damping D, input matrix G and potential energy V, residual
+    networks included), the number of inputs of the network of M, and the number of trained parameters.
     """
     figures: Figures = {f"outputs of {matrix}": 0 for matrix in NETWORKS.values()}
-    # The damping D has one output per joint if it is not computed by a network.
+    # If no network computes the damping D, each joint has a friction model, which is counted as one output.
     figures |= {"outputs of D": model.n, "inputs of M": 0}
     for name, module in model.named_modules():
         masks = [x for key, x in module.named_buffers(recurse=False) if key.startswith("mask")]
@@ -170,22 +170,3 @@ def sizes(model: ArmModel) -> Figures:
             if masks and quantity == "mass":
                 figures["inputs of M"] = int(masks[0].flatten(1).any(dim=0).sum())
     return figures | {"parameters": parameter_count(model)}
-
-
-def predict_example(
-    predictor: Predictor, logs: Sequence[Trajectory], steps: int, decimation: int
-) -> PredictedMotion | None:
-    """Return the measured motion in the middle of the first log that is long enough, and its prediction.
-
-    The motion has `steps` steps of `decimation` samples each. None is returned if all logs are shorter.
-    """
-    span = steps * decimation
-    for log in logs:
-        if len(log) > span:
-            # The simulated controller changes its torque only at samples that are multiples of the decimation, so the
-            # motion starts at such a sample.
-            start = (len(log) - 1 - span) // (2 * decimation) * decimation
-            piece = log[start : start + span + 1]
-            window = cut_windows([piece], steps + 1, decimation=decimation, measured=False)
-            return predicted_motion(log.name, window, predictor.solver(window))
-    return None

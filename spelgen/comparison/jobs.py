@@ -9,9 +9,9 @@ from typing import Self, cast
 import torch
 from pydantic import TypeAdapter, ValidationError
 
-from spelgen.comparison.arms import ArmInputs, ablation_designs
+from spelgen.comparison.arms import ArmInputs
 from spelgen.comparison.figures import SimulatedFigures, simulated_figures
-from spelgen.design import Design, load_design
+from spelgen.design import load_design
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.errors import RunError
@@ -65,8 +65,8 @@ class RunResult:
 class Job(Group):
     """A run of a comparison, finished or not.
 
-    design: name of a preset or of an ablation design, or path of a YAML file. protocol: settings of fits to simulated
-    logs.
+    design: name of a preset, or path of a YAML file. training: settings of fits to logs of the user. protocol: settings
+    of fits to simulated logs, which are the same for all models.
     """
 
     arm: str
@@ -83,7 +83,7 @@ class Job(Group):
 
     @property
     def preset(self) -> str:
-        """Return the name of the compared preset or ablation design; for a YAML file, the name of the file."""
+        """Return the name of the compared preset; for a YAML file, the name of the file."""
         return Path(self.design).stem
 
     @property
@@ -102,18 +102,13 @@ class Job(Group):
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
         # The hash contains the content of the design and not its name, since a YAML file may have changed. The hash
         # contains the version of spelgen, since versions may give different results.
-        sources = (__version__, load_design(self.named_design), self.inputs.digest, protocol, options)
+        sources = (__version__, load_design(self.design), self.inputs.digest, protocol, options)
         return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
-
-    @property
-    def named_design(self) -> str | Design:
-        """Return the design as `build` accepts it: the name of a preset, the path of a YAML file, or a `Design`."""
-        return ablation_designs().get(self.design, self.design)
 
     def build(self) -> ArmModel:
         """Return the untrained model of the run."""
         arm = self.inputs.load()
-        return build(arm, self.named_design, width=self.width, depth=self.depth, seed=self.seed)
+        return build(arm, self.design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
         """Return the result in result.json; None if there is none, or if it is of a run with other inputs.
@@ -220,7 +215,8 @@ def _own_checkpoint(job: Job, run: RunFolder) -> bool:
 def _errors(results: Results) -> Errors:
     """Return {label of an error measure, with its unit: {predictor: error}}.
 
-    The order is: position errors of replays, relative errors per prediction horizon, nMSE of torques.
+    The order is: position errors under replayed commands (of position servos), relative errors per prediction horizon,
+    nMSE of torques.
     """
     errors: Errors = {}
     for replay in results.replays:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from spelgen.comparison.arms import ArmInputs, Comparison, Progress, ablation_designs, arm_inputs
+from spelgen.comparison.arms import ArmInputs, Comparison, Progress, arm_inputs
 from spelgen.comparison.figures import TUNING, step_seconds
 from spelgen.comparison.jobs import Job, RunResult, run_job
 from spelgen.design import load_design
@@ -66,7 +66,7 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     does not exist, and RunError if no arm can be used. If there is only one arm, its error is raised.
     """
     # Presets are checked first, so that a misspelt name is an error before logs are simulated.
-    for preset in set(comparison.presets or ()) - ablation_designs().keys():
+    for preset in comparison.presets or ():
         load_design(preset)
     jobs = []
     failures = {}
@@ -82,8 +82,11 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
     # A stored result is used only if it was computed from the same options and inputs, which `Job.result` checks.
-    finished = {job.name: job.result() for job in jobs}
-    results = {name: result for name, result in finished.items() if result is not None}
+    results = {}
+    for job in jobs:
+        result = job.result()
+        if result is not None:
+            results[job.name] = result
     waiting = [job for job in jobs if job.name not in results]
     # Time is estimated once per arm and preset, as runs that differ only in seed or split take about equally long.
     models = {(job.arm, job.preset): job for job in reversed(waiting)}
@@ -93,10 +96,10 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
 
 
 def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address: str | None = None) -> Study:
-    """Run the unfinished jobs, write comparison.json and return the study with all results.
+    """Run the unfinished jobs of ``study``, write comparison.json and return the study with all results.
 
-    A run with an error becomes a failure of the study; the same command runs it again. note: function called with a
-    line of text after each run. jobs, address: see `run_tasks`.
+    A job with an error becomes a failure of the study; the same command runs the job again. note: function called with
+    a line of text after each job. jobs: number of parallel jobs. address: address of a Ray cluster, see `run_tasks`.
     """
     waiting = [job for job in study.jobs if job.name in study.estimates]
     results, failures = dict(study.results), dict(study.failures)
@@ -115,8 +118,7 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
             line += f"; about {duration((time.monotonic() - start) * (total / done - 1))} left"
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
-    # comparison.json contains no curves of simulated arms, because result.json of each run contains them.
-    figures = [record(replace(result, simulated=None)) for result in results.values()]
+    figures = list(map(record, results.values()))
     write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
     return finished
 

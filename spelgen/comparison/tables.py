@@ -2,13 +2,14 @@
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from spelgen.comparison.figures import Figures
 from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
-from spelgen.evaluation.tables import Row, Table, table
+from spelgen.evaluation.tables import Row, Table
 from spelgen.labels import MODEL, counted, listed
 from spelgen.listing import number
 from spelgen.settings.training import PublishedFigures
@@ -26,16 +27,16 @@ The row below contains the loss of the baseline (`BASELINE`) divided by the loss
 
 @dataclass(frozen=True)
 class ArmResults:
-    """The results of one arm: a sentence, tables (the main result first), and the results of all runs."""
+    """The results of one arm: the preset with the smallest error, a sentence, and tables (the main result first)."""
 
     name: str
+    best: str
     sentence: str
     tables: tuple[Table, ...]
-    results: tuple[RunResult, ...]
 
 
 def arm_sections(study: Study) -> list[ArmResults]:
-    """Return the tables and the sentence of each arm with finished runs, for the report of a comparison."""
+    """Return the tables of each arm with finished runs, and the sentence that names its best model, for a report."""
     arms: dict[str, list[RunResult]] = {}
     for job in study.jobs:
         if job.name in study.results:
@@ -43,8 +44,11 @@ def arm_sections(study: Study) -> list[ArmResults]:
     published = {job.arm: job.protocol.published for job in study.jobs}
     sections = []
     for name, results in arms.items():
+        runs, measure = _by_preset(results), _main_measure(results)
+        # `_medians` sorts by error and contains baselines, which have no runs.
+        best = next(model for model in _medians(runs, measure) if model in runs)
         tables = tuple(arm_tables(results, published[name]))
-        sections.append(ArmResults(name, arm_sentence(results), tables, tuple(results)))
+        sections.append(ArmResults(name, best, arm_sentence(results), tables))
     return sections
 
 
@@ -55,11 +59,6 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
     # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
     if not all(figures.values()):
         return [_ranking(runs)]
-    of_seeds: dict[str, Numbers] = {}
-    for result in sorted(results, key=lambda result: (result.seed, result.split)):
-        split = f", split {result.split}" if any(x.split for x in results) else ""
-        loss = next(iter(result.errors.values()))[MODEL]
-        of_seeds.setdefault(f"seed {result.seed}{split}", {})[result.preset] = loss
     rows = []
     sizes = {name: [run.sizes for run in x] for name, x in figures.items()}
     for label in next(iter(sizes.values()))[0]:
@@ -69,13 +68,12 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
     title = (
         "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
     )
-    of_runs = table("Prediction loss over 1 s of every run", of_seeds)
-    return [_losses(losses, published), Table(title, tuple(rows)), of_runs]
+    return [_losses(losses, published), Table(title, tuple(rows))]
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
     """Return a sentence that names the best model of an arm and compares its error with the errors of all others."""
-    runs, measure = _by_preset(results), next(iter(results[0].errors))
+    runs, measure = _by_preset(results), _main_measure(results)
     errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
     models = [name for name in errors if name in runs]
     if not models:
@@ -106,16 +104,14 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
         return "No run is finished."
     if len(sections) == 1:
         return sections[0].sentence
-    wins: dict[str, int] = {}
-    for section in sections:
-        runs, measure = _by_preset(section.results), next(iter(section.results[0].errors))
-        # `_medians` sorts by error and contains baselines, which have no runs. The first name with runs is the best
-        # model.
-        best = next(name for name in _medians(runs, measure) if name in runs)
-        wins[best] = wins.get(best, 0) + 1
-    best_first = sorted(wins.items(), key=lambda item: -item[1])
-    counts = [f"{name} on {counted(count, 'arm')}" for name, count in best_first]
+    wins = Counter(section.best for section in sections)
+    counts = [f"{name} on {counted(count, 'arm')}" for name, count in wins.most_common()]
     return f"The preset with the smallest error is {listed(counts)}."
+
+
+def _main_measure(results: Sequence[RunResult]) -> str:
+    """Return the first error measure of the runs, which ranks the models."""
+    return next(iter(results[0].errors))
 
 
 def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
@@ -138,7 +134,7 @@ def _ranking(runs: Runs) -> Table:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error}, sorted by error; errors that are not finite are last."""
+    """Return {model or baseline: median error by ``measure``}, sorted by error; errors that are not finite are last."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -154,12 +150,12 @@ def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, Pu
         medians = _summary(figures, label, statistics.median)
         rows.append(Row(label, medians))
         baseline = medians.get(BASELINE)
-        # A row with the ratio of the baseline's loss to each loss is added, because absolute losses depend on units and
-        # on the sample rate.
+        # A row with the loss of the preset `BASELINE` divided by each preset's loss is added, because absolute losses
+        # depend on units and on the sample rate.
         if baseline is not None and label in RATIO:
             ratios = {name: baseline / median if median else None for name, median in medians.items()}
             rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
-    # Rows of published figures contain only presets that the publication evaluates.
+    # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
     records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}

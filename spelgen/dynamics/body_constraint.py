@@ -7,7 +7,7 @@ from spelgen.dynamics.constraint import Constraint
 
 
 def body_constraint(arm: Chain) -> Constraint:
-    """Return the linear function of q, (n,), whose values are the joint positions of all bodies, (bodies,) [rad, m]."""
+    """Return the joint positions of all bodies, (bodies,) [rad, m], as a function K q + offset of q, (n,) [rad, m]."""
     jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
     for row, body in enumerate(arm.bodies):
         jacobian[row, body.coordinate] = float(body.multiplier)

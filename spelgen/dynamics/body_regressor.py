@@ -39,10 +39,10 @@ def quaternion(rotation: object) -> np.ndarray:
 
 
 def pseudo_inertia(ten: Tensor) -> Tensor:
-    """Return the pseudo-inertia [[tr(I)/2 1 - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (..., 10).
+    """Return the pseudo-inertia [[tr(I)/2 E - I, m c], [(m c)^T, m]], (..., 4, 4), of inertial parameters (..., 10).
 
-    It is positive definite if and only if the inertial parameters are physically consistent (Wensing, Kim and Slotine,
-    IEEE RA-L 3:60, 2018).
+    E is the identity matrix. The pseudo-inertia is positive definite if and only if the inertial parameters are
+    physically consistent (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 
     ten: mass m, first moment m c, and inertia I (xx, xy, xz, yy, yz, zz) about the origin [kg, kg m, kg m^2].
     """
@@ -107,8 +107,9 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     A base parameter is its row of coefficients times the inertial parameters of B bodies and the n armatures, in the
     order of `constants_regressor`. That regressor is evaluated at random states. The parameter of a column that depends
     linearly on the preceding columns is regrouped into the parameters of those columns (Gautier and Khalil, IEEE T-RA
-    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter; torque offsets count, since
-    gravity along a prismatic joint is constant.
+    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter. Torque offsets take part in
+    the regrouping, since constant gravity along a prismatic joint cannot be distinguished from an offset. The columns
+    and rows of the n offsets are then removed from the result.
 
     Args:
         chain: kinematics of B bodies.
@@ -123,7 +124,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     order += range(inertial, inertial + 2 * n)
     # The random states give twice as many equations as parameters, so that they do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
-    # The random states are copied, since results on memory of NumPy depend in the last digit on its alignment.
+    # The last digit of a result of torch depends on the alignment of its memory, which varies for NumPy arrays. The
+    # random states are therefore copied to memory of torch.
     motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion)
     columns = torch.cat([columns, motors.mT.expand(len(columns), n, n)], dim=-1).flatten(0, 1)

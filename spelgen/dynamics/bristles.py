@@ -22,8 +22,8 @@ class BristleReach:
         values: break-away displacements, (n, K) [rad, m]; K is 0 without bristles.
         motors: matrix C, (n, n): the velocities of the drives are C qd (see ``Actuation.motor_speeds``); None: each
             drive moves its own joint.
-        smoothing_velocity: velocity at which the smooth sign of velocity, which replaces bristles at drives without
-            bristles, is 0.7, (n,) [rad/s, m/s]; None: unknown.
+        smoothing_velocity: velocity v_s of the smooth sign v / sqrt(v^2 + v_s^2), on which the dry friction of a drive
+            without bristles depends, (n,) [rad/s, m/s]; None: unknown.
     """
 
     values: np.ndarray
@@ -35,17 +35,22 @@ class BristleReach:
         """Number of bristles per drive, K."""
         return int(self.values.shape[1])
 
+    def of_drives(self, joints: np.ndarray) -> np.ndarray:
+        """Return positions or velocities of the drives, (..., n), from positions or velocities of the joints."""
+        return joints if self.motors is None else joints @ self.motors.T
+
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
     """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
 
-    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C of `BristleReach`.
+    kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C, (n, n): the velocities of the drives are
+    C qd; None: each drive moves its own joint.
     """
     return BristleReach(np.array([BREAKAWAY[kind] for kind in kinds]), motors)
 
 
 def bristle_reach(model: PortHamiltonian) -> BristleReach:
-    """Return the break-away displacements of a trained model; there are K = 0 bristles in a model without bristles."""
+    """Return the break-away displacements of the K bristles per drive of a trained model; K = 0 without bristles."""
     if not isinstance(model, RigidBodyDynamics) or not model.elements:
         return BristleReach(np.zeros((model.n, 0)))
     width = model.friction.prepare().coulomb_smoothing_velocity
@@ -58,7 +63,8 @@ def bristle_reach(model: PortHamiltonian) -> BristleReach:
 def moved_bristles(z: torch.Tensor, displacement: torch.Tensor, reach: torch.Tensor) -> torch.Tensor:
     """Return the deflections of K bristles per drive after a displacement of the drives, (..., n, K) [rad, m].
 
-    The result is exact if the displacement has no reversals. Dimensions may have another order, if they broadcast.
+    The result is exact if the displacement has no reversals. The dimension of the bristles may also be the first one of
+    all arguments, (K, ..., n).
 
     Args:
         z: deflections before the displacement, (..., n, K) [rad, m].
@@ -75,9 +81,7 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
     q. After a reversal of a drive, z depends only on z at this reversal and on the displacement since then: the loop is
     over reversals, not over samples.
     """
-    path = encoded(q)
-    if bristles.motors is not None:
-        path = path @ bristles.motors.T
+    path = bristles.of_drives(encoded(q))
     z = np.empty((*q.shape, bristles.elements))
     for drive, (positions, reach) in enumerate(zip(path.T, bristles.values, strict=True)):
         steps = np.diff(positions)
@@ -105,7 +109,7 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
     if bristles.smoothing_velocity is None:
         return None
     # The smooth sign must be equal to the smooth sign of `runtime.friction_laws`, which the trained model uses.
-    speed = qd if bristles.motors is None else qd @ bristles.motors.T
+    speed = bristles.of_drives(qd)
     return np.asarray(speed / np.hypot(speed, bristles.smoothing_velocity))
 
 

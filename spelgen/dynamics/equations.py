@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from spelgen.dynamics.protocol import known_past, memory_after
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
-from spelgen.runtime.port_hamiltonian import PortHamiltonian
+from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +72,7 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
 
 
 def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
-    """Return the equations of motion of W rollouts at positions q, (W, n), for any ``RigidDynamics``.
-
-    The force M qdd is computed from the forward dynamics, since ``RigidDynamics`` has no method that returns it.
-    """
+    """Return the equations of motion of W rollouts at positions q, (W, n), for any ``RigidDynamics``."""
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
@@ -86,7 +83,7 @@ def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
         """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
         # `RigidDynamics` has no method that returns the force M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
-        return (mass @ qdd.unsqueeze(-1)).squeeze(-1)
+        return applied(mass, qdd)
 
     return MotionEquations(mass, force, friction)
 
@@ -112,7 +109,6 @@ def runge_kutta(
             of the joints.
         step: duration of the step [s].
     """
-
     qd1 = qd = pd = torch.zeros_like(p)
     moved = pushed = torch.zeros_like(p)
     # For each stage of the Runge-Kutta method: its time as a fraction of the step, and its weight in the mean rate.
@@ -128,10 +124,11 @@ def runge_kutta(
 
 
 def unbounded(mass: Tensor) -> Tensor:
-    """Return the factor t = 1, (...), for mass matrices M, (..., n, n).
+    """Return the factor t = 1, (...), for mass matrices M, (..., n, n): M is not corrected.
 
-    ``mass_as_learned`` puts this function in place of ``DerivedMass.fraction``, which returns t < 1 for an indefinite
-    M: M is then not corrected to be positive definite.
+    ``DerivedMass`` replaces M by C + t (M - C), with a constant C; ``DerivedMass.fraction`` returns t < 1 for an
+    indefinite M, so that the result is positive definite. ``mass_as_learned`` puts this function in place of that
+    method.
     """
     return mass.new_ones(mass.shape[:-2])
 

@@ -40,7 +40,7 @@ class DriveFriction:
     smoothing_velocity: float
     speeds: np.ndarray | None = None
 
-    def __call__(self, qd: np.ndarray) -> np.ndarray:
+    def __call__(self, qd: np.ndarray, direction: np.ndarray | None = None) -> np.ndarray:
         """Return the friction torque of the joints, (..., n) [Nm, N], at joint velocities qd, (..., n) [rad/s, m/s].
 
         The torque is C^T times the torque of the drives, which depends on their velocities v = C qd:
@@ -49,19 +49,13 @@ class DriveFriction:
 
         The last two terms tend to `forward` and `backward` for large |v|. The torque is smooth, 0 at rest, and
         dissipative: the torque of a drive times its velocity is not negative.
+
+        direction: factor s of the dry friction of each drive, from -1 to 1, (..., n), if it is a function of the
+        friction state.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
-        return self.torque(qd, np.tanh(v / self.smoothing_velocity))
-
-    def torque(self, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the friction torque of the joints, (..., n) [Nm, N], with a given factor of dry friction.
-
-        Args:
-            qd: joint velocities, (..., n) [rad/s, m/s].
-            direction: factor of the dry friction of each drive, from -1 to 1, (..., n): tanh(v / smoothing_velocity)
-                with the velocity v of the drive, or a function of the friction state.
-        """
-        v = qd if self.speeds is None else qd @ self.speeds.T
+        if direction is None:
+            direction = np.tanh(v / self.smoothing_velocity)
         # With the direction s, forward f and backward b: s (f - b)/2 + s^2 (f + b)/2 is f at s = 1 and b at s = -1.
         odd, even = self.forward - self.backward, self.forward + self.backward
         torque: np.ndarray = self.viscous * v + 0.5 * direction * (odd + direction * even)
@@ -104,14 +98,15 @@ BRISTLES = tuple(f"bristle {k + 1}, joint " for k in range(len(BREAKAWAY["revolu
 class FrictionModel:
     """Torques of drives that are linear in coefficients, as columns of the regressor of a least-squares fit.
 
-    Each effect is a torque per drive: armature, viscous and Coulomb friction, torque offset, and optional ones.
+    Each effect is a torque per drive: armature, viscous and Coulomb friction, torque offset, and the effects that
+    ``stribeck`` and ``polynomial`` add.
 
     Attributes:
         coulomb_smoothing_velocity: width of the tanh that replaces the sign of the velocity [rad/s, m/s].
         stribeck: True: add dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
         polynomial: True: add the effects qd |qd| and qd^3.
-        memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), with an
-            effect per bristle. False: it depends on the tanh of the velocity.
+        memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), and each
+            bristle is an effect with its own coefficient. False: it depends on the tanh of the velocity.
     """
 
     coulomb_smoothing_velocity: float = 0.01
@@ -170,6 +165,8 @@ class FrictionModel:
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
         """Return the torque at the drives of each effect in `effects` per unit of its coefficient, (..., effects, n).
+
+        For example, the effect "viscous" has the torque `speed`, and "armature" has the torque `rise`.
 
         Args:
             speed: velocities of the drives, (..., n) [rad/s, m/s].

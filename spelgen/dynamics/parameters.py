@@ -22,10 +22,14 @@ class ParameterInfo:
     """Group and unit of a trained parameter of a model. Fits select parameters by group.
 
     Attributes:
-        kind: group of the parameter: bodies, armature, gains, offset, friction_compensation, sizes (magnitude of
-            friction), effects (friction that varies with velocity), velocities, load_dependence, fractions (of
-            bristles), torque_splines, torque_ripple, friction_splines, mass_constants, mass_residuals, stiffness,
-            damping, dead_zone, delay, or network.
+        kind: group of the parameter, one of
+            rigid bodies and drives: bodies (inertial parameters), armature, gains (of motors), offset (of torque),
+                friction_compensation;
+            friction: sizes (viscous and Coulomb coefficients), effects (Stribeck and saturation torques), velocities
+                (velocity scales), load_dependence, fractions (of bristles);
+            residual terms: torque_splines, torque_ripple, friction_splines, mass_residuals;
+            models of networks: mass_constants (constants in M), network (weights and biases);
+            position servos: stiffness, damping, dead_zone, delay.
         unit: unit of the physical quantity that the parameter represents, for revolute and for prismatic joints. Most
             parameters are the logarithm of this quantity divided by a nominal value.
     """
@@ -39,9 +43,10 @@ NETWORK = ParameterInfo("network", "1")
 
 
 def parameter_table(model: nn.Module) -> dict[str, ParameterInfo]:
-    """Return {name: group and unit} of the parameters of a model and of the buffers that a fit may set.
+    """Return {name: group and unit} of the parameters of a model, and of buffers for which a fit may set a value.
 
-    These buffers are quantities that only some logs determine, for example the friction compensation of a drive.
+    A quantity is a buffer, and not a parameter, if only some logs determine it: for example, the friction compensation
+    of a drive.
     """
     table = {name: NETWORK for name, _ in model.named_parameters()}
     for path, module in model.named_modules():
@@ -130,9 +135,10 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
 
 
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the torque of the residual terms of M and V, (..., n) [Nm, N]; zeros for a model without them.
+    """Return the torque of the residual terms of a model, (..., n) [Nm, N]; zeros for a model without them.
 
-    q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
+    These terms are added to the mass matrix M and the potential energy V. q, qd, qdd: positions [rad, m], velocities
+    [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)
@@ -154,8 +160,8 @@ def evaluate_with(model: Model, parameters: NamedTensors, function: Callable[[Mo
     The result is differentiable with respect to the given parameters. Parameters that are not given have the values of
     the model.
     """
-    # The tensors of the model are replaced while the function is evaluated, as in `torch.func.functional_call`, which
-    # takes longer than most of the functions.
+    # The tensors of the model are replaced while the function is evaluated. `torch.func.functional_call` does the same,
+    # but takes longer than most of the functions.
     replaced = []
     for name, tensor in parameters.items():
         path, _, key = name.rpartition(".")

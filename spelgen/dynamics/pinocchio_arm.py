@@ -1,4 +1,4 @@
-"""Pinocchio model of a derived arm (its bodies, not its URDF file), with rotor inertia from the settings file."""
+"""Pinocchio model of a `Chain` (the bodies of an arm, not its URDF file), with rotor inertia from the settings file."""
 
 from collections.abc import Callable
 from functools import partial
@@ -64,6 +64,6 @@ def kinematic_model(arm: Chain) -> pin.Model:
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:
     mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
-    if mass == 0.0:  # `FromDynamicParameters` divides by the mass.
+    if mass == 0.0:  # `FromDynamicParameters`, which divides by the mass, is not used.
         return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
     return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

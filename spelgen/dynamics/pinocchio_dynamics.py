@@ -67,7 +67,8 @@ class PinocchioDynamics:
         order = [model.joints[model.getJointId(name)].idx_v for name in constraint.names]
         self.jacobian, self.offset = np.zeros((model.nv, len(self.inputs))), np.zeros(model.nv)
         self.jacobian[order], self.offset[order] = constraint.jacobian, constraint.offset
-        # Products with K would take longer than Pinocchio's `aba` itself: they are skipped if K is the identity.
+        # Products with the constraint's Jacobian would take longer than Pinocchio's `aba`: they are skipped if it is
+        # the identity.
         self._same = np.array_equal(self.jacobian, np.eye(self.n)) and not self.offset.any()
 
     @property
@@ -78,10 +79,7 @@ class PinocchioDynamics:
     @_takes_tensors
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """Return the mass matrix M, (..., n, n) [kg m^2, kg m, kg]."""
-        upper = np.triu(self._batched(pin.crba, self.configuration(q)))
-        # Pinocchio guarantees only the upper triangle of M, which is copied to the lower one.
-        joints = upper + np.triu(upper, 1).swapaxes(-1, -2)
-        return np.asarray(self.jacobian.T @ joints @ self.jacobian)
+        return np.asarray(self.jacobian.T @ self._batched(pin.crba, self.configuration(q)) @ self.jacobian)
 
     @_takes_tensors
     def nonlinear_effects(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
@@ -128,14 +126,10 @@ class PinocchioDynamics:
             q = q @ self.jacobian.T + self.offset
         if self.model.nq == self.model.nv:
             return q
-        # Planar and floating joints are not coordinates: they remain at Pinocchio's neutral configuration.
-        configuration = np.tile(pin.neutral(self.model), (*q.shape[:-1], 1))
-        for joint in self.model.joints[1:]:
-            position = q[..., joint.idx_v]
-            if joint.nq <= 2:  # Pinocchio represents a continuous joint by (cos q, sin q).
-                values = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
-                configuration[..., joint.idx_q : joint.idx_q + joint.nq] = np.stack(values, axis=-1)
-        return configuration
+        # Pinocchio represents a continuous joint by (cos q, sin q). Planar and floating joints are not coordinates and
+        # remain at the neutral configuration.
+        neutral = pin.neutral(self.model)
+        return self._batched(lambda model, _, position: pin.integrate(model, neutral, position), q)
 
     def _batched(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
         """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.
@@ -153,14 +147,14 @@ class PinocchioDynamics:
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
     """Return the dynamics of an arm as Pinocchio reads them from its URDF: a reference for spelgen's own parser.
 
-    The URDF defines inertials, damping and friction. The settings file defines gravity and the input matrix. Raises
-    the errors of Pinocchio if it cannot read the file.
+    The URDF defines inertials, damping and friction. The settings file of the URDF defines gravity and the input
+    matrix. Raises the errors of Pinocchio if it cannot read the URDF.
 
     Args:
         urdf: path of the URDF.
         joints: names of the coordinates; their mimic joints move, too, and all other joints are locked at zero.
-        drives: True: use the rotor inertias of the settings, and their friction, if any, in place of the friction of
-            the URDF.
+        drives: True: for joints in the settings file, use rotor inertia and friction of the drive from this file, in
+            place of damping and friction of the URDF.
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     # Pinocchio parses the file itself, so the result is an independent reference for spelgen's own parser.

@@ -44,6 +44,7 @@ class PreparedModel:
         dtype: type of the parameters and states.
 
     Attributes:
+        model: the copy, without residual terms that are zero.
         n: number of joints.
         elements: number of bristles per joint, K.
         dtype: type of the parameters and states.
@@ -53,57 +54,58 @@ class PreparedModel:
         self, model: PortHamiltonian, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
     ) -> None:
         # Residual networks whose output is zero would take most of the time: they are removed.
-        reduced = without_idle_residuals(model)
-        reduced.to(dtype=dtype).requires_grad_(False)
-        self._model = reduced
-        self._weights, self._tip, self.dtype = reduced.prepare(), tip, dtype
-        self.n: int = reduced.n
-        self.elements: int = reduced.elements
+        self.model = without_idle_residuals(model).to(dtype=dtype).requires_grad_(False)
+        self._weights, self._tip, self.dtype = self.model.prepare(), tip, dtype
+        self.n: int = self.model.n
+        self.elements: int = self.model.elements
 
     def mass_matrix(self, q: Tensor) -> Tensor:
         """Return the mass matrix M(q), (..., n, n) [kg m^2, kg m, kg]."""
-        return self._model.mass_matrix(self._at(q))
+        return self.model.mass_matrix(self._at(q))
 
     def gravity(self, q: Tensor) -> Tensor:
         """Return the gravity torque dV/dq, (..., n) [Nm, N]."""
-        return self._model.gravity(self._at(q))
+        return self.model.gravity(self._at(q))
 
     def bias(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return Coriolis, centrifugal and gravity torque, (..., n) [Nm, N]."""
-        return self._model.nonlinear_effects(self._at(q, qd), qd)
+        return self.model.nonlinear_effects(self._at(q, qd), qd)
 
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the friction torque, (..., n) [Nm, N]; z: friction state, (..., n, K) [rad, m]."""
-        return self._model.friction_torque(self._at(q, qd), qd, *known_past(self._model, z))
+        return self.model.friction_torque(self._at(q, qd), qd, *known_past(self.model, z))
 
     def memory(self, qd: Tensor) -> Tensor:
         """Return the friction state z, (..., n, K) [rad, m], after a long motion at qd, (..., n): zero at qd = 0."""
-        return sliding_memory(self._model, qd)
+        return sliding_memory(self.model, qd)
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state after a displacement of the joints without reversals, (..., n, K) [rad, m].
 
         z: friction state before it, (..., n, K) [rad, m]. displacement: (..., n) [rad, m].
         """
-        return memory_after(self._model, z, displacement)
+        return memory_after(self.model, z, displacement)
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
-        return self._model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self._model, z))
+        return self.model.forward_dynamics(self._at(q, qd, tau), qd, tau, *known_past(self.model, z))
 
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the inputs tau, (..., n), that cause the accelerations qdd, (..., n) [rad/s^2, m/s^2]."""
-        return self._model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self._model, z))
+        """Return the inputs tau, (..., n), that cause the accelerations qdd, (..., n) [rad/s^2, m/s^2].
+
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on the velocity qd.
+        """
+        return self.model.inverse_dynamics(self._at(q, qd, qdd), qd, qdd, *known_past(self.model, z))
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
         """Return the momenta p = M(q) qd, (..., n) [Nm s, N s]."""
-        return self._model.momentum(self._at(q, qd), qd)
+        return self.model.momentum(self._at(q, qd), qd)
 
     def momentum_rate(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
         """Return dp/dt, (..., n) [Nm, N], of the momenta p = M(q) qd under the inputs tau, for momentum observers."""
-        past = known_past(self._model, z)
+        past = known_past(self.model, z)
         p = self.momentum(q, qd)
-        return self._model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
+        return self.model.port_hamiltonian_rhs(q, p, tau, self._weights, *past)[1]
 
     def step(
         self, q: Tensor, qd: Tensor, tau: Tensor, dt: float, z: Tensor | None = None, *, substeps: int = 1
@@ -123,12 +125,12 @@ class PreparedModel:
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each."""
+            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; ``speed`` is qd."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
             # The integrated state has velocities, not momenta, since control loops measure velocities.
-            q, qd, z, _ = runge_kutta(self._model, rhs, q, qd, z, dt / substeps)
+            q, qd, z, _ = runge_kutta(self.model, rhs, q, qd, z, dt / substeps)
         return State(q, qd, z)
 
     def rollout(
@@ -166,7 +168,8 @@ class PreparedModel:
 
         A is the derivative with respect to the state (q, qd), B with respect to the inputs tau. Without dt, A and B are
         derivatives of the rate (qd, qdd) at constant z (continuous time). With dt [s], A and B are derivatives of q and
-        qd after ``step`` (discrete time).
+        qd after ``step`` with ``substeps`` Runge-Kutta steps (discrete time). z: friction state, by default
+        ``memory(qd)``.
         """
         n = self.n
         z = self.memory(qd) if z is None else z
@@ -212,7 +215,7 @@ class PreparedModel:
 
         others: other vectors of the call, such as qd and tau, (..., n), whose dtypes and shapes are checked.
         """
-        return self._model.at(q, *others, prepared=self._weights)
+        return self.model.at(q, *others, prepared=self._weights)
 
     def _kinematics(self) -> TipKinematics:
         if self._tip is None:
@@ -230,8 +233,8 @@ def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: 
     """
     if not torch.is_grad_enabled():
         states = tuple(x.detach() for x in states)
-    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode, and if autograd is disabled:
-    # autograd is therefore enabled, and reverse mode is used.
+    # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode and, if autograd is disabled, in
+    # reverse mode. Reverse mode is therefore used, with autograd enabled.
     with torch.inference_mode(False), torch.enable_grad():
         jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
         # Tensors of inference mode cannot be differentiated, so the arguments are cloned.

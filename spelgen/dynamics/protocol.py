@@ -1,6 +1,7 @@
 """The common interface of an arm's dynamics: trained models, Pinocchio, and regressors with identified parameters.
 
-The functions of the friction state z accept dynamics with and without a friction state.
+Functions such as `memory_after` return the friction state z after a motion. They also accept dynamics without a
+friction state, for which z is empty.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class RigidDynamics(Protocol):
         """Return h, (..., n): Coriolis, centrifugal and gravity torque, without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the friction torque, (..., n)."""
+        """Return the friction torque, (..., n) [Nm, N], with the sign of qd: it is subtracted from the inputs."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau."""
@@ -83,7 +84,7 @@ def is_stateful(dynamics: object) -> TypeGuard[FrictionState]:
 
 
 def motors_of(model: Any) -> Tensor:
-    """Return the matrix C, (n, n), for which C qd are the motor velocities of a trained model of rigid bodies.
+    """Return the matrix C, (n, n), of a rigid-body model: its motors have the velocities C qd.
 
     C is the identity if each motor drives its own joint.
     """
@@ -91,9 +92,9 @@ def motors_of(model: Any) -> Tensor:
 
 
 def sliding_memory(dynamics: object, qd: Tensor) -> Tensor:
-    """Return the friction state z, (..., n, K) [rad, m], after a long motion at constant qd, (..., n) [rad/s, m/s].
+    """Return the friction state z of dynamics, (..., n, K) [rad, m], after a long motion at constant qd, (..., n).
 
-    K is the number of bristles per joint, 0 for friction without a state: z is then empty.
+    K is the number of bristles per joint, 0 for friction without a state: z is then empty. qd: [rad/s, m/s].
     """
     if not is_stateful(dynamics):
         return qd.unsqueeze(-1)[..., :0]
@@ -130,15 +131,16 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the optional arguments for friction of the methods of `dynamics`: (z, direction), (z,) or ().
+    """Return the arguments about friction that a caller appends to (q, qd, ...) in a call of a method of `dynamics`.
 
-    A caller appends them to (q, qd, ...). They are empty if z is unknown or friction has no state.
+    Three cases: () if z is None or friction has no state, since `direction` is passed after z; (z, direction) for
+    `RigidBodyDynamics` with a given direction; otherwise (z,).
 
     Args:
         dynamics: dynamics whose method is called.
         z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
-        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
-            needed only if tau was filtered: it must have passed the same filter.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles; None:
+            computed from qd. A comparison with low-pass filtered torques needs the smooth sign after the same filter.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()
@@ -152,7 +154,8 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts also call the methods of the friction state on the adapter: they are copied from `dynamics`.
+        # Rollouts also call `memory` and `memory_after`, the methods of the friction state, on the adapter. They are
+        # therefore copied from `dynamics`.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements
@@ -174,13 +177,16 @@ class VelocityState:
         return p
 
     def port_hamiltonian_rhs(
-        self, q: Tensor, p: Tensor, tau: Tensor | None, prepared: None, z: Tensor | None = None
+        self, q: Tensor, p: Tensor, tau: Tensor, prepared: None, z: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; p is the velocity qd."""
-        past = known_past(self.dynamics, z)
-        return p, self.dynamics.forward_dynamics(q, p, torch.zeros_like(q) if tau is None else tau, *past)
+        return p, self.dynamics.forward_dynamics(q, p, tau, *known_past(self.dynamics, z))
 
 
 def integrable(dynamics: RigidDynamics) -> Any:
-    """Return `dynamics` with the methods that rollouts call: unchanged for a model, else wrapped in `VelocityState`."""
+    """Return `dynamics` with the methods that rollouts call.
+
+    A trained model (`PortHamiltonian`) has these methods and is returned unchanged. Other dynamics, such as baselines,
+    are wrapped in `VelocityState`.
+    """
     return dynamics if isinstance(dynamics, PortHamiltonian | VelocityState) else VelocityState(dynamics)

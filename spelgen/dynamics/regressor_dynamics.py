@@ -112,15 +112,15 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies (quantities that depend only on q), and momentum derivatives.
+        """Return the configuration cache of the B bodies at q, (..., n) [rad, m], and the derivatives of their momenta.
 
-        q: (..., n). The derivatives of the bodies' momenta with respect to qd are (..., n, 12 B). The momentum of a
-        body is T' J, 3 x 4 elements, with the time derivative T' of its homogeneous transform T and its
-        pseudo-inertia J.
+        The momentum of a body is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and the time
+        derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of the
+        momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
         """
-        # The kinetic energy of a body, 1/2 tr(T' J T'^T), is linear in its pseudo-inertia J, so J may be physically
-        # inconsistent. `chain.forward` returns the transforms T times four given points; the columns of the identity as
-        # points give T itself.
+        # The kinetic energy of a body is 1/2 tr(T' J T'^T), with T' = dT/dt. The pseudo-inertia J itself is used,
+        # without its Cholesky factors, so J may be physically inconsistent. `chain.forward` returns the transforms T
+        # times four given points; the columns of the identity as points give T itself.
         chain = self.chain.forward(q, torch.eye(len(self.inertia)).to(q))
         jacobian = torch.unflatten(self.chain.ratios.mT @ chain.jacobian, -1, (3, -1))
         return chain, (jacobian @ self.inertia).flatten(-2)
@@ -128,13 +128,16 @@ class RegressorDynamics:
     def friction_torque(self, q: Tensor, qd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the sum of friction torque and torque offset, (..., n) [Nm, N], at velocities qd, (..., n).
 
-        z: friction state, (..., n, K) [rad, m]; None: unknown. q has no effect.
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on qd. q has no effect.
         """
         past = z.numpy() if z is not None and self.elements else None
         return torch.from_numpy(self.friction(qd.numpy(), past))
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor, z: Tensor | None = None) -> Tensor:
-        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n)."""
+        """Return the accelerations qdd, (..., n) [rad/s^2, m/s^2], under the inputs tau, (..., n).
+
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on qd.
+        """
         equations = self.equations_at(q)
         # `solve` broadcasts the batch dimensions of M and tau only if the force is a matrix with one column.
         force = equations.force(qd, tau, z).unsqueeze(-1)
@@ -144,7 +147,8 @@ class RegressorDynamics:
     def inverse_dynamics(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the inputs tau, (..., n), that give the accelerations qdd, (..., n).
 
-        A passive joint has no input: its element is the torque that a motor at the joint would need.
+        A passive joint has no input: its element is the torque that a motor at the joint would need. z: friction state,
+        (..., n, K) [rad, m]; None: friction depends only on qd.
         """
         passive = (self.inputs == 0).all(dim=1).double()
         # The row of a passive joint in G is zero, which makes G singular. It is replaced by the row of the identity.
@@ -203,7 +207,10 @@ def identified_dynamics(
     reach = reach_of(arm.joint_types).values if friction.memory else None
 
     def torque(qd: np.ndarray, z: np.ndarray | None) -> np.ndarray:
-        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), and at the state z, (..., n, K)."""
+        """Return the friction torque, (..., n) [Nm, N], at velocities qd, (..., n), for a friction state z.
+
+        z: deflections of K bristles per drive, (..., n, K) [rad, m]; None: friction depends only on qd.
+        """
         deflection = None if z is None or reach is None else z / reach
         return friction.torque(constants, qd, deflection, drives.speeds)
 

@@ -1,12 +1,13 @@
 """Rollouts of arms with position servos: positions under logged commands, by an implicit integration method.
 
 Servos act as springs, kp times the position error. These springs and dry friction are stiff. Both are integrated
-implicitly, so that a few steps between samples are stable for any kp. Springs are linearised at the start of a step
-(Rosenbrock method with the weights of the theta method; Hairer and Wanner, Solving ODEs II, IV.7). Theta is computed
-for each step: decaying motion then has its true rate of decay to third order (exponential fitting; Liniger and
-Willoughby, SIAM J. Numerical Analysis 7:47, 1970). Theta is 1/2 for slow motion, without numerical damping, and tends
-to 1 for motion that is too fast for the step. The friction state is not integrated, but computed from the displacement
-in the step.
+implicitly, so that a few steps between samples are stable for any kp. Springs are nonlinear (dead zone, torque limit),
+and are linearised at the start of a step (Rosenbrock method with the weights of the theta method; Hairer and Wanner,
+Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step from its duration x in units of the time
+constant of decay: it is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for
+the step. The computed decay is then exact to third order in x (exponential fitting; Liniger and Willoughby, SIAM J.
+Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step. It
+is (K, ..., n) for K bristles per joint, in states as in `ServoDrives`.
 """
 
 from typing import NamedTuple
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from spelgen.dynamics.bristles import moved_bristles
+from spelgen.dynamics.prepared import State
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.motors import ServoConstants, beyond
 from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
@@ -22,27 +24,17 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 class ServoDrives(NamedTuple):
-    """Constants of servos and friction of an arm, (..., n), in the layout that rollouts of this module use.
+    """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
 
-    Constants of the K bristles are (K, ..., n): a rollout takes two thirds of the time that it takes with (..., n, K).
+    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n), since a
+    rollout with this layout takes two thirds of the time with (..., n, K).
     """
 
     servo: ServoConstants
     friction: FrictionConstants
     offset: Tensor  # torque offset [Nm, N]
     reach: Tensor  # break-away displacements, (K, ..., n) [rad, m]
-    steepness: Tensor  # bristle stiffness / dry friction = fraction / break-away displacement, (K, ..., n) [1/rad, 1/m]
-
-
-class ServoState(NamedTuple):
-    """State of an arm: positions q and velocities qd, (..., n), and friction state z, (K, ..., n) [rad, m].
-
-    z has the deflections of K bristles per joint.
-    """
-
-    q: Tensor
-    qd: Tensor
-    z: Tensor
+    steepness: Tensor  # stiffness of a bristle / magnitude of dry friction, (K, ..., n) [1/rad, 1/m]
 
 
 class Load(NamedTuple):
@@ -68,18 +60,21 @@ def servo_drives(model: PortHamiltonian) -> ServoDrives:
     constants = model.friction.prepare()
     reach = constants.bristle_reach.T.contiguous()
     steepness = (constants.bristle_fractions / constants.bristle_reach).movedim(-1, 0).contiguous()
-    # `batch`: batch dimensions of the friction constants, at least one.
+    # Constants of K bristles of n drives are (K, *batch, n), with the batch dimensions of the friction constants.
+    # Without batch dimensions, one of size 1 is added, (K, 1, n), so that the constants broadcast with states of W
+    # windows, (K, W, n).
     batch = steepness.shape[1:-1] or (1,)
     shape = len(reach), *[1] * len(batch), model.n
     steepness = steepness.reshape(len(reach), *batch, model.n)
     return ServoDrives(model.servo.prepare(), constants, model.torque_offset, reach.view(shape), steepness)
 
 
-def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> ServoState:
-    """Return the initial state of a rollout: q, qd, and the friction state with which the acceleration is zero.
+def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) -> State:
+    """Return the initial state of a rollout: q, qd, and the friction state that balances all other torques.
 
-    An arm at rest or in steady motion has this state: dry friction balances all other torques, up to its largest
-    magnitude.
+    The acceleration is then zero, as for an arm at rest or in steady motion. All bristles of a joint are deflected by
+    the same fraction of their break-away displacements. If the other torques exceed the largest dry friction, the
+    fraction is 1 and the acceleration is not zero.
 
     Args:
         drives: constants of servos and friction.
@@ -93,10 +88,10 @@ def balanced(drives: ServoDrives, q: Tensor, qd: Tensor, u: Tensor, load: Load) 
     torque = torque.clamp(-servo.limit, servo.limit) - drives.offset
     excess = torque - load.bias - drives.friction.viscosity(qd) * qd
     direction = (excess / drives.friction.dry(qd, load.gravity)).clamp(-1.0, 1.0)
-    return ServoState(q, qd, direction * drives.reach)
+    return State(q, qd, direction * drives.reach)
 
 
-def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: Tensor) -> ServoState:
+def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor) -> State:
     """Return the state after one implicit step (see the module's docstring).
 
     Args:
@@ -142,15 +137,17 @@ def advanced(drives: ServoDrives, state: ServoState, u: Tensor, load: Load, h: T
             velocity = slipped(momentum - coupling, inertia + damping, bristle_stiffness, bent, reach)
     displacement = h * velocity
     qd = qd + (velocity - qd) / theta
-    return ServoState(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
+    return State(q + displacement, qd, moved_bristles(z, displacement, drives.reach))
 
 
 def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Tensor) -> Tensor:
     """Return the displacement x of each joint that balances a force against a spring and K bristles, (..., n).
 
-    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) is the deflection of bristle k after the
-    displacement x. For a given number of sliding bristles, 0 to K, the equation is linear in x. Of the solutions of
-    these K + 1 linear equations, the one with the largest |x| is valid.
+    x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
+    deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
+    linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
+    resists with at most its sliding force, so the resistance of the valid equation is the smallest one, and its |x| the
+    largest.
 
     Args:
         push: force on the joint, (..., n).
@@ -159,8 +156,9 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
             shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # Cumulative sums over the number of sliding bristles, 0 to K. `remaining`: |push| minus the force of the sliding
-    # bristles. `resisting`: stiffness of the spring and of the bristles that do not slide.
+    # The linear equations for 0 to K sliding bristles are computed by cumulative sums. Their solutions |x| are
+    # `remaining` (|push| minus the forces of the sliding bristles) divided by `resisting` (`slope` plus the stiffness
+    # of the bristles that do not slide).
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class TipKinematics:
     """Pose and Jacobian of a link in the frame of the root link, as functions of q, (..., n) [rad, m].
 
-    Mimic joints move with their coordinates; all other joints are at zero. Angles of the URDF are not rounded, unlike
-    the angles of a derived arm. Results have the dtype of q.
+    Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
+    rounded to it, unlike in a `Chain`. Results have the dtype of q.
 
     Args:
         robot: the URDF.
@@ -38,7 +38,8 @@ class TipKinematics:
         }
         constraint = mimic_constraint(robot, joints)
         rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        # The positions of the moving joints on the path to the link are _jacobian q + _offset; (joints, n), (joints,).
+        # The J moving joints on the path to the link include mimic joints. Their positions are _jacobian q + _offset,
+        # with _jacobian (J, n) and _offset (J,).
         self._jacobian = torch.from_numpy(constraint.jacobian[rows])
         self._offset = torch.from_numpy(constraint.offset[rows])
         # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
@@ -65,7 +66,7 @@ class TipKinematics:
         return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
 
     def _positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of the joints on the path to the link at q, (..., n): (states, joints) [rad, m]."""
+        """Return the positions of all joints on the path to the link, (S, joints) [rad, m], of S states q, (..., n)."""
         return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
 
 
@@ -80,12 +81,10 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
 
     first = last = Frame(root, Link(root), Joint())
     for joint in path:
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(Rotation.from_euler("xyz", joint.rpy).as_matrix())
-        pose[:3, 3] = torch.tensor(joint.xyz, dtype=torch.float64)
         kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
         axis = torch.tensor(joint.axis, dtype=torch.float64)
-        offset = pk.Transform3d(matrix=pose[None].to(dtype), dtype=dtype)
+        rotation = Rotation.from_euler("xyz", joint.rpy).as_matrix()
+        offset = pk.Transform3d(rot=rotation, pos=joint.xyz, dtype=dtype)
         frame = Frame(
             joint.child, Link(joint.child), Joint(joint.name, offset, kind, axis / axis.norm(), dtype)
         )

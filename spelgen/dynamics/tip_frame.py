@@ -28,7 +28,7 @@ class Tip:
 
 
 def tip_frame(loaded: Arm) -> Tip:
-    """Return the frame of the tip link, with the unrounded angles of the URDF."""
+    """Return the frame of the tip link of an arm, with the unrounded angles of the URDF."""
     names = loaded.chain.joint_names
     link = loaded.tip or loaded.robot.last_link(names)
     # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.
@@ -36,15 +36,15 @@ def tip_frame(loaded: Arm) -> Tip:
     return Tip(link, *link_poses(loaded)[link], bodies)
 
 
-def link_poses(loaded: Arm) -> dict[str, tuple[int, np.ndarray]]:
+def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:
     """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
 
     The body is an index in `Chain.bodies`, or -1 for the root link. The pose is in the frame of this body. Angles of
-    the URDF are not rounded.
+    the URDF are rounded with ``angle_tolerance`` [rad].
     """
     chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
     poses: dict[str, tuple[int, np.ndarray]] = {}
-    for link, frame in lump_links(loaded.robot, chain, 0.0).frames.items():
+    for link, frame in lump_links(loaded.robot, chain, angle_tolerance).frames.items():
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
         poses[link] = frame.body, pose

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class ArmModel(PortHamiltonian):
-    """Base class of all models in memory that are made from a specification, which is their attribute ``spec``.
+    """Base class of models that are made in memory, without a module file, from the specification ``spec``.
 
     Each model has a second base class, from ``spelgen.runtime``, with its dynamics.
     """
@@ -37,16 +37,14 @@ class ArmModel(PortHamiltonian):
 
         def __getattr__(self, name: str) -> Any: ...
 
-    def prepared(
-        self, tip: TipKinematics | None = None, *, dtype: torch.dtype = torch.float64
-    ) -> PreparedModel:
-        """Return a copy with constant parameters for many calls, as in control loops; see ``PreparedModel``.
+    def prepared(self, tip: TipKinematics | None = None) -> PreparedModel:
+        """Return a copy in double precision with constant parameters for many calls, as in control loops.
 
-        tip: kinematics of the tip, for its pose and Jacobian. dtype: type of the parameters and states.
+        tip: kinematics of the tip, for its pose and Jacobian.
         """
         from spelgen.dynamics.prepared import PreparedModel
 
-        return PreparedModel(self, tip, dtype=dtype)
+        return PreparedModel(self, tip)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
         # pickle does not find the model's class by name, since a function makes the class: pickle calls the function.
@@ -95,10 +93,10 @@ def load_module(module: str | Path, *, seed: int = 0) -> ArmModel:
     """
     from spelgen.emission.text import read_source, require_unedited
 
-    is_text = isinstance(module, str) and "\n" in module
-    file = None if is_text else Path(module)
-    text = str(module) if file is None else read_source(file)
-    return assemble(require_unedited(text, file), seed)
+    if isinstance(module, str) and "\n" in module:
+        return assemble(require_unedited(module), seed)
+    file = Path(module)
+    return assemble(require_unedited(read_source(file), file), seed)
 
 
 def spec_of(model: object) -> ModelSpec | None:

@@ -30,8 +30,8 @@ class NetworkTuning:
     friction_units: int = 8
     # [1] Smallest number of hidden units per group of outputs (of a network) that depend on the same joints.
     min_units: int = 4
-    # [1] Smallest number of hidden units per group of outputs of a Kolmogorov-Arnold network, whose units have a
-    # learned function per edge.
+    # [1] Smallest number of hidden units per group of outputs (with the same joints) of a Kolmogorov-Arnold network;
+    # smaller than `min_units`, because each edge of such a network has a learned function.
     min_kan_units: int = 2
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
@@ -68,7 +68,9 @@ def model_parts(spec: ModelSpec) -> ModelParts:
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
     if spec.outputs and spec.links and spec.design.net != "none":
-        # The functions of the residual terms of M have bounds in place of mean and scale: rows have only the joints.
+        # The learned functions of R, the residual term of M, are scaled by bounds that the model computes from the
+        # armature, so that armature + R is positive definite. A row of the table therefore has the joints of a
+        # function, but no mean and scale.
         rows["FUNCTIONS"] = tuple(call("Function", _joint_names(spec, x.joints)) for x in spec.outputs)
     elif spec.design.mass == "derived":
         functions = [
@@ -83,13 +85,14 @@ def model_parts(spec: ModelSpec) -> ModelParts:
 
 
 def _inputs(spec: ModelSpec) -> Call:
-    n = range(len(spec.joints))
-    values = {(x.joint, x.motor): x.value for x in spec.inputs}
-    matrix = tuple(tuple(values.get((joint, motor), 0.0) for motor in n) for joint in n)
-    # `mask` is True for gains (entries of G) that are trained; known gear ratios are constants.
-    trained = {(x.joint, x.motor) for x in spec.inputs if x.trained}
-    mask = tuple(tuple((joint, motor) in trained for motor in n) for joint in n)
-    return call("MotorInputs", matrix, **_without_defaults({"trained": mask}, trained=not trained))
+    n = len(spec.joints)
+    # `is_trained` is True for gains (entries of G) that are trained; known gear ratios are constants.
+    gains, is_trained = np.zeros((n, n)), np.zeros((n, n), dtype=bool)
+    for entry in spec.inputs:
+        gains[entry.joint, entry.motor] = entry.value
+        is_trained[entry.joint, entry.motor] = entry.trained
+    masks = {"trained": tuple(map(tuple, is_trained.tolist()))} if is_trained.any() else {}
+    return call("MotorInputs", tuple(map(tuple, gains.tolist())), **masks)
 
 
 def base_class(spec: ModelSpec) -> str:
@@ -110,8 +113,8 @@ def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `runtime.rows.Joint` computes center and half range from the limits with the same rounding: a row omits
-        # `typical_range` if it is equal to the computed values.
+        # `typical_range` is (center, half range). `runtime.rows.Joint` computes the same two numbers from the limits,
+        # with the same rounding: the row of a joint omits `typical_range` if it is equal to the computed numbers.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
@@ -199,7 +202,7 @@ def _mass(spec: ModelSpec) -> Call:
     if spec.design.mass == "dense-3n":
         rows = 3 * len(spec.joints)
         outputs = (spec.joint_names,) * (rows * (rows + 1) // 2)
-        # M is symmetric, so a module has only the lower triangle of the nominal mean.
+        # M is symmetric, so a module has only the lower triangle of the mean of the nominal M over positions.
         mean = mean_mass(len(spec.joints), spec.outputs, spec.constants)
         triangle = tuple(tuple(row[: k + 1]) for k, row in enumerate(mean.tolist()))
         return call("DenseMass", JOINTS, mean=triangle, network=_network(spec, outputs, _mass_scales(spec)))
@@ -211,7 +214,7 @@ def _mass(spec: ModelSpec) -> Call:
 
 
 def _mass_network(spec: ModelSpec) -> Call:
-    """Return the constructor call of the network whose outputs are the learned functions of M."""
+    """Return the constructor call of the network whose outputs are the learned functions of q in the entries of M."""
     # Each edge of a Kolmogorov-Arnold network is a learned function, so fewer units suffice.
     min_units = TUNING.min_kan_units if spec.design.net == "kan" else TUNING.min_units
     return _network(spec, call("joints_of", FUNCTIONS), _mass_scales(spec), min_units=min_units)
@@ -220,14 +223,15 @@ def _mass_network(spec: ModelSpec) -> Call:
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
-    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. The factors
-    are the sensitivities of M to the coordinates.
+    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. Both rows
+    are equal: the root mean square change of M if only one coordinate changes, divided by the largest such change.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
 
 def _potential(spec: ModelSpec) -> Call:
-    # The inputs cos q and sin q of a joint have the same scale.
+    # The inputs cos q and sin q of a joint are multiplied by the same factor, the sensitivity of V to the joint's
+    # position.
     scales = (tuple(joint.potential_sensitivity for joint in spec.joints),) * 2
     # The network of V has a single output, the network of M has many: a fraction of its hidden units suffices for V.
     width = max(TUNING.min_units, round(TUNING.potential_fraction * units(spec)))
@@ -244,8 +248,8 @@ def _friction(spec: ModelSpec) -> Call:
         width = TUNING.friction_units * n
         network = _network(spec, outputs, (scale, scale, speeds, ones), width=width, depth=1)
         return call("JointFriction", JOINTS, network=network)
-    # Dense friction of the published model (Duong et al., IEEE T-RO 40:3695, 2024) has three axes per joint, about or
-    # along one of which the joint moves.
+    # Dense friction of the published model (Duong et al., IEEE T-RO 40:3695, 2024) has rows for all three axes of each
+    # joint frame, although a joint moves about or along one axis only.
     axes = 3 if spec.design.dissipation == "dense-3n" else 1
     rows = axes * n
     network = _network(spec, (spec.joint_names,) * (rows * (rows + 1) // 2), (scale, scale, ones))
@@ -327,7 +331,7 @@ def term_names(spec: ModelSpec) -> list[str]:
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], to six digits.
+    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], rounded.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
     outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
@@ -339,4 +343,4 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     for output in outputs:
         for row, column, value in output.basis:
             mean[row, column] += output.mean * value
-    return np.array([[rounded(value) for value in row] for row in mean])
+    return np.asarray(np.vectorize(rounded)(mean))

@@ -42,7 +42,7 @@ class ModelTuning:
     """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
 
     # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
-    # positions. These eigenvalues are generalised ones, relative to the mean of the nominal M.
+    # positions. Both are generalised eigenvalues with respect to the mean of the nominal M over these positions.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -53,8 +53,8 @@ class ModelTuning:
     largest_effort: float = 1e4
     # [rad/s, m/s] A larger velocity limit in a URDF is regarded as a placeholder for an unknown limit.
     largest_speed: float = 100.0
-    # [1] Significant digits of inertial parameters: more than the accuracy of a URDF, and few enough that the
-    # decimals of a URDF are reproduced.
+    # [1] Significant digits of inertial parameters: more than a URDF has, but fewer than the 16 of float64, so that
+    # decimals of a URDF are reproduced without rounding errors of float64.
     inertia_digits: int = 12
     # [1] Smallest allowed principal second moment of mass of a body about its center of mass, divided by the largest:
     # large enough that rounding errors do not make the body physically inconsistent.
@@ -72,8 +72,8 @@ class ModelTuning:
     full_effort_at: float = 0.5
     # [s] Initial ratio kd / kp of a servo.
     servo_lag: float = 0.05
-    # [1] Armature of a drive of unknown rotor inertia, effort or speed, divided by the joint's diagonal entry of the
-    # nominal M.
+    # [1] Armature of a drive with unknown rotor inertia and an unknown limit of effort or speed, divided by the joint's
+    # diagonal entry of the nominal M.
     min_armature: float = 0.01
 
 
@@ -144,7 +144,7 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` for each learned function of M: its joints, its matrix in M, mean and scale.
+    """Return an ``OutputSpec`` per learned function f of M: its joints, the matrix that f multiplies, mean and scale.
 
     structure: terms of M. sizes: nominal means and standard deviations of the functions.
     """
@@ -159,7 +159,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` for each trained constant of M: its matrix in M, initial value and scale.
+    """Return a ``ConstantSpec`` per trained constant c of M: the matrix that c multiplies, initial value and scale.
 
     structure: terms of M. sizes: nominal values of the constants.
     """
@@ -181,14 +181,15 @@ def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
 def _joint(
     coordinate: Coordinate, sizes: Nominal, index: int, drive: JointSettings, min_armature: float
 ) -> JointSpec:
-    """Return the ``JointSpec`` of a coordinate: limits, and typical values of motion, friction and armature.
+    """Return the ``JointSpec`` of a coordinate: limits, typical friction, armature, and sensitivities of M and V to q.
 
     Args:
         coordinate: joint with the limits of the URDF.
-        sizes: typical magnitudes of M, V and torques.
+        sizes: typical magnitudes of M, potential energy V and torques.
         index: index of the coordinate, from 0.
         drive: settings of the joint's drive.
-        min_armature: armature if the rotor inertia, the effort or the speed is unknown [kg m^2, kg].
+        min_armature: armature if the rotor inertia and at least one of the limits of effort and speed are unknown [kg
+            m^2, kg].
     """
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
@@ -270,7 +271,11 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 
 
 def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
-    """Return the inertial parameters ``ten`` of a body, (10,), changed if they are not physically consistent."""
+    """Return the inertial parameters ``ten`` of a body, (10,), made physically consistent if necessary.
+
+    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`), as are principal second
+    moments of mass below `min_second_moment` times the largest.
+    """
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
@@ -280,8 +285,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten
-    # Second moments below the bound are raised to twice the bound. All others and the principal directions are
-    # unchanged.
+    # Principal second moments below twice the bound are raised to twice the bound, so that rounding cannot make one
+    # smaller than the bound. All others and the principal directions are unchanged.
     raised = np.maximum(values, 2 * TUNING.min_second_moment * values[-1])
     pseudo[:3, :3] += (vectors * (raised - values)) @ vectors.T
     return _significant(parameters_of(pseudo))

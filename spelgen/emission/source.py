@@ -11,7 +11,7 @@ SKIP = "  # fmt: skip"  # With this comment in a module, ruff does not reformat 
 
 @dataclass(frozen=True)
 class Code:
-    """A name in source code, such as the name of a table; texts that are not names are ``str``."""
+    """A name in source code, such as the name of a table, written without quotes; a ``str`` is a string literal."""
 
     text: str
 
@@ -76,7 +76,7 @@ def flat(value: object) -> str:
     if isinstance(value, Code):
         return value.text
     if isinstance(value, str):
-        return json.dumps(value) if value.isascii() and value.isprintable() else _escaped(value)
+        return json.dumps(value) if value.isascii() and value.isprintable() else ascii(value)
     if isinstance(value, tuple):
         if _is_repeated(value):
             return f"({flat(value[0])},) * {len(value)}"
@@ -84,15 +84,6 @@ def flat(value: object) -> str:
     if isinstance(value, dict):
         return "{" + _joined(value) + "}"
     return f"{value.callee}({_joined(value)})" if isinstance(value, Call) else repr(value)
-
-
-def _escaped(text: str) -> str:
-    """Return a string literal for ``text``, in which characters that are not ASCII are Python's 32-bit escapes.
-
-    json.dumps is not used for these characters: it has only 16-bit escapes, and two of them for a larger code point,
-    which Python does not join.
-    """
-    return '"' + "".join(rf"\U{ord(x):08x}" if not x.isascii() else json.dumps(x)[1:-1] for x in text) + '"'
 
 
 def _items(value: object) -> list[tuple[str, object]]:

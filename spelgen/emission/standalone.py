@@ -3,7 +3,6 @@
 import ast
 from collections import defaultdict
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
 from graphlib import TopologicalSorter
 from importlib.resources import files
@@ -15,39 +14,26 @@ _OURS = "spelgen.runtime."
 
 
 class Definition(NamedTuple):
-    """A class, function or constant of the runtime: source text with comments, and names that occur in the text."""
+    """A class, function or constant of the runtime."""
 
-    text: str
-    uses: frozenset[str]
+    text: str  # source text with comments
+    uses: frozenset[str]  # names that occur in the text
     is_block: bool  # True for a class or function, False for a constant
+    file: str  # name of the file, without the suffix
 
 
-@dataclass(frozen=True)
-class Runtime:
-    """The source of all files of ``spelgen.runtime``.
+class Runtime(NamedTuple):
+    """The source of all files of ``spelgen.runtime``."""
 
-    Attributes:
-        definitions: {name: definition}, in an order in which they can be executed.
-        imports: import statements of other packages and of the standard library.
-        rows: names of the classes in rows.py, which must be defined before the tables of an arm.
-    """
-
-    definitions: dict[str, Definition]
-    imports: tuple[ast.Import | ast.ImportFrom, ...]
-    rows: frozenset[str]
+    definitions: dict[str, Definition]  # by name, in an order in which they can be executed
+    imports: tuple[ast.Import | ast.ImportFrom, ...]  # imports of other packages and of the standard library
 
 
-class Bundle(NamedTuple):
-    """The parts of a standalone module that are copied from the runtime."""
-
-    imports: str  # import statements
-    rows: str  # source text that precedes the tables of the arm
-    runtime: str  # source text that follows the tables
-    contents: tuple[str, ...]  # names of the classes and functions in `runtime`
-
-
-def bundle(arm: str, model: str) -> Bundle:
+def bundle(arm: str, model: str) -> dict[str, object]:
     """Return the source of the runtime that a standalone module needs, directly or through other definitions.
+
+    The result has the variables of the template: ``imports``; ``rows``, the text that precedes the tables of the arm;
+    ``runtime``, the text that follows the tables; ``contents``, the names of the classes and functions in ``runtime``.
 
     arm, model: source texts of the module's tables and of its class ``Model``.
     """
@@ -60,12 +46,21 @@ def bundle(arm: str, model: str) -> Bundle:
             new = runtime.definitions[name].uses - used
             used |= new
             pending += new
-    needed = {name: definition for name, definition in runtime.definitions.items() if name in used}
     # The tables of the arm consist of instances of the classes in rows.py, which must be defined before the tables.
-    rows = [definition for name, definition in needed.items() if name in runtime.rows]
-    definitions = {name: definition for name, definition in needed.items() if name not in runtime.rows}
-    blocks = tuple(name for name, definition in definitions.items() if definition.is_block)
-    return Bundle(_imports(used, runtime), _joined(rows), _joined(definitions.values()), blocks)
+    rows, definitions, contents = [], [], []
+    for name, definition in runtime.definitions.items():
+        if name in used and definition.file == "rows":
+            rows.append(definition)
+        elif name in used:
+            definitions.append(definition)
+            if definition.is_block:
+                contents.append(name)
+    return {
+        "imports": _imports(used, runtime),
+        "rows": _joined(rows),
+        "runtime": _joined(definitions),
+        "contents": contents,
+    }
 
 
 def _joined(definitions: Iterable[Definition]) -> str:
@@ -93,25 +88,19 @@ def load_runtime() -> Runtime:
     imports = []
     for name, tree in trees.items():
         order.add(name)
-        for node in _imported(tree):
-            module = (node.module or "") if isinstance(node, ast.ImportFrom) else ""
+        for node in tree.body:
+            module = str(node.module) if isinstance(node, ast.ImportFrom) else ""
             if module.startswith(_OURS):
                 order.add(name, module.removeprefix(_OURS))
-            elif module != "__future__":
+            elif isinstance(node, ast.Import | ast.ImportFrom) and module != "__future__":
                 imports.append(node)
     definitions = {}
     for name in order.static_order():
         for statement in trees[name].body:
             if (defined := _defined(statement)) is not None:
                 text, is_block = _text(statement, texts[name]), not isinstance(statement, ast.Assign)
-                definitions[defined] = Definition(text, frozenset(names_in(statement)), is_block)
-    rows = frozenset(filter(None, map(_defined, trees["rows"].body)))
-    return Runtime(definitions, tuple(imports), rows)
-
-
-def _imported(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
-    """Return the import statements at the top level of a file's syntax tree."""
-    return [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+                definitions[defined] = Definition(text, frozenset(names_in(statement)), is_block, name)
+    return Runtime(definitions, tuple(imports))
 
 
 def _defined(node: ast.stmt) -> str | None:

@@ -1,12 +1,13 @@
 """Conversion of a ``ModelSpec`` to the source of a module, and back. Equal specifications give equal bytes.
 
-Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. To read the
-specification of a module, its source is parsed, but not executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. The specification of
+a module is found in its text, which is not executed.
 """
 
 import ast
 import json
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +18,7 @@ from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, name
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
-from spelgen.spec import ModelSpec, spec_from_json
+from spelgen.spec import ConstantSpec, ModelSpec, OutputSpec, spec_from_json
 from spelgen.templates import render
 
 _COMMENTS = {
@@ -43,6 +44,8 @@ _EXAMPLE = """\
 # [bytes] Largest file that is read as a module: ten times the size of the largest module that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
+# The statement of a module with its specification. JSON has no three quotes in a row.
+_SPEC = re.compile(r'^SPEC = r"""(.*)"""', re.MULTILINE)
 
 
 def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
@@ -69,7 +72,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     if standalone:
         from spelgen.emission.standalone import bundle
 
-        return render("standalone.py.jinja", **bundle(arm, model)._asdict(), **context)
+        return render("standalone.py.jinja", **bundle(arm, model), **context)
     # A module imports only the names that occur in its text.
     used = names_in(ast.parse(f"{arm}\n{model}")) & _public_names()
     # The imported names have ruff's order: classes first.
@@ -112,7 +115,7 @@ def header(spec: ModelSpec) -> str:
 
 
 def description(spec: ModelSpec) -> str:
-    """Return sentences about a model: robot, bodies or networks, the joints that V depends on, and inputs."""
+    """Return sentences about a model: robot, bodies or networks, joints of the potential energy V, and inputs."""
     kind = class_summary(spec)
     lines = [f"Robot {_quoted(spec.robot)}. {kind[0].upper()}{kind[1:]}"]
     if spec.links and spec.design.net != "none":
@@ -130,8 +133,7 @@ def description(spec: ModelSpec) -> str:
 
 def module_name(spec: ModelSpec) -> str:
     """Return the default name of the module of a URDF, without folder and suffix: `ur5_spel` for ur5.urdf."""
-    stem = spec.urdf.rpartition("/")[2].rpartition(".")[0]
-    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem) or "arm"
+    name = re.sub(r"[^0-9A-Za-z_]+", "_", Path(spec.urdf).stem) or "arm"
     return f"{'_' if name[0].isdigit() else ''}{name}_spel"
 
 
@@ -172,35 +174,35 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
-    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: a statement each, below comments about units."""
+    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: one assignment each, after comments on its units."""
     statements = []
+    terms: dict[str, Sequence[OutputSpec | ConstantSpec]] = {
+        "FUNCTIONS": spec.outputs,
+        "CONSTANTS": spec.constants,
+    }
     for name, rows in assembly.rows.items():
-        about = _term_descriptions(spec) if name in ("FUNCTIONS", "CONSTANTS") else {}
-        letter = name[0].lower()
         lines = [*(f"# {line}" for line in _COMMENTS[name]), f"{name} = ("]
-        for number, row in enumerate(rows, start=1):
-            end = f"  # {letter}{number}: {about[f'{letter}{number}']}" if about else ""
+        for k, row in enumerate(rows):
+            end = ""
+            if name in terms:
+                end = f"  # {name[0].lower()}{k + 1}: {_term_description(spec, terms[name][k])}"
             lines.append(f"    {filled('', row, 4, len(end))},{end}")
         statements.append("\n".join([*lines, f"){SKIP}"]))
     return statements
 
 
-def _term_descriptions(spec: ModelSpec) -> dict[str, str]:
-    """Return {name of a term of M: description}: entries of M that contain the term, and unit of the first entry."""
-    descriptions = {}
-    bases = [x.basis for x in spec.outputs] + [x.basis for x in spec.constants]
-    for name, basis in zip(parts.term_names(spec), bases, strict=True):
-        entries = [entry_name(row, column) for row, column, _ in basis]
-        row, column, _ = basis[0]
-        # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
-        slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
-        suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
-        descriptions[name] = f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
-    return descriptions
+def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
+    """Return the description of a term of M: the entries of M that contain it, and the unit of the first entry."""
+    entries = [entry_name(row, column) for row, column, _ in term.basis]
+    row, column, _ = term.basis[0]
+    # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
+    slides = [spec.joints[joint].joint_type for joint in (row, column)].count("prismatic")
+    suffix = f" and {len(entries) - 2} more" if len(entries) > 2 else ""
+    return f"{', '.join(entries[:2])}{suffix} [{('kg m^2', 'kg m', 'kg')[slides]}]"
 
 
 def _mass_entries(spec: ModelSpec) -> str:
-    """Return the source of the function ``mass_entries``, which computes M from functions and constants."""
+    """Return the source of the function ``mass_entries``, which computes M from its functions f_j(q) and constants."""
     names = parts.term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"
@@ -233,11 +235,11 @@ def _sum(sums: parts.Sums, names: list[str]) -> str:
     text = ""
     for factor, index in sums:
         term = names[index] if abs(factor) == 1 else f"{_number(abs(factor))} * {names[index]}"
-        if text:
-            text += f" - {term}" if factor < 0 else f" + {term}"
-        else:
-            text = f"-{term}" if factor < 0 else term
-    return text or "0"
+        text += f" - {term}" if factor < 0 else f" + {term}"
+    # The first term has no plus sign, and no blanks around its minus sign.
+    if text.startswith(" - "):
+        return f"-{text[3:]}"
+    return text.removeprefix(" + ") or "0"
 
 
 def _number(value: float) -> str:
@@ -255,7 +257,7 @@ def read_source(path: Path) -> str:
     try:
         return content.decode("utf-8").replace("\r\n", "\n")
     except ValueError as problem:
-        raise _no_module(problem, path) from None
+        raise _no_module(f" ({type(problem).__name__})", path) from None
 
 
 def read_spec(path: Path | str) -> ModelSpec:
@@ -268,21 +270,10 @@ def parse_spec(text: str, file: Path | None = None) -> ModelSpec:
 
     Raises ModuleError if the text has no specification. file: path of the module for the error.
     """
-    values = {}
-    try:
-        for node in ast.parse(text).body:
-            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
-                values[ast.unparse(node.targets[0])] = node.value.value
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
-        raise _no_module(problem, file) from None
-    if "FACTS" in values:
-        raise ModuleError(
-            "a module of an earlier version of spelgen", file=file, expected=_EXPECTED,
-            do="build it again with `spelgen build`, and train it again",
-        )  # fmt: skip
-    if "SPEC" not in values:
-        raise _no_module(None, file)
-    return spec_from_json(str(values["SPEC"]), file)
+    statement = _SPEC.search(text)
+    if statement is None:
+        raise _no_module("", file)
+    return spec_from_json(statement[1], file)
 
 
 def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
@@ -298,8 +289,7 @@ def require_unedited(text: str, file: Path | None = None) -> ModelSpec:
     )  # fmt: skip
 
 
-def _no_module(problem: Exception | None, file: Path | None) -> ModuleError:
-    reason = f" ({type(problem).__name__})" if problem is not None else ""
+def _no_module(reason: str, file: Path | None) -> ModuleError:
     got, do = f"no specification of spelgen in it{reason}", "build it again, or check the path"
     if file is not None and file.suffix in (".urdf", ".xacro", ".xml"):
         got, do = "a robot description", f"`spelgen build {file}` writes its module"

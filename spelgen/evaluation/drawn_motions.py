@@ -1,7 +1,7 @@
 """Selection of the motions that charts show.
 
-Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion of median error and
-the motion of largest error. A predictor is the trained model or a baseline.
+Charts show two predicted windows, two torque curves and two replayed logs: in each case the motion with the median
+error and the motion with the largest error of the trained model. Predictors are the trained model and the baselines.
 """
 
 import math
@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from scipy.integrate import cumulative_trapezoid
 
 from spelgen.baselines.predictor import States
 from spelgen.dynamics.bristles import bristles_along
@@ -53,8 +52,8 @@ class PredictedMotion(DrawnMotion):
         qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
         u: Commands of position servos, (T, n) [rad, m]; None for a window.
-        error: For a window: relative error at the last sample of the window, the RMS over the relative errors of q and
-            qd of all joints. A relative error is the error divided by the RMS change of q or qd over the horizon. For a
+        error: For a window: RMS over joints of the relative errors of q and qd at the last sample [1]. A relative error
+            is an error divided by the RMS change of its quantity since the first sample, over all windows. For a
             replayed log: RMS position error [rad, m].
     """
 
@@ -75,15 +74,12 @@ class TorqueTrace(DrawnMotion):
         predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
         parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the
             model.
-        energy: {name of a term: energy since the first sample, (T,) [J]}, for the work of the drives, the stored
-            energy, the work of friction, and the work of the torque residual.
     """
 
     qd: Curve
     measured: Curve
     predicted: dict[str, Curve]
     parts: dict[str, Curve]
-    energy: dict[str, Curve]
 
 
 Drawn = TypeVar("Drawn", bound=DrawnMotion)
@@ -113,7 +109,7 @@ def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
     return replace(motion, **curves)
 
 
-def predicted_motion(trajectory: str, windows: Windows, states: States, k: int = 0) -> PredictedMotion:
+def predicted_motion(trajectory: str, windows: Windows, states: States, k: int) -> PredictedMotion:
     """Return the measured and the predicted motion of window k, for a chart.
 
     trajectory: name of the log. windows: measured motion of W windows. states: predicted q and qd of the windows after
@@ -165,7 +161,9 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
     """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
 
-    The mean acceleration is the change of qd divided by the duration of the interval.
+    At a low sample rate only the mean acceleration can be computed: the change of qd divided by the duration of the
+    interval. logs: the evaluated logs, for their filter (`used`) and the break-away displacements of bristles
+    (`reach`).
     """
     steps = cut_windows([piece], 2, measured=logs.used.filtered)
     qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
@@ -175,7 +173,7 @@ def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques and energies along `samples` that charts show: all predictors, and the terms of the model.
+    """Return the torques along `samples` that charts show: of all predictors, and the terms of the model.
 
     dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`.
     """
@@ -197,29 +195,16 @@ def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples
     predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
     # Logs contain motor torques. They are converted to joint torques, because the terms of the model are joint torques.
     measured = _at_joints(inputs, samples.tau)
-    # The samples are evenly spaced, so the times are computed from the sample rate.
-    t = np.arange(len(samples.q)) / samples.rate
-    # The inertia, Coriolis and gravity torques change the stored energy. The work of friction is computed from the
-    # rest of the model's torque, so it includes the work of the constant torque offset.
-    stored = curves["inertia"] + curves["Coriolis"] + curves["gravity"]
-    works = {
-        "work of the drives": measured,
-        "stored": stored,
-        "friction": predicted[MODEL] - stored,
-        "not explained": measured - predicted[MODEL],
-    }
-    power = {name: (torque * samples.qd).sum(axis=-1) for name, torque in works.items()}
-    energy = {name: cumulative_trapezoid(values, t, initial=0) for name, values in power.items()}
     return TorqueTrace(
         trajectory=samples.name,
         error=mean_nmse(predicted[MODEL] - measured, measured),
-        t=t,
+        # The samples are evenly spaced, so the times are computed from the sample rate.
+        t=np.arange(len(samples.q)) / samples.rate,
         q=samples.q,
         qd=samples.qd,
         measured=measured,
         predicted=predicted,
         parts=curves,
-        energy=energy,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.predictor import Predictor, Solver, of_dynamics
+from spelgen.baselines.predictor import of_dynamics
 from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import RigidDynamics
@@ -104,7 +104,7 @@ def evaluate(
         for trajectory in logs:
             require_commands(trajectory)
         followers = command_followers(tested.linear_servos, notes)
-        errors, missed = replays(tested.model, logs, followers, notes)
+        errors, missed = replays(tested.model, logs, followers)
         results = replace(_results(tested, logs, notes, replay_traces(missed)), replays=errors)
     else:
         require_torques(logs)
@@ -142,19 +142,20 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of an arm under torques: inverse dynamics, and motion predicted under the logged torques.
+    """Return the errors of model and baselines for torque logs: of inverse dynamics, and of motion under these torques.
 
     Args:
         tested: the model with the data of its fit.
         logs: test logs with torques.
-        notes: notes about the logs and the evaluation, to which notes are appended.
+        notes: list of remarks about the logs and the evaluation; further remarks are appended.
         used: preprocessing of the logs.
         baselines: {name: dynamics} of further baselines.
         ahead: prediction horizons, in samples and in seconds.
         truth: true arm of simulated logs, or the path of its URDF; None if unknown.
         progress: function called before each horizon, see `evaluate`.
     """
-    # All errors are divided by the motion or by the variation of the torque, so at rest they would only show noise.
+    # All errors are divided by the motion or by the variation of the torque. Logs at rest, whose errors would only show
+    # noise, are therefore rejected.
     if max(float(np.ptp(trajectory.q, axis=0).max()) for trajectory in logs) < TUNING.smallest_motion:
         got = f"no motion: all joints stay within {TUNING.smallest_motion:g} rad or m"
         raise LogError(got, expected="test logs in which joints move")
@@ -164,16 +165,15 @@ def _evaluate_torques(
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    # The windows for the choice of the integrator steps are as long as the windows of the training. In longer windows
-    # the motion diverges because of errors of the dynamics, and integration errors cannot be distinguished.
-    probe = tests.windows(tested.window - 1, TUNING.probed_model_windows)
+    # The windows for the choice of the integrator steps are short. In long windows the motion diverges because of
+    # errors of the dynamics, and integration errors cannot be distinguished.
+    probe = tests.windows(TUNING.model_window - 1, TUNING.probed_model_windows)
     # Residual terms that the fit did not select are zero; they are removed to save time.
     model = without_idle_residuals(tested.model)
     # The number of integrator steps is chosen per predictor, because stiff friction needs more steps than smooth
     # dynamics. Integration errors are then negligible in the error of each predictor.
-    solver = Solver(model, probe)
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
-    predictors = [Predictor(MODEL, solver, model), *torque_predictors(arm)]
+    predictors = [of_dynamics(MODEL, model, probe), *torque_predictors(arm)]
     predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
     tip = _tip(tested, notes) if lengths else None
     horizons: list[Horizon] = []
@@ -202,9 +202,8 @@ def _evaluate_torques(
     if truth is not None:
         masses = mass_errors(all_dynamics, truth, tested.joints, torch.from_numpy(joined_column(logs, "q")))
     return replace(
-        _results(tested, logs, notes, motion_traces(all_dynamics, tests, longest, tip)),
+        _results(tested, logs, notes, motion_traces(all_dynamics, tests, longest)),
         cutoff=used.cutoff or None,
-        substeps=solver.substeps,
         horizons=tuple(horizons),
         torque=torque,
         torque_steps=steps,

@@ -68,7 +68,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     # there, and with the torque of the interval that ends there.
     inputs = torch.stack([torch.cat([tau, tau[:, -1:]], dim=1), torch.cat([tau[:, :1], tau], dim=1)])
     _, (at_start, at_end) = dynamics.port_hamiltonian_rhs(pose, p, inputs, cache, *known_past(dynamics, z))
-    # `residual` is d, the residual of the momentum balance in each interval, (W, past, n).
+    # `residual` is d of the docstring, the residual of the momentum balance in each of the `past` intervals before the
+    # prediction, (W, past, n), in the unit of the result.
     residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2
     gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
     r = torch.zeros_like(residual[:, 0])
@@ -84,7 +85,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps, the steps in which a momentum observer runs.
 
-    The friction state z is not advanced: it remains the state at the first sample of the given windows.
+    The friction state z remains the state at the first sample of the given windows, since its change depends on the
+    dynamics: `observe` replaces z by the state after the first `past` steps.
     """
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
@@ -121,9 +123,9 @@ class StateErrors:
 class Horizon:
     """Errors of all predictors at one prediction horizon.
 
-    steps: length [samples]. seconds: mean length [s]. windows: number of predictions. errors: {key: errors}. The key is
-    the name of the predictor for open-loop predictions, and `observed(name)` for predictions with the disturbance that
-    a momentum observer estimates.
+    steps: length [samples]. seconds: mean length [s], since sample intervals may vary. windows: number of predictions.
+    errors: {key: RMS errors at the end of the horizon}. The key is the name of the predictor for open-loop predictions,
+    and `observed(name)` for predictions with the disturbance that a momentum observer estimates.
     """
 
     name: str
@@ -165,7 +167,7 @@ class EvaluatedLogs:
     def stride(self, span: int, window_count: int) -> int:
         """Return the number of samples between the starts of consecutive windows of `span` steps.
 
-        With this stride, all segments without gaps together contain about `window_count` windows.
+        With this stride, the segments of the logs (cut at gaps) together contain about `window_count` windows.
         """
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 
@@ -255,7 +257,8 @@ def predict(
             continue
         with torch.no_grad():
             started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
-        # The rollouts without and with the disturbance form one batch: two batches would need twice as many operations.
+        # The rollouts without and with the disturbance form one batch: two batches would need twice the number of calls
+        # of torch.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
         q, qd = predictor.solver(joined([started, started]), disturbances)
         count = len(started)

@@ -1,4 +1,4 @@
-"""Conversion of arrays and numbers to JSON: rounded to five digits, None if not finite."""
+"""Conversion of arrays and numbers to JSON: rounded to five significant digits, None if not finite."""
 
 import math
 from typing import Annotated
@@ -9,7 +9,7 @@ from pydantic import PlainSerializer, PlainValidator, TypeAdapter
 
 
 def number(value: float) -> float | None:
-    """Return a number for JSON, rounded to five digits; None if it is not finite."""
+    """Return a number for JSON, rounded to five significant digits; None if it is not finite."""
     # JSON has no infinity and no NaN. Five digits exceed the accuracy of every figure, and keep pages small.
     if math.isfinite(value):
         return float(f"{value:.5g}")
@@ -17,7 +17,7 @@ def number(value: float) -> float | None:
 
 
 def listed(values: np.ndarray) -> object:
-    """Return an array of any shape as nested lists of numbers for JSON: rounded to five digits, None if not finite."""
+    """Return an array of any shape as nested lists for JSON, with five significant digits, and None if not finite."""
     if values.ndim == 0:
         return number(values.item())
     return list(map(listed, values))

@@ -10,7 +10,6 @@ from spelgen.baselines.predictor import CommandFollower
 from spelgen.dynamics.parameters import without_idle_residuals
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.emission.assemble import ArmModel
-from spelgen.errors import Diagnostic
 from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
 from spelgen.logs.filtering import velocities
@@ -48,28 +47,26 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 class ServoModel:
     """The trained model as a predictor of positions under position commands (`CommandFollower`), like the baselines."""
 
-    about = "the model"
-
     def __init__(self, model: ArmModel) -> None:
         self._model = without_idle_residuals(model)
 
-    def positions(self, parts: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions of each part, (K, n) [rad, m] for a part of K + 1 samples.
+    def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
+        """Return the predicted positions of each segment of a log, (K, n) [rad, m] for a segment of K + 1 samples.
 
-        A part is a segment of a log, whose commands the model replays from the state at the first sample. The first
-        sample is not predicted. Parts are padded to one length for the rollout; the padding is removed from the result.
+        The model replays the commands of a segment from the state at its first sample, which is not predicted. Segments
+        are padded to one length for the rollout; the padding is removed from the result.
 
         Args:
-            parts: (log, slice of its samples) of each part.
-            q: (parts, n) initial positions [rad, m].
-            qd: (parts, n) initial velocities [rad/s, m/s].
+            segments: (log, slice of its samples) of each segment.
+            q: (segments, n) initial positions [rad, m].
+            qd: (segments, n) initial velocities [rad/s, m/s].
         """
-        # All parts form one batch, because a rollout of many parts takes about as long as a rollout of one part. A
-        # batch has one number of integrator steps per interval: the number for the part that needs most steps.
-        steps = max(steps_between(log) for log, _ in parts)
-        lengths = [rows.stop - rows.start - 1 for _, rows in parts]
+        # All segments form one batch, because a rollout of many takes about as long as a rollout of one. A batch has
+        # one number of integrator steps per interval: the number for the segment that needs most steps.
+        steps = max(steps_between(log) for log, _ in segments)
+        lengths = [rows.stop - rows.start - 1 for _, rows in segments]
         commands, intervals = [], []
-        for (log, rows), length in zip(parts, lengths, strict=True):
+        for (log, rows), length in zip(segments, lengths, strict=True):
             padding = (0, max(lengths) - length)
             delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
@@ -83,12 +80,11 @@ def replays(
     model: ArmModel,
     logs: Sequence[Trajectory],
     baselines: Mapping[str, CommandFollower],
-    notes: list[Diagnostic],
 ) -> tuple[tuple[Replay, ...], list[PositionErrors]]:
     """Replay the commands of whole logs, and of consecutive windows of one second, with the model and the baselines.
 
     Return two results: the errors of all predictors on whole logs and on windows, and the position errors of the model
-    along each gap-free segment of the logs. A description of each baseline is appended to `notes`.
+    along each gap-free segment of the logs.
     """
     pieces = [piece for log in logs for piece in split_at_gaps(log, shortest=3)]
     windows = []
@@ -98,8 +94,6 @@ def replays(
         for start in range(0, len(piece) - length + 1, length - 1):
             windows.append((piece, slice(start, start + length)))
             first_qd.append(qd[start])
-    for name, baseline in baselines.items():
-        notes.append(Diagnostic("info", "baseline", "logs", None, f"{name}: {baseline.about}"))
     # The model is treated as one of the predictors, so that the same code measures all errors.
     predictors = {MODEL: ServoModel(model), **baselines}
     # Whole logs are replayed from zero velocity, as they begin at rest. Windows start with the velocity of the log.
@@ -115,7 +109,7 @@ def replays(
 
 
 def _replay(
-    name: str, predictors: Mapping[str, CommandFollower], parts: Sequence[LogRows], qd: np.ndarray
+    name: str, predictors: Mapping[str, CommandFollower], segments: Sequence[LogRows], qd: np.ndarray
 ) -> tuple[Replay, list[np.ndarray]]:
     """Return the errors of all predictors, and the position errors of the model, on replayed segments of logs.
 
@@ -125,15 +119,15 @@ def _replay(
     Args:
         name: description of the segments, for example "whole log".
         predictors: {name: predictor of positions}, the model and the baselines.
-        parts: (log, slice of its samples) of each segment.
-        qd: (parts, n) initial velocities [rad/s, m/s].
+        segments: (log, slice of its samples) of each segment.
+        qd: (segments, n) initial velocities [rad/s, m/s].
     """
-    q = np.stack([log.q[rows.start] for log, rows in parts])
-    measured = [log.q[rows][1:] for log, rows in parts]
+    q = np.stack([log.q[rows.start] for log, rows in segments])
+    measured = [log.q[rows][1:] for log, rows in segments]
     errors = {}
     for predictor, follower in predictors.items():
-        errors[predictor] = list(map(np.subtract, follower.positions(parts, q, qd), measured))
-    names = [log.name for log, _ in parts]
+        errors[predictor] = list(map(np.subtract, follower.positions(segments, q, qd), measured))
+    names = [log.name for log, _ in segments]
     summaries = {predictor: _summary(names, missed) for predictor, missed in errors.items()}
     return Replay(name, summaries), errors[MODEL]
 

@@ -48,7 +48,6 @@ class Results:
         diagnostics: Warnings and notes about the logs and the evaluation.
         traces: Curves from which the errors are computed; predictions are over the longest horizon.
         cutoff: Cutoff frequency of the filter of the test logs [Hz]; None without a filter.
-        substeps: Integrator steps of the model per sample interval.
         horizons: Errors of predicted motion, one entry per horizon.
         torque: {predictor: torque errors}; empty if the sample rate is too low for accelerations.
         torque_steps: {joint: quantisation step of its torque [Nm, N]}, see `coarse_torques`.
@@ -65,7 +64,6 @@ class Results:
     diagnostics: tuple[Diagnostic, ...]
     traces: Traces
     cutoff: float | None = None
-    substeps: int = 1
     horizons: tuple[Horizon, ...] = ()
     torque: dict[str, TorqueErrors] = field(default_factory=dict)
     torque_steps: dict[str, float] = field(default_factory=dict)

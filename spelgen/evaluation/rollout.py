@@ -58,9 +58,9 @@ def rollout(
 
 
 def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest eigenvalue of M divided by the mean eigenvalue, at random q in [low, high] (n,) [rad, m].
+    """Return the smallest eigenvalue of M over random positions, divided by the mean eigenvalue over them.
 
-    The result is positive if M is positive definite at all of these positions.
+    The positions are in [low, high] (n,) [rad, m]. The result is positive if M is positive definite at all positions.
     """
     # The seed of the random positions is fixed, so that the result is reproducible.
     generator = torch.Generator().manual_seed(0)
@@ -90,10 +90,10 @@ def energy_rise(model: ArmModel, windows: Windows) -> float | None:
 
 
 def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:
-    """Return M (T, n, n) [kg m^2, kg m, kg] of a URDF and its settings by Pinocchio, armature included.
+    """Return M (T, n, n) [kg m^2, kg m, kg] by Pinocchio, from a URDF and the settings file of the same name.
 
     Args:
-        robot: The true arm, or the path of its URDF.
+        robot: The true arm, or the path of its URDF. Its settings contain the armatures, which are included in M.
         q: Positions (T, n) [rad, m].
         joints: Names of the n joints in the order of q; None: the joints in the settings, else the longest chain.
     """

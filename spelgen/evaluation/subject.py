@@ -14,15 +14,13 @@ from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.evaluation.results import Results
-from spelgen.evaluation.tuning import TUNING
-from spelgen.evaluation.verdict import verdict
+from spelgen.evaluation.verdict import Limits, verdict
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
-from spelgen.settings.fits import OnWindows
 from spelgen.settings.settings import load_mapping
 from spelgen.urdf.read import read_urdf
 
@@ -37,8 +35,6 @@ class Subject:
         reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
         urdf: URDF of the robot; None if unknown.
         preprocessing: Filter and delay that the fit used.
-        window: Number of samples of the training windows, or `TUNING.model_window` if the model was not fitted to
-            windows.
         trained_on: Names of the training and validation logs.
         baselines: Content of least_squares.json: baselines that were fitted to the training logs.
         fitted_urdf: URDF of the fit, whose kinematics the baselines use.
@@ -61,7 +57,7 @@ class Subject:
         # If the model has no bristles, default break-away displacements are used: the baseline of least squares may
         # have bristles.
         self.reach = reach if reach.elements else reach_of(self.model.joint_types)
-        self.urdf, self.window = urdf_path(arm), TUNING.model_window
+        self.urdf = urdf_path(arm)
         self.fitted_urdf: Path | None = None
         self.preprocessing: Preprocessing | None = None
         self.trained_on: set[str] = set()
@@ -70,8 +66,6 @@ class Subject:
         if isinstance(fit, Fit):
             self.urdf, self.fitted_urdf = self.urdf or fit.urdf, fit.urdf
             self.preprocessing, self.baselines = fit.preprocessing, fit.baselines
-            if isinstance(fit.config, OnWindows):
-                self.window = fit.config.window
             self.trained_on = {*fit.record.training, *fit.record.validation}
             self.linear_servos = fit.record.servo and fit.record.servo["linear"]
 
@@ -90,15 +84,12 @@ class Subject:
 
         The assessment uses the range of the training logs and the joint limits of the specification.
         """
-        limits, independent = [], []
+        limits: Limits = ()
+        independent: list[str] = []
         if self.spec is not None:
+            limits = [joint.limits for joint in self.spec.joints]
             depends = {*self.spec.potential, *(k for entry in self.spec.entries for k in entry[3])}
-            for k, joint in enumerate(self.spec.joints):
-                # A joint with only one limit is treated as a joint without limits.
-                bound = None if joint.lower is None or joint.upper is None else (joint.lower, joint.upper)
-                limits.append(bound)
-                if k not in depends:
-                    independent.append(joint.name)
+            independent = [name for k, name in enumerate(self.spec.joint_names) if k not in depends]
         return replace(results, assessment=verdict(results, self.baselines, limits, independent))
 
 

@@ -1,9 +1,7 @@
-"""Tables and figures of an evaluation, with a column per predictor: for the terminal, notebooks, files and pages."""
+"""Tables of an evaluation, with a column per predictor: for the terminal, notebooks and pages."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
@@ -23,7 +21,6 @@ OBSERVER = (
 Numbers = Mapping[str, float | None]
 """Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
-CSV_HEAD = ("table", "row", "predictor", "value")
 LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
 """Names of the figures that `spelgen evaluate --limit` accepts."""
 
@@ -89,7 +86,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
 
 
 def result_tables(results: Results) -> list[Table]:
-    """Return the tables of an evaluation: replays, errors per horizon and per joint, torques."""
+    """Return the tables of an evaluation: errors of replayed logs, of predictions per horizon, of torques, and of M."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
         tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))
@@ -112,30 +109,17 @@ def joined(runs: Mapping[str, Results]) -> list[Table]:
 
     Tables and rows that not all runs have are omitted. runs: {name of a run: its results}.
     """
-    tables: dict[str, dict[str, dict[str, float | None]]] = {}
+    values: dict[tuple[str, str], dict[str, float | None]] = {}
     for run, results in runs.items():
         for one_table in result_tables(results):
-            rows = tables.setdefault(one_table.title, {})
             for row in one_table.rows:
-                rows.setdefault(row.label, {})[run] = row.values[MODEL]
-    common = []
-    for title, rows in tables.items():
+                values.setdefault((one_table.title, row.label), {})[run] = row.values[MODEL]
+    tables: dict[str, dict[str, Numbers]] = {}
+    for (title, label), numbers in values.items():
         # Rows that are absent in one run are omitted, since they cannot be compared.
-        of_all = {label: values for label, values in rows.items() if len(values) == len(runs)}
-        if of_all:
-            common.append(table(title, of_all))
-    return common
-
-
-def csv_text(results: Results) -> str:
-    """Return the numbers of all tables as CSV, one line per number; an unknown number is an empty cell."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(CSV_HEAD)
-    for one_table in result_tables(results):
-        for row in one_table.rows:
-            writer.writerows((one_table.title, row.label, *value) for value in row.values.items())
-    return file.getvalue()
+        if len(numbers) == len(runs):
+            tables.setdefault(title, {})[label] = numbers
+    return [table(title, rows) for title, rows in tables.items()]
 
 
 def summary(results: Results) -> Listing | None:
@@ -248,46 +232,15 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One of the few figures that summarise an evaluation.
+def limit_figures(results: Results) -> dict[str, float | None]:
+    """Return {name in `LIMITS`: figure of the model}; None for a figure that is not known.
 
-    unit: unit of the value. The value of unit "variance" is a fraction of the variance of the torque; the value of unit
-    "motion" is a fraction of the RMS change of q and qd over the horizon.
+    The relative error of a rollout is the error at the longest horizon, which is the most difficult one.
     """
-
-    name: str
-    label: str
-    unit: str
-    value: float
-
-    def text(self) -> str:
-        """Return the value of the figure as text, with its unit."""
-        if self.unit in ("variance", "motion"):
-            return share(self.value, self.unit)
-        return f"{number(self.value)} {self.unit}"
-
-
-def figures(results: Results) -> list[Figure]:
-    """Return the known figures of the model: nMSE of torques, errors of the longest rollout and of replays."""
-    candidates = []
+    values: dict[str, float | None] = dict.fromkeys(LIMITS)
     if MODEL in results.torque:
         torque = results.torque[MODEL]
-        candidates.append(("torque.nmse", "nMSE of torques", "variance", torque.mean_nmse))
-        candidates.append(("joint.nmse", "nMSE of the worst joint's torque", "variance", torque.worst_nmse))
-    # The longest horizon is reported: it is the most difficult one, and the relevant one for simulation.
+        values |= {"torque.nmse": torque.mean_nmse, "joint.nmse": torque.worst_nmse}
     for horizon in results.horizons[-1:]:
-        errors, horizon_name = horizon.errors[MODEL], f"after {horizon.name}"
-        candidates.append(
-            ("rollout.rms", f"rollout error {horizon_name}", "motion", errors.mean_relative_rms)
-        )
-        candidates.append(("tip.mm", f"tip error {horizon_name}", "mm", errors.tip_mm))
-    for replay in results.replays:
-        label = f"position error, commands replayed, {replay.name}"
-        mean = 1000 * replay.errors[MODEL].mean
-        candidates.append(("replay", label, thousandths(results.joint_types), mean))
-    named_figures = []
-    for name, label, unit, value in candidates:
-        if value is not None:
-            named_figures.append(Figure(name, label, unit, value))
-    return named_figures
+        values["rollout.rms"] = horizon.errors[MODEL].mean_relative_rms
+    return values

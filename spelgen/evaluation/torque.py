@@ -76,10 +76,11 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the past of the motion on which friction depends: bristle state (T, n, K) and direction (T, n) in [-1, 1].
+    """Return the history of motion on which friction depends: the last arguments of methods such as `inverse_dynamics`.
 
-    The methods of `dynamics` that compute friction take these values as their last arguments. A value that they do not
-    take is omitted (see `known_past`).
+    The values are the bristle deflections (T, n, K) [rad, m] and the direction (T, n), a smooth sign of the velocity
+    that is filtered like the torques. A value that the methods of `dynamics` do not accept is omitted (see
+    `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)

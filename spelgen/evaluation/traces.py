@@ -1,7 +1,7 @@
-"""The curves from which the figures of an evaluation are computed: for pages, and `traces` in evaluation.json.
+"""Curves of an evaluation (errors, motions, torques, M, friction) for charts of pages, and `traces` in evaluation.json.
 
 All curves are arrays in SI units [rad, m, s, Nm, N, kg m^2, J], with NaN for unknown numbers. In JSON, numbers have
-five digits.
+five significant digits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,13 +23,14 @@ from spelgen.evaluation.drawn_motions import (
     torque_trace,
     typical_and_worst,
 )
-from spelgen.evaluation.horizons import EvaluatedLogs, Predictions, TipPosition
+from spelgen.evaluation.horizons import EvaluatedLogs, Predictions
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import PositionErrors
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.labels import MODEL, is_drawn
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
+from spelgen.logs.windows import Windows
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,20 +44,18 @@ class Quantiles:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Growth of the prediction error with the time since the start of a prediction.
+    """Growth of the prediction error (an RMS over q and qd of all joints) with the time since the start.
 
     Attributes:
         seconds: Times since the start of a prediction, (T,) [s].
         windows: Number of predictions.
-        relative: {predictor: quantiles of the relative error}: the errors of q and qd divided by the RMS change of q
-            and qd since the start.
-        tip_mm: {predictor: quantiles of the position error of the tip [mm]}; empty without a URDF.
+        relative: {predictor: 10, 50 and 90 % quantiles of the relative error over the windows}. The errors of q and qd
+            of each joint are divided by the RMS change of this q or qd since the start, over all windows.
     """
 
     seconds: Curve
     windows: int
     relative: dict[str, Quantiles]
-    tip_mm: dict[str, Quantiles]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +67,7 @@ class MassCurves:
 
 @dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M along a trajectory at times t (T,) [s]. by: {predictor: entries of M along the trajectory}."""
+    """M along a trajectory at times t (T,) [s]. by: {predictor: its M, as `MassCurves`}."""
 
     trajectory: str
     t: Curve
@@ -115,7 +114,6 @@ def motion_traces(
     dynamics: Mapping[str, RigidDynamics],
     logs: EvaluatedLogs,
     predictions: Predictions | None,
-    tip: TipPosition | None,
 ) -> Traces:
     """Return all curves of the evaluation of an arm under torques.
 
@@ -123,7 +121,6 @@ def motion_traces(
         dynamics: {name of a predictor (the model or a baseline): dynamics}.
         logs: test logs.
         predictions: predictions over the longest horizon; None if no horizon was evaluated.
-        tip: position of the tip as a function of q; None if the tip is unknown.
     """
     growth = None
     predicted: tuple[PredictedMotion, ...] = ()
@@ -131,7 +128,7 @@ def motion_traces(
     # predicted motion are omitted.
     if predictions is not None and predictions.windows.q.diff(dim=1).abs().max() >= AT_REST:
         errors = _relative_errors(predictions, logs.joint_types)
-        growth = _growth(predictions, errors, tip)
+        growth = _growth(predictions.windows, errors)
         predicted = _predicted_motions(predictions, errors[MODEL][:, -1])
     torques = typical_and_worst([torque_trace(dynamics, motion) for motion in torque_motions(logs)])
     drawn = (*torques, *predicted)
@@ -170,20 +167,12 @@ def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> di
     return errors
 
 
-def _growth(predictions: Predictions, errors: Mapping[str, Tensor], tip: TipPosition | None) -> Growth:
-    windows = predictions.windows
+def _growth(windows: Windows, errors: Mapping[str, Tensor]) -> Growth:
     seconds = windows.dt.cumsum(dim=1).mean(dim=0).numpy()
     # The times of the curve are spaced geometrically, because errors grow by orders of magnitude.
     times = np.unique(np.geomspace(1, len(seconds), TUNING.curve_times).round().astype(int)) - 1
-    relative, tips = {}, {}
-    for name, (q, _) in predictions.states.items():
-        if is_drawn(name):
-            relative[name] = _quantiles(errors[name][:, times])
-            # The tip is unknown if the model was passed to `evaluate` without a URDF.
-            if tip is not None:
-                distance = tip(q[:, times]) - tip(windows.q[:, 1 + times])
-                tips[name] = _quantiles(1000 * distance.norm(dim=-1))
-    return Growth(seconds[times], len(windows), relative, tips)
+    relative = {name: _quantiles(error[:, times]) for name, error in errors.items() if is_drawn(name)}
+    return Growth(seconds[times], len(windows), relative)
 
 
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
@@ -201,9 +190,8 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 def _quantiles(values: Tensor) -> Quantiles:
     """Return the 10, 50 and 90 % quantiles over W windows, (T,) each, of errors (W, T) at T times; NaN is infinity."""
-    ordered = values.nan_to_num(nan=torch.inf).sort(dim=0).values.numpy()
-    last = len(ordered) - 1
-    return Quantiles(*(ordered[round(quantile * last)] for quantile in (0.1, 0.5, 0.9)))
+    errors = values.nan_to_num(nan=torch.inf).numpy()
+    return Quantiles(*np.quantile(errors, (0.1, 0.5, 0.9), axis=0, method="nearest"))
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:

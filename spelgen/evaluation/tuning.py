@@ -10,15 +10,16 @@ class EvaluationTuning:
     # [s] Time that the momentum observer runs before a prediction; 0.2 and 0.3 s are no better on the UR10e of
     # `benchmarks/arms.py`.
     observed_past: float = 0.1
-    # [s] Time constant 1 / K of the momentum observer with the gain K; 0.02 to 0.1 s differ by 3 % on the UR10e of
-    # `benchmarks/arms.py`.
+    # [s] Time constant 1 / K of the momentum observer with the gain K; prediction errors differ by 3 % for 0.02 to 0.1
+    # s on the UR10e of `benchmarks/arms.py`.
     observer_time_constant: float = 0.05
     # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000
     # [1] Largest number of predicted steps per predictor and horizon. A horizon of k steps has this number / k windows,
     # but at least `fewest_windows`.
     most_predicted_steps: int = 10_000
-    # [1] Number of windows of the longest horizons; there are fewer only if the logs are too short.
+    # [1] Smallest number of windows of a horizon, reached at long horizons; there are fewer only if the logs are too
+    # short.
     fewest_windows: int = 100
     # [1] Number of test windows from which the number of integration steps of a model is chosen.
     probed_model_windows: int = 64
@@ -55,8 +56,8 @@ class EvaluationTuning:
     started_states: int = 8
     # [1] Largest number of words of the first sentence of an assessment.
     headline: int = 20
-    # [samples] Length of the windows from which the number of integration steps is chosen, for a model that was not
-    # fitted to windows.
+    # [samples] Length of the windows from which the number of integration steps is chosen: the default length of the
+    # windows of a fit.
     model_window: int = 5
     # [s] Length of the windows that are replayed from a measured state.
     replay_window: float = 1.0

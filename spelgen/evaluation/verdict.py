@@ -50,11 +50,12 @@ def verdict(
 ) -> Verdict:
     """Return the assessment of an evaluation.
 
-    identified: content of least_squares.json, for the range of motion of the training logs. limits: position limits of
-    the joints. independent: names of joints on whose position the dynamics do not depend, such as a vertical first
-    axis.
+    identified: content of least_squares.json, with the range of motion of the training logs, from which recommendations
+    of further recordings are computed. limits: position limits of the joints. independent: names of joints on whose
+    position the dynamics do not depend, such as a vertical first axis.
     """
-    # Each assessment function adds uses, and the texts with the errors from which they were decided.
+    # Each assessment function adds the uses for which the model is or is not sufficient, and texts with the errors that
+    # decide this.
     uses = _Uses()
     _assess_torques(results, uses)
     _assess_motion(results, uses)
@@ -67,7 +68,7 @@ def verdict(
     elastic = next((x for x in results.diagnostics if x.code == ELASTIC), None)
     if elastic is not None:
         # A rigid model is wrong near the resonance of an elastic joint, even if its errors on these logs are small.
-        # Therefore the sentence begins with this limit, and not with "Good enough".
+        # Therefore the verdict begins with this limitation, and not with "Good enough".
         band = f"; below it, usable for {listed(uses.good)}" if uses.good else ""
         sentence = f"Not valid near the resonance of an elastic joint{band}"
     if any(diagnostic.code == SEEN for diagnostic in results.diagnostics):
@@ -149,16 +150,19 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
     # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
-        is_best = error == min(errors.mean for errors in replay.errors.values())
-        (uses.good if is_best else uses.bad).append("simulation from commands")
+        if error == min(errors.mean for errors in replay.errors.values()):
+            uses.good.append("simulation from commands")
+        else:
+            uses.bad.append("simulation from commands")
         distance = f"{1000 * error:.3g} {thousandths(results.joint_types)}"
         uses.proofs.append(f"misses {distance} of the positions that follow commands, {replay.name}")
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the mean relative error of a prediction (RMS error / RMS change over the horizon); infinity if unknown."""
-    error = None if errors is None else errors.mean_relative_rms
-    return math.inf if error is None else error
+    """Return the relative error (RMS error / RMS change), averaged over q and qd of all joints; infinity if unknown."""
+    if errors is None or errors.mean_relative_rms is None:
+        return math.inf
+    return errors.mean_relative_rms
 
 
 def _better_baselines(results: Results) -> list[str]:
@@ -188,7 +192,7 @@ def _better_baselines(results: Results) -> list[str]:
 
 
 def _worst_joint(results: Results) -> tuple[str, str, str]:
-    """Return the name of the worst joint, words for its worst speed, and a sentence about its error.
+    """Return the name of the worst joint, words for its worst speed, and a sentence about its motion error.
 
     The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
     joint of the largest motion error. The words are " near standstill" or " at speed" if the torque error of the joint
@@ -202,9 +206,7 @@ def _worst_joint(results: Results) -> tuple[str, str, str]:
         return moving, "", f"At {moving} the error after {results.horizons[-1].name} is {amount}."
     if not joint:
         return "", "", ""
-    speed = _slow_or_fast(results, results.joints.index(joint))
-    amount = share(math.sqrt(error), "the torque's standard deviation")
-    return joint, speed, f"At {joint} the torque residual is {amount}."
+    return joint, _slow_or_fast(results, results.joints.index(joint)), ""
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:

@@ -11,14 +11,12 @@ from math import ceil
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
 
-from spelgen.arm.arm import Chain, lump_links
-from spelgen.arm.chain import choose_chain
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_arm import kinematic_model
+from spelgen.dynamics.tip_frame import link_poses
 from spelgen.excitation.bounds import MotionBounds, Surroundings
 from spelgen.excitation.trajectory import Motion
 from spelgen.excitation.tuning import TUNING
@@ -58,7 +56,11 @@ class Collisions:
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
-        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read."""
+        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
+
+        bounds: position limits, for the random positions at which ``ignored`` is determined, and for the travel of
+        prismatic joints, by which displacements of the arm are bounded.
+        """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
         self.unread = shapes.unread_text
@@ -66,21 +68,21 @@ class Collisions:
             raise LookupError(f"no collision shape can be read: {self.unread}")
         if not shapes.shapes:
             raise LookupError("the URDF has no collision geometry")
-        frames = lump_links(robot, choose_chain(robot, chain.joint_names, None), arm.angle_tolerance).frames
         self._model, self._constraint = kinematic_model(chain), body_constraint(chain)
         self._geometry = pin.GeometryModel()
+        self._names: list[str] = []  # The name of each object.
         self._bodies: list[int] = []  # The index of the body that carries each object; -1 is the root link.
         # For each body: the largest distance of a point of its shapes from the origin of its frame, (bodies,) [m].
         self._extents = np.zeros(len(chain.bodies))
+        poses = link_poses(arm, arm.angle_tolerance)
         for shape in shapes.shapes:
-            frame = frames[shape.link]
-            pose = _pose(frame.rotation, frame.position) @ shape.pose
-            self._add(shape.link, frame.body, pose, _geometry(shape))
+            body, pose = poses[shape.link]
+            self._add(shape.link, body, pose @ shape.pose, _geometry(shape))
         links = len(self._bodies)
         if surroundings.floor is not None:
             self._add(FLOOR, -1, np.eye(4), coal.Halfspace(np.array([0.0, 0.0, 1.0]), surroundings.floor))
         for name, box in surroundings.boxes.items():
-            pose = _pose(rotation_from_rpy(box.rpy), box.xyz)
+            pose = pin.SE3(pin.rpy.rpyToMatrix(*box.rpy), np.array(box.xyz)).homogeneous
             self._add(f"box {name!r}", -1, pose, coal.Box(*box.size))
         self._surroundings = " and surroundings" if len(self._bodies) > links else ""
         for first, second in self._pairs(chain, links):
@@ -135,12 +137,15 @@ class Collisions:
         return None
 
     def contact_at(self, q: np.ndarray, time: float = 0.0) -> Contact | None:
-        """Return the nearest pair at q (n,) [rad, m] if it is closer than the clearance, otherwise None."""
+        """Return the nearest pair of objects at q (n,) [rad, m]; None if its distance is not below the clearance.
+
+        time: time at which the motion is at q [s], for the result.
+        """
         distances = self.distances(q)
         nearest = int(distances.argmin()) if self.pairs else 0
         if not self.pairs or distances[nearest] >= self.clearance:
             return None
-        return Contact(time, float(distances[nearest]), *self._names(nearest))
+        return Contact(time, float(distances[nearest]), *self._names_of(nearest))
 
     def penalty(self, q: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the penalty on distances below a margin at positions q (T, n), and its gradient (T, n).
@@ -184,26 +189,26 @@ class Collisions:
 
     def _add(self, name: str, body: int, pose: np.ndarray, geometry: coal.CollisionGeometry) -> None:
         """Add an object that is fixed to a body. pose: pose of the object in the frame of the body, (4, 4)."""
-        unique = f"{len(self._bodies)} {name}"
-        placed = pin.GeometryObject(unique, body + 1, pin.SE3(pose), geometry)
+        placed = pin.GeometryObject(str(len(self._bodies)), body + 1, pin.SE3(pose), geometry)
         self._geometry.addGeometryObject(placed)
         self._bodies.append(body)
+        self._names.append(name)
         if body >= 0:
             geometry.computeLocalAABB()
             center = pose[:3, :3] @ geometry.aabb_center + pose[:3, 3]
             extent = float(np.linalg.norm(center) + geometry.aabb_radius)
             self._extents[body] = max(self._extents[body], extent)
 
-    def _names(self, pair: int) -> tuple[str, str]:
+    def _names_of(self, pair: int) -> tuple[str, str]:
         """Return the names of the two objects of a pair."""
         objects = self._geometry.collisionPairs[pair]
-        first, second = (self._geometry.geometryObjects[k].name for k in (objects.first, objects.second))
-        return first.partition(" ")[2], second.partition(" ")[2]
+        return self._names[objects.first], self._names[objects.second]
 
     def _pairs(self, chain: Chain, links: int) -> Iterator[tuple[int, int]]:
-        """Yield the indices of the two objects of each pair to be compared.
+        """Yield the indices of the two objects of each pair whose distance is computed.
 
-        links: number of objects that are shapes of links; they are the first objects.
+        Objects of the same body, and shapes of two bodies that a joint connects, form no pair. links: number of objects
+        that are shapes of links; these objects are followed by the floor and the boxes.
         """
         neighbour = {}
         for index, body in enumerate(chain.bodies):
@@ -255,17 +260,10 @@ class Collisions:
             # A pair with the floor or a box is removed only if it is too close at all positions, as for a base on the
             # floor: otherwise the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
-                names[" and ".join(self._names(pair))] = None
+                names[" and ".join(self._names_of(pair))] = None
                 self._geometry.removeCollisionPair(objects)
         self._found = pin.GeometryData(self._geometry)
         return tuple(reversed(names))
-
-
-def _pose(rotation: ArrayLike, position: ArrayLike) -> np.ndarray:
-    """Return the homogeneous matrix (4, 4) of a rotation (3, 3) and a position (3,) [m]."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
@@ -274,7 +272,6 @@ def _geometry(shape: LinkShape) -> coal.CollisionGeometry:
         kinds = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
         return kinds[shape.kind](*shape.size)
     points = coal.StdVec_Vec3s()
-    for vertex in shape.mesh[0]:
-        points.append(vertex)
+    points.extend(list(shape.mesh[0]))
     # Options of Qhull: Qt makes triangular facets. QJ perturbs the vertices slightly, so that flat meshes have a hull.
     return coal.Convex.convexHull(points, False, "Qt QJ")

@@ -1,9 +1,9 @@
 """Criterion that the parameters of an exciting motion minimize.
 
-The criterion is the logarithm of the condition number of the base regressor with columns of unit length (Swevers et
-al., IEEE T-RA 13:730, 1997) plus penalties. There are penalties on violated effort limits, on distances below a margin,
-and on reduced amplitudes. The penalty on amplitudes is needed because the condition number of columns of unit length
-does not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
+The criterion is the logarithm of the condition number of the base regressor (Gautier and Khalil, IJRR 11:362, 1992)
+with columns of unit length, plus penalties. There are penalties on violated effort limits, on distances between objects
+below a margin, and on reduced amplitudes. The penalty on amplitudes is needed because the condition number of columns
+of unit length does not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ FRICTION = FrictionModel()
 
 
 class Criterion:
-    """Criterion to be minimized over the parameters (size,) of an `ExcitationTrajectory`.
+    """Criterion to be minimized over the parameters (size,) of a motion: log condition number plus penalties.
 
-    size: number of parameters, see `ExcitationTrajectory`.
+    The parameters are explained in `ExcitationTrajectory`, and the criterion in the docstring of the module.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Criterion:
         return torch.where(self.limits.isinf(), torch.nan, largest).numpy()
 
     def value(self, parameters: np.ndarray) -> float:
-        """Return the value of the criterion for parameters (size,)."""
+        """Return the criterion for the parameters (size,) of a motion; smaller values are better."""
         return float(self._value(torch.from_numpy(parameters)))
 
     def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
@@ -93,7 +93,7 @@ class Criterion:
         return self._log_condition(rows) + penalties
 
     def _rows(self, states: Tensor) -> Tensor:
-        """Return the regressor of the torque for states (3, T, n), (T, n, K), with K parameters.
+        """Return the regressor of the torques, (T, n, K) for K parameters; ``states``: q, qd and qdd, (3, T, n).
 
         The parameters are the inertial parameters of the bodies, then armature and friction (`FRICTION.columns`).
         """
@@ -111,7 +111,7 @@ class Criterion:
         """Return the logarithm of the condition number, (), of the base regressor, from the regressor of `_rows`."""
         columns = rows[:, :, self.columns].flatten(0, 1)
         length = columns.norm(dim=0)
-        # The column of a parameter that the motion does not excite is zero.
+        # The column of a parameter that the motion does not excite is zero: the condition number is then infinite.
         if not length.all():
             return torch.tensor(torch.inf, dtype=torch.float64)
         condition: Tensor = torch.linalg.cond(columns / length)

@@ -95,24 +95,23 @@ def excite(
             f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
             f"{reach * fraction:.0%} of the ranges."
         )
-    first, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
+    states = np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
         motion=motion,
         approach=to_motion,
         collisions=statement,
         parameters=len(criterion.columns),
-        first=criterion.condition(first),
+        first=criterion.condition(criterion.states(starts[0])),
         condition=criterion.condition(criterion.states(best)),
         efforts=criterion.largest_efforts(torch.from_numpy(states)),
-        first_efforts=criterion.largest_efforts(first),
     )
 
 
 def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
-    """Return the number of harmonics of a motion. Raises SettingsError for an invalid argument of ``excite``."""
+    """Return ``harmonics``, or its default for ``duration``. Raises SettingsError for a bad argument of `excite`."""
     bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
     bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}
     for name, (value, largest) in bounded.items():
@@ -129,9 +128,10 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of the acceleration, and the acceleration limits of the approach, (n,).
+    """Return the bounds with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
 
-    Without an acceleration limit, the approach reaches its largest speed in one second.
+    The approach is the motion to the first position of the exciting motion. Without an acceleration limit, the approach
+    reaches its largest speed in one second. arm: for the number and the names of the joints.
     """
     if acceleration is None:
         return bounds, bounds.speed

@@ -28,7 +28,6 @@ class Excitation:
         first: Condition number for the first random motion, for comparison.
         condition: Condition number of the base regressor with columns of unit length for `motion`.
         efforts: Largest rigid-body torque divided by the effort limit, (n,) [1]; NaN without a limit or inertials.
-        first_efforts: Same as `efforts`, for the first random motion.
     """
 
     arm: Chain
@@ -39,15 +38,13 @@ class Excitation:
     first: float
     condition: float
     efforts: np.ndarray
-    first_efforts: np.ndarray
 
     def text(self) -> str:
         """Return a text of at most 80 columns about the quality of the motion and its use of the limits."""
-        overran = " (which overran effort limits)" if (self.first_efforts > 1).any() else ""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
             f"condition number of the {self.parameters} base parameters' regressor: "
-            f"{self.condition:.3g}\n  of the first motion at random{overran}: {self.first:.3g}"
+            f"{self.condition:.3g}\n  of the first motion at random: {self.first:.3g}"
         )
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():

@@ -10,6 +10,7 @@ from math import ceil, cos, pi, sqrt
 
 import numpy as np
 import torch
+from scipy.interpolate import BPoly
 from torch import Tensor
 
 from spelgen.excitation.bounds import MotionBounds
@@ -62,13 +63,10 @@ def approach(
     by_acceleration = np.sqrt(10 / sqrt(3) * np.abs(distance) / acceleration).max()
     duration = float(max(by_speed, by_acceleration))
     t = np.linspace(0.0, duration, ceil(duration * sample_rate) + 1)
-    s = t / (duration or 1.0)
-    position = s**3 * (10 - 15 * s + 6 * s**2)
-    velocity = 30 * s**2 * (1 - s) ** 2 / (duration or 1.0)
-    second = 60 * s * (1 - s) * (1 - 2 * s) / (duration or 1.0) ** 2
-    return Motion(
-        t, start + np.outer(position, distance), np.outer(velocity, distance), np.outer(second, distance)
-    )
+    still = np.zeros_like(distance)
+    # For equal positions, the motion is a single sample, and any duration is right.
+    curve = BPoly.from_derivatives([0.0, duration or 1.0], [[start, still, still], [end, still, still]])
+    return Motion(t, curve(t), curve(t, 1), curve(t, 2))
 
 
 @dataclass(frozen=True, eq=False)

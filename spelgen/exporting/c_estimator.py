@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.c_source import CFunction, c_function
-from spelgen.exporting.description import TORQUE, EntryPoint, TrainedModel
+from spelgen.exporting.description import TORQUE, TrainedModel, entry_point
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
 from spelgen.exporting.residual_expressions import residual_symbols
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
@@ -25,27 +25,17 @@ CALLED = ("inverse_dynamics", "friction", "gravity")
 """Functions of the model that the estimator calls, in addition to its own."""
 
 _ENTRIES = (
-    EntryPoint(
+    entry_point(
         "momentum_balance",
         "the terms of d/dt (p + P load) = torque - friction + N load, of an arm with a payload, and the tip's Jacobian",
-        ("q", "qd", "tau", "low", "high"),
-        {
-            "momentum": "Nm s, N s",
-            "torque": TORQUE,
-            "friction": TORQUE,
-            "uncertainty": TORQUE,
-            "load_momentum": "SI",
-            "load_torque": "SI",
-            "jacobian": "m, 1",
-        },
+        "q qd tau low high", momentum="Nm s, N s", torque=TORQUE, friction=TORQUE, uncertainty=TORQUE,
+        load_momentum="SI", load_torque="SI", jacobian="m, 1",
     ),
-    EntryPoint(
-        "payload_torque",
-        "the torques that move a payload with ten inertial parameters at the last body",
-        ("q", "qd", "qdd", "load"),
-        {"tau": TORQUE},
+    entry_point(
+        "payload_torque", "the torques that move a payload with ten inertial parameters at the last body",
+        "q qd qdd load", tau=TORQUE,
     ),
-)
+)  # fmt: skip
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
@@ -96,14 +86,13 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
 
     levels: noise levels, which are constants in the C code.
     """
-    # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
-    breakaway = model.breakaway.ravel() if model.memory else [0.0]
     tables: dict[str, Iterable[float]] = {
         "load_prior": TUNING.load_prior,
         "scales": TUNING.scales,
-        "breakaway": breakaway,
+        # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
+        "breakaway": model.breakaway.ravel() if model.memory else [0.0],
+        "rest_speed": levels.rest_speed,
     }
-    tables["rest_speed"] = levels.rest_speed
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}

@@ -35,7 +35,8 @@ _CALLS = (
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the C declarations of the residual terms ``names``, and the C calls that compute these terms.
 
-    The statements are the first ones in the C function of an entry point. names: names of `residual_symbols`.
+    The C function of an entry point begins with these lines, since its other statements depend on the residual terms.
+    names: keys of `residual_symbols`.
     """
     uncomputed = set(names)
     symbols = residual_symbols(model)
@@ -96,12 +97,10 @@ def _layer_tables(name: str, weight: np.ndarray, bias: np.ndarray) -> list[str]:
         weight: weights of the layer, (outputs, inputs).
         bias: biases of the layer, (outputs,).
     """
-    spans = []
-    for column in weight.T:
-        nonzero = np.flatnonzero(column).tolist() or [0, -1]
-        spans.append((nonzero[0], nonzero[-1] + 1))
-    first, last = np.array(spans).T
-    packed = [column[slice(*span)] for column, span in zip(weight.T, spans, strict=True)]
+    is_used = weight != 0
+    first = is_used.argmax(axis=0)
+    last = np.where(is_used.any(axis=0), len(weight) - is_used[::-1].argmax(axis=0), 0)
+    packed = [column[a:b] for column, a, b in zip(weight.T, first, last, strict=True)]
     tables = {"bias": bias, "weight": np.concatenate(packed), "first": first, "last": last}
     return [_table(f"{name}_{key}", values) for key, values in tables.items()]
 

@@ -109,7 +109,7 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     """Return the C function of an entry point, which computes the outputs of a CasADi function.
 
     entry: function of the model, such as inverse_dynamics. function: CasADi function of scalar expressions, made by
-    `named_function`; its residual terms are computed in C.
+    `named_function`. Its residual terms are inputs, which the C function computes by calls of other C functions.
     """
     # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))
@@ -160,9 +160,9 @@ def _parameter(model: TrainedModel, name: str, size: str) -> str:
 def _statements(function: ca.Function, outputs: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the variables and the statements of a C function, one statement per CasADi instruction.
 
-    The C arrays are row-major; their names are the names of the inputs of `function` and ``outputs``. Outputs are
-    dense, so that each number is written exactly once. Each variable is a slot of CasADi's work vector, which holds
-    several intermediate results in turn.
+    The C arrays are row-major; their names are the names of the inputs of `function` and ``outputs``. The outputs of
+    `function` are dense, so that each entry of an array is assigned exactly once. A variable is a slot of CasADi's work
+    vector: it is assigned several intermediate results in turn.
     """
     inputs = function.name_in()
     # CasADi numbers the entries of a matrix in column-major order, the C arrays are row-major.

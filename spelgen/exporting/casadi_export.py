@@ -10,11 +10,12 @@ from scipy.interpolate import BSpline
 
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import (
-    ENTRY_POINTS,
     EntryPoint,
     Residuals,
     SigmoidNetwork,
     TrainedModel,
+    entry_points,
+    select_names,
     spline_energy,
 )
 from spelgen.exporting.exported import Exported, with_readme
@@ -31,7 +32,10 @@ def export_casadi(trained: Trained) -> Exported:
     Raises RunError if results of a function and of the model differ.
     """
     model = trained.described
-    functions = casadi_functions(model, trained.entry_points)
+    # The derivatives of C are not exported, since CasADi differentiates its functions itself.
+    entries = entry_points(model)
+    names = select_names(trained.entries, entries)
+    functions = casadi_functions(model, {name: entries[name] for name in names})
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}"
     use = (
@@ -48,23 +52,17 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 
     Rigid bodies and friction are SX (scalar) expressions; residual terms are MX (matrix) expressions.
     """
-    # Without residual terms, pure SX functions suffice. They are faster than MX functions that call SX functions.
-    if not model.residuals:
-        return expression_functions(model, entries)
-    # Derivatives are computed from the MX function, which includes the residual terms as functions of q. In the SX
-    # function, the residual terms are symbols, so a derivative would omit their dependence on q.
-    bases = {name: ENTRY_POINTS[name.removesuffix("_derivatives")] for name in entries}
-    expressions = expression_functions(model, {base.name: base for base in bases.values()})
     functions = {}
-    for name, entry in entries.items():
-        base = bases[name]
-        function = _with_residuals(base, model, expressions[base.name])
-        functions[name] = function if base is entry else _derivatives(entry, function)
+    for name, function in expression_functions(model, entries).items():
+        functions[name] = _with_residuals(entries[name], model, function)
     return functions
 
 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
     """Return a CasADi function that computes the residual terms of a model and passes them to ``function``.
+
+    A function that depends on no residual terms is returned unchanged: a pure SX function is faster than an MX function
+    that calls it.
 
     The inputs of the result are the inputs of the entry point ``entry``. The inputs of ``function`` are these inputs,
     then the residual terms.
@@ -79,19 +77,6 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
     return ca.Function(entry.name, arguments, outputs, list(entry.inputs), list(entry.outputs))
 
 
-def _derivatives(entry: EntryPoint, function: ca.Function) -> ca.Function:
-    """Return the CasADi function of the Jacobians of ``function`` with respect to its inputs, one output per Jacobian.
-
-    Output k is the Jacobian with respect to input k. entry: entry point of the result; it has at most as many outputs
-    as inputs. function: function with a single output and the inputs of ``entry``.
-    """
-    arguments = function.mx_in()
-    (output,) = function.call(arguments)
-    # The Jacobians are made dense: callers expect n x n numbers, including structural zeros.
-    derivatives = [ca.densify(ca.jacobian(output, x)) for x in arguments[: len(entry.outputs)]]
-    return ca.Function(entry.name, arguments, derivatives, list(entry.inputs), list(entry.outputs))
-
-
 def _saved(function: ca.Function) -> bytes:
     # The function is saved to a file and read again, since CasADi cannot serialise a function to memory.
     with tempfile.TemporaryDirectory() as folder:
@@ -101,13 +86,13 @@ def _saved(function: ca.Function) -> bytes:
 
 
 def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
-    """Return a function for `check_parity`, which calls a CasADi function once per state and stacks the results."""
+    """Return a function for `check_parity`: it calls a named CasADi function per state and stacks the results."""
 
     def called(name: str, inputs: Values) -> Values:
         function = functions[name]
         states = zip(*(inputs[key] for key in function.name_in()), strict=True)
         # A loop over states calls the exported function itself; CasADi's `map` would make another function.
-        results = [function.call(list(map(ca.DM, state))) for state in states]
+        results = [function.call([ca.DM(value.ravel()) for value in state]) for state in states]
         outputs = {}
         for key, values in zip(function.name_out(), zip(*results, strict=True), strict=True):
             array = np.array([value.full() for value in values])
@@ -169,7 +154,11 @@ def _torque_energy(residuals: Residuals, q: ca.MX) -> ca.MX:
 
 
 def _spline(spline: BSpline, q: ca.MX) -> ca.MX:
-    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint; outside of the knots it is constant."""
+    """Return the value (1, 1) of a spline at the position q (1, 1) of a joint.
+
+    Outside of the knots it is the value at the nearest end: zero for a torque or friction spline, a constant for an
+    energy.
+    """
     knots, degree = spline.t, spline.k
     # CasADi's bspline extrapolates the last polynomial, but the model's splines are constant there.
     inside = ca.fmin(ca.fmax(q, knots[degree]), knots[-degree - 1])

@@ -58,19 +58,9 @@ class Trained:
     def entry_points(self) -> dict[str, description.EntryPoint]:
         """The functions of the model to export, by name, such as inverse_dynamics.
 
-        Raises RunError for unknown names.
+        Raises RunError for unknown names in ``entries``.
         """
         return description.entry_points(self.described, self.entries)
-
-    @property
-    def tip(self) -> str:
-        """Name of the link that is the tip of the arm."""
-        return self.arm.tip or self.arm.robot.last_link(self.arm.chain.joint_names)
-
-    @property
-    def memory(self) -> int:
-        """Number of values in the friction state z of all joints; 0 for a model of networks."""
-        return self.model.n * self.model.elements
 
 
 def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
@@ -229,7 +219,8 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonic
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
-            # Each harmonic takes time in an export, so trailing harmonics with zero amplitude are removed.
+            # Each harmonic costs computing time in the exported code, so trailing harmonics with zero amplitude are
+            # removed.
             if used.size:
                 last = used[-1] + 1
                 ripple.append(description.Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

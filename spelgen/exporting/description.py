@@ -147,7 +147,7 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """Matrix (n, n) from joint torques to motor torques: G^-1, with the identity at passive joints."""
+        """Matrix (n, n) from joint torques to motor torques: inverse of G, with 1 in zero rows of passive joints."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 
@@ -170,65 +170,44 @@ class EntryPoint:
 
 TORQUE = "Nm, N"
 
+
+def entry_point(name: str, about: str, inputs: str, **outputs: str) -> EntryPoint:
+    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result."""
+    return EntryPoint(name, about, tuple(inputs.split()), outputs)
+
+
 _ENTRY_POINTS = (
-    EntryPoint(
-        "inverse_dynamics",
-        "the torques that give qdd, friction included",
-        ("q", "qd", "qdd", "z"),
-        {"tau": TORQUE},
+    entry_point("inverse_dynamics", "the torques that give qdd, friction included", "q qd qdd z", tau=TORQUE),
+    entry_point("forward_dynamics", "the accelerations under the torques tau", "q qd tau z", qdd="rad/s^2, m/s^2"),
+    entry_point("mass_matrix", "M, armature included", "q", mass="kg m^2, kg m, kg"),
+    entry_point("bias", "Coriolis, centrifugal and gravity torques", "q qd", bias=TORQUE),
+    entry_point("gravity", "the torques that hold the arm still, dV/dq", "q", gravity=TORQUE),
+    entry_point("friction", "the torques of friction", "q qd z", friction=TORQUE),
+    entry_point("friction_step", "the friction state after a displacement dq of each joint", "z dq", z_next="rad, m"),
+    entry_point(
+        "friction_memory", "the initial friction state of joints that have moved at constant qd", "qd",
+        z_start="rad, m",
     ),
-    EntryPoint(
-        "forward_dynamics",
-        "the accelerations under the torques tau",
-        ("q", "qd", "tau", "z"),
-        {"qdd": "rad/s^2, m/s^2"},
+    entry_point("momentum", "M qd", "q qd", momentum="Nm s, N s"),
+    entry_point("energy", "kinetic energy, then potential", "q qd", energy="J"),
+    entry_point("tip_pose", "the tip's homogeneous transform in the root link's frame", "q", pose="1, m"),
+    entry_point(
+        "tip_jacobian", "the tip's linear, then angular velocity by qd, in the root link's axes", "q",
+        jacobian="m, 1",
     ),
-    EntryPoint("mass_matrix", "M, armature included", ("q",), {"mass": "kg m^2, kg m, kg"}),
-    EntryPoint("bias", "Coriolis, centrifugal and gravity torques", ("q", "qd"), {"bias": TORQUE}),
-    EntryPoint("gravity", "the torques that hold the arm still, dV/dq", ("q",), {"gravity": TORQUE}),
-    EntryPoint("friction", "the torques of friction", ("q", "qd", "z"), {"friction": TORQUE}),
-    EntryPoint(
-        "friction_step",
-        "the friction state after a displacement dq of each joint",
-        ("z", "dq"),
-        {"z_next": "rad, m"},
+    entry_point(
+        "inverse_dynamics_derivatives", "the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix",
+        "q qd qdd z", dtau_dq="Nm/rad", dtau_dqd="Nm s/rad",
     ),
-    EntryPoint(
-        "friction_memory",
-        "the initial friction state of joints that have moved at constant qd",
-        ("qd",),
-        {"z_start": "rad, m"},
+    entry_point(
+        "forward_dynamics_derivatives", "the derivatives of forward_dynamics", "q qd tau z",
+        dqdd_dq="1/s^2", dqdd_dqd="1/s", dqdd_dtau="1/(kg m^2)",
     ),
-    EntryPoint("momentum", "M qd", ("q", "qd"), {"momentum": "Nm s, N s"}),
-    EntryPoint("energy", "kinetic energy, then potential", ("q", "qd"), {"energy": "J"}),
-    EntryPoint(
-        "tip_pose", "the tip's homogeneous transform in the root link's frame", ("q",), {"pose": "1, m"}
+    entry_point(
+        "servo_torque", "the torques of position servos under a command u, which the caller delays", "u q qd",
+        tau=TORQUE,
     ),
-    EntryPoint(
-        "tip_jacobian",
-        "the tip's linear, then angular velocity by qd, in the root link's axes",
-        ("q",),
-        {"jacobian": "m, 1"},
-    ),
-    EntryPoint(
-        "inverse_dynamics_derivatives",
-        "the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix",
-        ("q", "qd", "qdd", "z"),
-        {"dtau_dq": "Nm/rad", "dtau_dqd": "Nm s/rad"},
-    ),
-    EntryPoint(
-        "forward_dynamics_derivatives",
-        "the derivatives of forward_dynamics",
-        ("q", "qd", "tau", "z"),
-        {"dqdd_dq": "1/s^2", "dqdd_dqd": "1/s", "dqdd_dtau": "1/(kg m^2)"},
-    ),
-    EntryPoint(
-        "servo_torque",
-        "the torques of position servos under a command u, which the caller delays",
-        ("u", "q", "qd"),
-        {"tau": TORQUE},
-    ),
-)
+)  # fmt: skip
 
 ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 """All entry points by name."""

@@ -9,7 +9,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import RunError, suggestion
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.exported import EXPORTERS, Exported, require_fitting
+from spelgen.exporting.exported import EXPORTERS, WITH_FLOAT32, WITH_FUNCTIONS, Exported, require_fitting
 from spelgen.fitting.fitted import Fit, load_run, required_spec
 from spelgen.labels import listed
 from spelgen.listing import Listing
@@ -41,7 +41,7 @@ def export(
         entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
         float32: whether onnx and torch programs compute in float32, for accelerators; default: float64.
 
-    Raises RunError without an arm, for a preset or a path that the format does not allow, if the comparison fails, and
+    Raises RunError without an arm, for a model or a path that the format does not allow, if the comparison fails, and
     if a file exists without ``force``.
     """
     if to not in EXPORTERS:
@@ -54,28 +54,27 @@ def export(
         trained = load_run(trained)
     intervals: tuple[Listing, ...] = ()
     levels = None
-    # Only a fit has intervals of its parameters and noise levels, which the export contains, too; a model has neither.
+    # A fit has 95 % intervals of its parameters, and noise levels of the estimator. The export contains both; a model
+    # that is given without its fit has neither.
     if isinstance(trained, Fit):
         levels = stored_levels(trained)
         if trained.checkpoint.posterior:
             intervals = trained.posterior.listings
         trained, arm = trained.model, arm or trained.urdf
-    exporter = EXPORTERS[to]
-    if entries and not exporter.choice:
-        formats = [name for name, row in EXPORTERS.items() if row.choice]
-        raise RunError(f"functions for --to {to}", expected=f"--to {listed(formats)}, which have a choice")
-    if float32 and not exporter.float32:
-        formats = [name for name, row in EXPORTERS.items() if row.float32]
-        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(formats)}; C has -DNAME_FLOAT")
+    if entries and to not in WITH_FUNCTIONS:
+        raise RunError(
+            f"functions for --to {to}", expected=f"--to {listed(WITH_FUNCTIONS)}, which have a choice"
+        )
+    if float32 and to not in WITH_FLOAT32:
+        raise RunError(f"float32 for --to {to}", expected=f"--to {listed(WITH_FLOAT32)}; C has -DNAME_FLOAT")
     if arm is None:
         expected = "a run of `spelgen train --robot FILE.urdf`, or an arm"
         raise RunError("no robot.urdf", element="export", expected=expected)
     if not isinstance(arm, Arm):
         arm = arm_of_spec(required_spec(trained), arm)
     # The exporter is imported here, because packages of other formats may not be installed.
-    exported: Exported = pkgutil.resolve_name(exporter.function_name)(
-        Trained(trained, arm, tuple(entries), intervals, float32, levels)
-    )
+    export_model = pkgutil.resolve_name(f"spelgen.exporting.{to}_export:export_{to}")
+    exported: Exported = export_model(Trained(trained, arm, tuple(entries), intervals, float32, levels))
     if path is not None:
         exported.write(path, force=force)
     return exported

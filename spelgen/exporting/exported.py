@@ -23,31 +23,28 @@ class Exporter:
     """A format to which models are exported, such as urdf or onnx.
 
     Attributes:
-        function_name: "module:function" of the function that returns the ``Exported`` for a ``Trained``. It is imported
-            on use, because most formats need optional packages.
         title: last words of the README's title.
         suffix: file name extension; empty for a format that is a folder.
-        choice: whether a user can select functions.
-        float32: whether the exported programs can compute in float32.
     """
 
-    function_name: str
-    title: str = ""
+    title: str
     suffix: str = ""
-    choice: bool = False
-    float32: bool = False
 
 
 EXPORTERS = {
-    "urdf": Exporter("spelgen.exporting.urdf_export:export_urdf", "as a URDF", suffix=".urdf"),
-    "mjcf": Exporter("spelgen.exporting.mjcf_export:export_mjcf", "for MuJoCo", suffix=".xml"),
-    "c": Exporter("spelgen.exporting.c_export:export_c", "in C99", choice=True),
-    "casadi": Exporter("spelgen.exporting.casadi_export:export_casadi", "in CasADi", choice=True),
-    "onnx": Exporter("spelgen.exporting.onnx_export:export_onnx", "in ONNX", choice=True, float32=True),
-    "torch": Exporter("spelgen.exporting.torch_export:export_torch", "in torch", choice=True, float32=True),
-    "ros2": Exporter("spelgen.exporting.ros2_export:export_ros2", "for ROS 2"),
+    "urdf": Exporter("as a URDF", suffix=".urdf"),
+    "mjcf": Exporter("for MuJoCo", suffix=".xml"),
+    "c": Exporter("in C99"),
+    "casadi": Exporter("in CasADi"),
+    "onnx": Exporter("in ONNX"),
+    "torch": Exporter("in torch"),
+    "ros2": Exporter("for ROS 2"),
 }
-"""The formats, by the values of --to."""
+"""The formats, by the values of --to. The function `export_NAME` of the file `NAME_export` makes the export."""
+WITH_FUNCTIONS = ("c", "casadi", "onnx", "torch")
+"""The formats that consist of functions, which a user can select."""
+WITH_FLOAT32 = ("onnx", "torch")
+"""The formats whose programs can compute in float32."""
 # A file name specifies a format only if the format is a single file: folders have no suffix.
 _BY_SUFFIX = {exporter.suffix: name for name, exporter in EXPORTERS.items() if exporter.suffix}
 
@@ -131,18 +128,20 @@ def with_readme(
         to: name of the format.
         files: contents by file name.
         use: first line after the title, how the export is used.
-        about: conventions of the format, the end of the README's line with the units and the name of the tip.
+        about: conventions of the format, which are appended to the line of the README that states the units and the
+            tip.
         summary: results of the checks, one text without a full stop each.
         example: lines of Python that run in the folder of the README.
     """
     exporter, arm = EXPORTERS[to], trained.arm.chain
+    tip = trained.arm.tip or trained.arm.robot.last_link(arm.joint_names)
     # Before examples and tables, the README has only the five lines that a user needs for the first call; details are
     # in docs/deploy.md.
     head = [
         f"# Dynamics of {arm.name} {exporter.title}",
         use,
         f"Joints, in this order: {', '.join(arm.joint_names)}.",
-        f"{UNITS}; the tip is the link {trained.tip}; {about}",
+        f"{UNITS}; the tip is the link {tip}; {about}",
         f"{'; '.join(summary)}.",
     ]
     # Names come from an untrusted URDF, so characters that are not printable are replaced.

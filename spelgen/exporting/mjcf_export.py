@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -25,8 +26,8 @@ from spelgen.exporting.tuning import TUNING
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
-_SECTIONS = ("worldbody", "equality", "tendon", "actuator")
-_CONTACTS = {
+_SECTIONS = ("worldbody", "equality", "tendon", "actuator", "asset")
+_CONTACTS: dict[Literal["visual", "collision"], dict[str, str]] = {
     "visual": {"group": "2", "contype": "0", "conaffinity": "0"},
     "collision": {"group": "3", "contype": "1", "conaffinity": "0"},
 }
@@ -89,8 +90,8 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
     q = torch.from_numpy(random["q"])
-    # The reference has the unrounded angles of the URDF, as the file has: rounded angles, as in the model, would change
-    # M.
+    # The MJCF file has the angles of the URDF. The reference must have the same angles: the model has angles rounded to
+    # multiples of pi/2, which would change M.
     bodies = _with_exact_angles(projection)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
@@ -102,7 +103,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the unrounded angles of the URDF, which the MJCF has, too."""
+    """Return the rigid-body model with the angles of joint origins in URDF and MJCF, which no rounding has changed."""
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
@@ -126,13 +127,14 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off, since the reference has none: MuJoCo has another friction model.
+    # Torque limits and friction are switched off: the reference of `check_mjcf` has neither, since MuJoCo's friction
+    # model differs from the model's.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
     # `constraint` is the linear map from the coordinates to the positions of all joints, including mimic joints.
     constraint = body_constraint(arm)
-    # The rows of the map are sorted in MuJoCo's order of joints, the order of the tree of bodies.
+    # The rows of `constraint`, one per joint, are sorted in MuJoCo's order of joints, the order of the tree of bodies.
     order = np.argsort([model.joint(name).dofadr[0] for name in constraint.names])
     jacobian, offset = constraint.jacobian[order], constraint.offset[order]
     driven = [arm.joint_names.index(model.actuator(k).name) for k in range(model.nu)]
@@ -158,16 +160,17 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
 def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     """Return the content of the MJCF file of rigid bodies, and the names of links whose shapes are omitted.
 
-    Shapes that are flat or cannot be read are omitted. The file has the unrounded angles of the URDF, so that the tip
-    has the same pose as in other tools that read the URDF. The actuators are one motor per nonzero column of G or, for
-    position servos, one position actuator per joint.
+    Shapes that are flat or cannot be read are omitted. The angles of joint origins are the URDF's, such as 1.5708, and
+    not rounded to pi/2 as in the model, so that the tip has the same pose as in other tools that read the URDF. The
+    actuators are one motor per nonzero column of the input matrix G (joint torques per motor torque) or, for position
+    servos, one position actuator per joint.
     """
     arm = projection.arm.chain
     root = etree.Element("mujoco", model=arm.name)
     # MuJoCo's default unit of angles is degrees. With autolimits each given range is a limit.
     _add(root, "compiler", angle="radian", autolimits="true")
     _add(root, "option", gravity=arm.gravity)
-    world, equality, tendons, actuators = (etree.SubElement(root, tag) for tag in _SECTIONS)
+    world, equality, tendons, actuators, assets = (etree.SubElement(root, tag) for tag in _SECTIONS)
     # `is_coupled`: motors whose speed depends on several joints; their inertia is the armature of a tendon, not of a
     # joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
@@ -201,10 +204,10 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
         _add_motors(actuators, tendons, projection)
     else:
         _add_servos(actuators, arm.coordinates, projection.servos)
-    for section in (equality, tendons):
+    omitted = _add_shapes(assets, elements, projection.arm)
+    for section in (equality, tendons, assets):
         if not len(section):
             root.remove(section)
-    omitted = _add_shapes(root, elements, projection.arm)
     # The XML is indented, so that the file is readable.
     etree.indent(root)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n", omitted
@@ -230,7 +233,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
 
 
 def _add_motors(actuators: etree._Element, tendons: etree._Element, projection: RigidBodyProjection) -> None:
-    """Add a MuJoCo motor for each column of G: at a joint, or at a tendon if the motor acts on several joints.
+    """Add a MuJoCo motor for each nonzero column of the input matrix G: at a joint, or at a tendon for several joints.
 
     actuators, tendons: elements of the MJCF to which motors and tendons are added.
     """
@@ -269,24 +272,21 @@ def _add_tendon(
     return tendon
 
 
-def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
+def _add_shapes(assets: etree._Element, elements: Sequence[etree._Element], arm: Arm) -> str:
     """Add the visual and collision shapes of all links to an MJCF; return the names of links with omitted shapes.
 
     The names are separated by commas. A shape is omitted if it is flat or cannot be read.
 
     Args:
-        root: root element of the MJCF, to which meshes are added.
+        assets: element of the MJCF to which meshes are added.
         elements: elements of the world and of the bodies, in the order of the arm.
         arm: arm whose URDF has the shapes.
     """
     names = [link.name for link in arm.robot.links]
-    assets = etree.SubElement(root, "asset")
     omitted: dict[str, None] = {}
     poses = link_poses(arm)
     for kind, attributes in _CONTACTS.items():
-        shapes = link_shapes(
-            arm.robot.path, "visual" if kind == "visual" else "collision", names, TUNING.faces
-        )
+        shapes = link_shapes(arm.robot.path, kind, names, TUNING.faces)
         omitted |= dict.fromkeys(shapes.unread)
         for shape in shapes.shapes:
             if shape.mesh is not None and _is_flat(shape.mesh[0]):
@@ -297,8 +297,6 @@ def _add_shapes(root: etree._Element, elements: Sequence[etree._Element], arm: A
             form = _geom(shape, assets) | {"pos": pose[:3, 3], "quat": quaternion(pose[:3, :3])}
             # Shapes have no mass, since the <inertial> of the body has the whole mass.
             _add(elements[carrier + 1], "geom", **form, **attributes, mass=0)
-    if not len(assets):
-        root.remove(assets)
     return ", ".join(omitted)
 
 

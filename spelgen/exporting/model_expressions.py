@@ -77,18 +77,18 @@ def residuals_needed(function: ca.Function) -> list[str]:
 def _expressions(
     model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
 ) -> Outputs:
-    """Return {name: expressions} of all entry points except derivatives, and of ``force``.
+    """Return {name: expressions} of ``force`` and of all entry points that are not derivatives of other entry points.
 
-    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the measured torque ``offset``
-    at zero torque and the torque ``compensation`` that the drives add. ``force`` is M qdd + h + friction -
-    compensation, (n, 1).
+    The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the input matrix G, the
+    measured torque ``offset`` at zero torque, and the torque ``compensation`` that the drives add. ``force`` is M qdd +
+    h + friction - compensation, (n, 1).
 
     Args:
         model: the model as NumPy arrays.
-        inputs: symbols q, qd, qdd, tau, dq, u, (n, 1) each, and z, (n K, 1), of K bristles per joint.
+        inputs: symbols q, qd, qdd, tau, dq (displacement), u (command of servos), (n, 1) each, and z, (n K, 1), the
+            friction state of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: True if the expressions will be differentiated. The symbol ``first``, the derivative of M's
-            residual term with respect to q, then replaces the symbols ``rate`` and ``kinetic``.
+        derivatives: True if the caller differentiates the expressions for other entry points; passed to `coriolis`.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -149,7 +149,8 @@ def drive_friction(model: TrainedModel, residuals: Symbols, qd: ca.SX, gravity: 
         z: friction state of K bristles per joint, (n K, 1).
     """
     motors = constant(model.motors)
-    # Power is equal at motors and joints, so the gravity torques ``load`` of the motors satisfy C^T load = gravity.
+    # C is the matrix `motors`: the motor speeds are C qd. Power is equal at motors and joints, so the gravity torques
+    # ``load`` of the motors satisfy C^T load = gravity.
     load = constant(np.linalg.inv(model.motors).T) @ gravity
     friction = friction_torque(model, motors @ qd, load, z)
     for k, joint in enumerate(model.residuals.friction):
@@ -213,7 +214,7 @@ def bristle_step(breakaway: np.ndarray, z: ca.SX, dq: ca.SX) -> ca.SX:
 
 
 def _per_element(breakaway: np.ndarray, values: ca.SX) -> ca.SX:
-    """Return the values (n, 1) of n motors repeated for each of their K bristles, (n K, 1)."""
+    """Return the values (n, 1) of n motors repeated for each of their K bristles, (n K, 1); ``breakaway``: (n, K)."""
     return ca.vec(ca.repmat(values.T, breakaway.shape[1], 1))
 
 
@@ -251,8 +252,8 @@ def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Ou
         symbols.append(symbol)
         jacobians.append(jacobian)
     by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
-    # No chain rule is needed for qd: symbols of residual terms depend on q only, and `coriolis` is an explicit
-    # expression in qd.
+    # The derivative of `force` with respect to qd needs no chain rule: the symbols of residual terms in `force` depend
+    # on q only, and `coriolis` is an explicit expression in qd.
     by_velocity = ca.jacobian(force, inputs["qd"])
     right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
     # The Jacobians of the force are evaluated at the accelerations of the forward dynamics.

@@ -28,23 +28,18 @@ def export_onnx(trained: Trained) -> Exported:
     Raises RunError if results of ONNX Runtime and of the model differ.
     """
     model = torch_export.prepared(trained)
-    models, files = {}, {}
-    for name in torch_export.program_names(trained):
-        models[name] = files[f"{name}.onnx"] = onnx_model(model, name)
-    parity = torch_export.check_programs(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
-    checked = f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"
-    use = f"ONNX files for any runtime, {torch_export.number_type(model)} (batch, n), any batch."
-    size = model.n * model.elements
-    about = f"one file per entry point: {', '.join(models)}."
-    if size:
-        about = f"z, the friction state, is (batch, {size}); {about}"
-    example = ["import numpy as np", "import onnxruntime", "", "", "def run(name, **inputs):"]
-    example += ['    return onnxruntime.InferenceSession(f"{name}.onnx").run(None, inputs)[0]', "", ""]
-    number = f"np.{torch_export.number_type(model)}"
-    example += torch_export.calls(
-        model, list(models), f"np.zeros((5, {model.n}), {number})", f"np.zeros((5, {size}), {number})"
+    models = {name: onnx_model(model, name) for name in torch_export.program_names(trained)}
+    checked = torch_export.check_programs(
+        called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance
     )
-    return with_readme(trained, "onnx", files, use=use, about=about, summary=[checked], example=example)
+    use = f"ONNX files for any runtime, {torch_export.number_shapes(model)}."
+    about = f"one file per entry point: {', '.join(models)}."
+    files = {f"{name}.onnx": content for name, content in models.items()}
+    imports = ["import numpy as np", "import onnxruntime"]
+    run = 'onnxruntime.InferenceSession(f"{name}.onnx").run(None, inputs)[0]'
+    example = torch_export.example_lines(model, list(models), imports, run, "np.zeros(({}), np.{})")
+    summary = [f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {checked}"]
+    return with_readme(trained, "onnx", files, use=use, about=about, summary=summary, example=example)
 
 
 def onnx_model(model: PreparedModel, name: str) -> bytes:
@@ -52,7 +47,7 @@ def onnx_model(model: PreparedModel, name: str) -> bytes:
     # Functions without an ONNX operator are replaced already while torch traces the program.
     with _silent_exporter():
         with _Decomposed():
-            program = torch_export.export_program(model, name, flat_state=True)
+            program = torch_export.export_program(model, name)
         exported = torch.onnx.export(
             program,
             dynamo=True,
@@ -177,7 +172,7 @@ class _Decomposed(TorchFunctionMode):
 
 
 def called_by_onnx(files: Mapping[str, bytes]) -> Called:
-    """Return a function for `check_parity`, which evaluates an entry point in ONNX Runtime for arrays of states."""
+    """Return a function for `check_parity` that evaluates an entry point (key of ``files``) in ONNX Runtime."""
     sessions = {name: onnx_session(content) for name, content in files.items()}
 
     def called(name: str, inputs: Values) -> Values:

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
+from spelgen.dynamics.prepared import PreparedModel, batched_jacobians
 from spelgen.dynamics.tip import tip_kinematics
-from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
+from spelgen.excitation.bounds import SPEEDS
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
@@ -20,29 +21,39 @@ from spelgen.exporting.tuning import TUNING
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
 Called = Callable[[str, Values], Mapping[str, np.ndarray]]
-"""Function (name of an entry point, {input: (states, n)}) -> {output: (states, ...)}, computed by an export."""
+"""Function (name of an entry point, {input: (states, n)}) -> {output: (states, ...)}, computed by an export.
+
+The input z is (states, n, K) for K bristles per joint.
+"""
 
 
-def _energy(model: ArmModel, q: Tensor, qd: Tensor) -> Tensor:
-    """Return kinetic and potential energy of the torch model, two columns (states, 2) [J], at q and qd, (states, n)."""
-    kinetic = 0.5 * (model.momentum(q, qd) * qd).sum(dim=-1)
-    return torch.stack([kinetic, model.potential_energy(q)], dim=-1)
-
-
-_REFERENCES: dict[str, Callable[..., Tensor]] = {
-    "inverse_dynamics": lambda model, *inputs: model.inverse_dynamics(*inputs),
-    "forward_dynamics": lambda model, *inputs: model.forward_dynamics(*inputs),
-    "mass_matrix": lambda model, q: model.mass_matrix(q),
-    "bias": lambda model, q, qd: model.nonlinear_effects(q, qd),
-    "gravity": lambda model, q: model.gravity(q),
-    "friction": lambda model, *inputs: model.friction_torque(*inputs),
-    "friction_step": lambda model, z, dq: model.memory_after(z, dq).flatten(-2),
-    "friction_memory": lambda model, qd: model.memory(qd).flatten(-2),
-    "momentum": lambda model, q, qd: model.momentum(q, qd),
-    "energy": _energy,
-    "servo_torque": lambda model, u, q, qd: model.servo(u, q, qd),
+PROGRAMS: dict[str, Callable[..., Tensor]] = {
+    "inverse_dynamics": PreparedModel.inverse_dynamics,
+    "forward_dynamics": PreparedModel.forward_dynamics,
+    "mass_matrix": PreparedModel.mass_matrix,
+    "bias": PreparedModel.bias,
+    "gravity": PreparedModel.gravity,
+    "friction": PreparedModel.friction_torque,
+    "friction_step": PreparedModel.memory_after,
+    "friction_memory": PreparedModel.memory,
+    "tip_pose": PreparedModel.pose,
+    "tip_jacobian": PreparedModel.jacobian,
 }
-"""The torch model's functions of entry points, by name, except for derivatives and the tip."""
+"""The entry points that are exported as torch and ONNX programs, and the methods that compute them."""
+
+
+def _energy(prepared: PreparedModel, q: Tensor, qd: Tensor) -> Tensor:
+    """Return kinetic and potential energy of the torch model, two columns (states, 2) [J], at q and qd, (states, n)."""
+    kinetic = 0.5 * (prepared.momentum(q, qd) * qd).sum(dim=-1)
+    return torch.stack([kinetic, prepared.model.potential_energy(q)], dim=-1)
+
+
+_REFERENCES = PROGRAMS | {
+    "momentum": PreparedModel.momentum,
+    "energy": _energy,
+    "servo_torque": lambda prepared, u, q, qd: prepared.model.servo(u, q, qd),
+}
+"""The torch model's functions of entry points, by name, except for derivatives."""
 
 
 @dataclass(frozen=True)
@@ -99,14 +110,15 @@ def check_parity(
 
     Raises RunError if a difference is above the tolerance.
     """
-    inputs = random_inputs(trained.arm.chain.coordinates, states, trained.memory)
-    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
     # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
-    exact = copy.deepcopy(trained.model).double().cpu().requires_grad_(False)
+    exact = PreparedModel(copy.deepcopy(trained.model).cpu(), tip_kinematics(trained.arm))
+    inputs = random_inputs(trained.arm.chain.coordinates, states, exact.n * exact.elements)
+    inputs = {key: value.astype(dtype).astype(np.float64) for key, value in inputs.items()}
+    inputs["z"] = inputs["z"].reshape(states, exact.n, exact.elements)
     differences = {}
     for name in names:
         outputs = called(name, inputs)
-        expected = _expected(exact, trained, name, inputs)
+        expected = _expected(exact, name, inputs)
         # The outputs of the export are reshaped, since for an arm of one joint some formats return a vector in place of
         # a matrix.
         errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
@@ -141,10 +153,9 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
     """Return the velocity limits of the joints in the URDF, (n,) [rad/s, m/s], to scale random velocities.
 
-    Joints without a limit get a nominal speed.
+    Joints without a limit have the speed limit of exciting motions.
     """
-    nominal = {"revolute": TUNING.angular_speed, "prismatic": TUNING.linear_speed}
-    return np.array([joint.velocity or nominal[joint.joint_type] for joint in coordinates])
+    return np.array([joint.velocity or SPEEDS[joint.joint_type] for joint in coordinates])
 
 
 def relative(values: np.ndarray, expected: np.ndarray) -> float:
@@ -157,35 +168,20 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
         return float(np.abs(values - expected).max() / size)
 
 
-def _expected(model: ArmModel, trained: Trained, name: str, inputs: Values) -> Values:
+def _expected(model: PreparedModel, name: str, inputs: Values) -> Values:
     """Return {output: array (states, ...)} of one function of the torch model, such as inverse_dynamics, as reference.
 
     Args:
         model: the torch model in double precision.
-        trained: the model with its arm, for the friction state and the tip.
         name: name of the function (entry point).
-        inputs: {input: array (states, n)}.
+        inputs: {input: array (states, n)}, and (states, n, K) for the friction state z of K bristles per joint.
     """
     entry = ENTRY_POINTS[name]
-    arguments = []
-    for key in entry.inputs:
-        value = torch.from_numpy(inputs[key])
-        if key != "z":
-            arguments.append(value)
-        elif trained.memory:
-            arguments.append(value.unflatten(-1, (model.n, -1)))
-    outputs: Sequence[Tensor]
+    arguments = [torch.from_numpy(inputs[key]) for key in entry.inputs]
+    function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
     if name.endswith("_derivatives"):
-        from spelgen.dynamics.prepared import batched_jacobians
-
-        function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
         outputs = batched_jacobians(function, len(entry.outputs), *arguments)
-    elif name.startswith("tip_"):
-        tip = tip_kinematics(trained.arm)
-        outputs = [(tip.pose if name == "tip_pose" else tip.jacobian)(*arguments)]
-    elif name.startswith("friction_") and not trained.memory:
-        outputs = [arguments[0][:, :0]]
     else:
-        outputs = [_REFERENCES[name](model, *arguments)]
+        outputs = (function(*arguments),)
     arrays = [output.detach().numpy() for output in outputs]
     return dict(zip(entry.outputs, arrays, strict=True))

@@ -5,7 +5,7 @@ by loops over network weights and lookup of splines. R is the part of M that a n
 in the lower triangle; k is the number of joints whose friction depends on q. The symbols are:
 
 - ``mass`` (m, 1), entries of R; ``rate`` (m, 1), d mass / dt; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
-- ``energy`` (1, 1), the network of V; ``gravity`` (n, 1), d energy / dq;
+- ``energy`` (1, 1), the network of the potential energy V; ``gravity`` (n, 1), d energy / dq;
 - ``torque`` (n, 1), torques that depend on the position of a single joint; ``torque_energy`` (1, 1), their energy;
 - ``factor`` (k, 1), logarithms of the friction factors.
 
@@ -70,7 +70,10 @@ def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
 def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: bool) -> ca.SX:
     """Return the Coriolis torque of R, the residual term of M: dR/dt qd - d/dq (1/2 qd^T R qd), (n, 1).
 
-    derivatives: True: the result depends on the symbol ``first`` instead of ``rate`` and ``kinetic``.
+    symbols: result of `residual_symbols`. Its ``mass`` has the entries of R, ``rate`` is d mass / dt, ``kinetic`` is
+    d/dq of 1/2 qd^T R qd, and ``first`` is the Jacobian of ``mass`` with respect to q. derivatives: True if the result
+    will be differentiated with respect to q. The result then depends on ``first``, and not on ``rate`` and ``kinetic``,
+    whose Jacobians have no symbols.
     """
     if not derivatives:
         return symmetric(model, symbols["rate"]) @ qd - symbols["kinetic"]
@@ -94,7 +97,8 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return pairs (symbol, Jacobian with respect to q) for the residual terms that depend on q.
 
-    A symbol is a column of k entries, (k, 1). Its Jacobian, (k, n), consists of other symbols.
+    A residual term is a symbol of k entries, (k, 1). Its Jacobian, (k, n), consists of the symbols of its derivatives,
+    for example ``stiffness`` for ``gravity``. symbols: the result of `residual_symbols`.
     """
     # A friction factor depends only on the position of its own joint: each row of `joints` selects one joint.
     joints = np.eye(model.n)[list(model.residuals.friction)]

@@ -95,7 +95,7 @@ class RigidBodyProjection:
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
-    """Return the rigid bodies and the friction that approximate a trained model of ``arm`` best."""
+    """Return the rigid bodies of a trained model, or the nearest ones, and the nearest viscous and Coulomb friction."""
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)
@@ -141,7 +141,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the cost of the rigid bodies plus the ridge penalty, a scalar."""
+        """Return the cost: squared differences of M and gravity torque, plus the ridge penalty, a scalar."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
         # The parameters represent differences from the values in the URDF. The ridge penalty towards the URDF is
@@ -175,13 +175,13 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     fractions = np.concatenate([-fractions[::-1], fractions])
     speeds = np.outer(fractions, nominal_speeds(arm.coordinates))
     positions = q[:: TUNING.positions // TUNING.friction_positions]
-    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # positions: (positions, speeds, n)
+    positions = positions.unsqueeze(1).expand(-1, len(speeds), -1)  # q [rad, m], (positions, speeds, n)
     qd = torch.from_numpy(speeds).expand_as(positions)
     torques = model.friction_torque(positions, qd).numpy()  # torques: (positions, speeds, n)
     rows = []
     for joint, speed in enumerate(speeds.T):
-        # Torques are multiplied by the direction of motion, so that viscous and Coulomb friction are not
-        # negative.
+        # Torques are multiplied by the sign of the velocity. Friction that opposes the motion is then positive in both
+        # directions, as `nnls` requires, whose coefficients are non-negative.
         torque = torques[..., joint] * np.sign(speed)
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))

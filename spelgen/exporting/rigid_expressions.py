@@ -1,11 +1,12 @@
 """Rigid bodies as CasADi expressions: torques by recursive Newton-Euler, M and V by ``structure.recursion``.
 
 Quantities of a body are expressed in its joint's frame, whose z is the joint axis (Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). CasADi omits operations
-with structural zeros: zeros of the geometry, and all velocities if qd is ``ca.SX(n, 1)``.
+Algorithms, 2008, section 5.3, in the classical form of Khalil and Dombre, 2002, section 9.5). V is the potential
+energy. CasADi omits operations with structural zeros, such as zeros of the geometry. If qd is ``ca.SX(n, 1)``, a vector
+of structural zeros, all operations with velocities are omitted.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -52,11 +53,13 @@ class RigidBodies:
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
         # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
-        self.inertias: list[tuple[ca.SX, ca.SX, ca.SX]] = []
+        parameters = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
             # The ten parameters are mass, first moment (3), and the tensor's xx, xy, xz, yy, yz, zz.
             tensor = ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)
-            self.inertias.append((ten[0], ten[1:4], tensor))
+            parameters.append((ten[0], ten[1:4], tensor))
+        # Per body, parents first: the body; mass, first moment (3, 1) and inertia tensor (3, 3); frame.
+        self._rows = list(zip(self.bodies, parameters, self.frames, strict=True))
 
     def torque(self, qd: ca.SX, qdd: ca.SX) -> ca.SX:
         """Return M qdd + h without armature, (n, 1) [Nm, N], with h: Coriolis, centrifugal and gravity torque.
@@ -69,7 +72,7 @@ class RigidBodies:
         gravity = np.array(self.arm.gravity, dtype=float)
         motions = [(ca.SX(3, 1), ca.SX(3, 1), ca.SX(-gravity), ca.SX(3, 3))]
         wrenches = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, rate, acceleration, spin = motions[body.parent + 1]
             ratio = float(body.multiplier)
             speed, added = ratio * qd[body.coordinate], ratio * qdd[body.coordinate]
@@ -101,14 +104,15 @@ class RigidBodies:
     def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return the momentum M qd, (n, 1), and d/dq of the kinetic energy, (n, 1), both without armature.
 
-        Both are projections of the spatial momentum of all bodies that a joint carries: M qd onto the joint axis S, the
-        gradient onto dS/dt = twist x S.
+        Let h be the spatial momentum of all bodies that a joint carries, S the unit twist of the joint, and v the twist
+        (spatial velocity) of its child body. The entry of M qd is S . h. The entry of the gradient is (dS/dt) . h, with
+        dS/dt = v x S.
         """
         # `twists` has the twist of the base, then of each body, in its own frame: angular velocity, and velocity of the
         # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
         momenta = []
-        for body, (mass, moment, inertia), (rotation, position) in self._rows():
+        for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, v = twists[body.parent + 1]
             w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
             speed = _Z * (float(body.multiplier) * qd[body.coordinate])
@@ -125,10 +129,6 @@ class RigidBodies:
             momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
             gradient[body.coordinate] += ratio * turned
         return momentum, gradient
-
-    def _rows(self) -> Iterator[tuple[Body, tuple[ca.SX, ca.SX, ca.SX], Frame]]:
-        """Return (body, (mass, first moment (3, 1), inertia tensor (3, 3)), frame) of each body, parents first."""
-        return zip(self.bodies, self.inertias, self.frames, strict=True)
 
     def _accumulate(self, wrenches: list[Wrench]) -> None:
         """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
@@ -151,10 +151,11 @@ def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return M, (n, n), and V, (1, 1) [J], of the rigid bodies at q, (n, 1), by ``structure.recursion``."""
+    """Return M, (n, n), and potential energy, (1, 1) [J], of rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # Angles of mimic joints are integer multiples of (angle of the leader) / `base`.
+        # `base` is chosen such that angles of mimic joints are integer multiples of q / `base`: their cosines and sines
+        # are then polynomials in cos(q / `base`) and sin(q / `base`).
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)
@@ -194,8 +195,4 @@ def frame_kinematics(bodies: Sequence[Body], carrier: int, pose: np.ndarray, q: 
 def _rotation_about_z(angle: ca.SX) -> ca.SX:
     """Return the matrix of the rotation about z, (3, 3), by an angle, (1, 1) [rad]."""
     c, s = ca.cos(angle), ca.sin(angle)
-    rotation = ca.SX(3, 3)
-    rotation[0, 0] = rotation[1, 1] = c
-    rotation[1, 0], rotation[0, 1] = s, -s
-    rotation[2, 2] = 1
-    return rotation
+    return ca.diagcat(ca.blockcat([[c, -s], [s, c]]), 1)

@@ -79,7 +79,7 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
 def _usage(package: str, name: str, *, controller: bool) -> str:
     """Return the line of the README about the use of the ROS 2 package.
 
-    controller: True if the package contains the controller.
+    package: name of the package. name: name of the model. controller: True if the package contains the controller.
     """
     use = (
         f"Put this folder into a workspace and run colcon build --packages-select {package}. "
@@ -124,7 +124,10 @@ def _controller_numbers(trained: Trained) -> dict[str, object]:
 
 
 def _velocity_limit(velocity: float | None) -> float:
-    """Return the velocity above which the controller damps a joint: 20 % above the URDF's limit."""
+    """Return the velocity above which the controller damps a joint [rad/s, m/s]: 20 % above the URDF's limit.
+
+    velocity: limit in the URDF. If it is None, the result is 1000, which no joint exceeds.
+    """
     largest = UNLIMITED["velocity"]
     return largest if velocity is None else min(float(f"{1.2 * velocity:.4g}"), largest)
 

@@ -9,11 +9,6 @@ class ExportTuning:
 
     # [1] Number of random states of a parity check.
     states: int = 200
-    # [rad/s] Nominal speed of a revolute joint whose URDF has no velocity limit, for the states of parity
-    # checks.
-    angular_speed: float = 1.0
-    # [m/s] Nominal speed of a prismatic joint whose URDF has no velocity limit.
-    linear_speed: float = 0.3
     # [1] Largest allowed difference between results of C, CasADi or torch programs and of the model, divided by the
     # largest value of the result. `benchmarks/deploy.py` measures 4e-14.
     tolerance: float = 1e-12

@@ -7,7 +7,6 @@ from lxml import etree
 
 from spelgen.arm.arm import lump_links
 from spelgen.arm.chain import choose_chain
-from spelgen.arm.rational import rotation_from_rpy
 from spelgen.dynamics.body_regressor import about_center
 from spelgen.dynamics.parameters import friction_factor
 from spelgen.exporting.describe import Trained, array
@@ -60,25 +59,20 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     joints = {element.get("name"): element for element in root.findall("joint")}
     chain = choose_chain(robot, arm.joint_names, None)
     lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
-    # Some tools do not read the orientation of an <inertial>: fixed links get an <inertial> without one, too.
-    for link in robot.links:
-        if link.inertial and any(link.inertial.rpy):
-            mass, center, rpy, (xx, xy, xz, yy, yz, zz), _ = link.inertial
-            rotation = rotation_from_rpy(rpy)
-            tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            _set_inertial(links[link.name], mass, rotation.T @ center, tensor, rotation)
     for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
         for link in body.links:
-            _remove(links[link.name], "inertial")
+            etree.strip_elements(links[link.name], "inertial")
         name = body.joint.child
         # `rotation` maps from the body frame, whose z axis is the joint axis, to the link frame.
         rotation = np.array(lumped.frames[name].rotation.T, dtype=float)
-        _set_inertial(links[name], *about_center(inertia), rotation)
+        mass, center, tensor = about_center(inertia)
+        # Some tools do not read the orientation of an <inertial>, so the tensor has the axes of the link.
+        links[name].insert(0, _inertial(mass, rotation @ center, rotation @ tensor @ rotation.T))
     friction = projection.friction
     for index, coordinate in enumerate(arm.coordinates):
         element = joints[coordinate.name]
         # Existing <dynamics> of a joint are removed: with two of them, some tools read the first and some the last.
-        _remove(element, "dynamics")
+        etree.strip_elements(element, "dynamics")
         values = {"damping": _number(friction.viscous[index]), "friction": _number(friction.coulomb[index])}
         etree.SubElement(element, "dynamics", values)
     return bytes(etree.tostring(root, xml_declaration=True, encoding="utf-8")) + b"\n"
@@ -132,7 +126,10 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 
 
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
-    """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint."""
+    """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint.
+
+    The names are the fields of ``FrictionConstants``, and ``position_factor``. projection: for the joint ranges.
+    """
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}
     factor = array(friction_factor(model, sampled_positions(projection.arm.chain)))
@@ -148,34 +145,21 @@ def _plain(value: npt.ArrayLike) -> object:
     return rounded(value).tolist()
 
 
-def _set_inertial(
-    link: etree._Element, mass: float, center: np.ndarray, tensor: np.ndarray, rotation: np.ndarray
-) -> None:
-    """Replace the <inertial> of a link.
+def _inertial(mass: float, center: np.ndarray, tensor: np.ndarray) -> etree._Element:
+    """Return the <inertial> of a link.
 
     Args:
-        link: <link> element of the URDF.
         mass: mass [kg].
-        center: centre of mass in the body frame, (3,) [m].
-        tensor: inertia about the centre of mass in the body frame, (3, 3) [kg m^2].
-        rotation: rotation from the body frame to the link frame, (3, 3).
+        center: centre of mass in the link frame, (3,) [m].
+        tensor: inertia about the centre of mass along the axes of the link frame, (3, 3) [kg m^2].
     """
-    _remove(link, "inertial")
-    center = rotation @ center
-    tensor = rotation @ tensor @ rotation.T
     inertial = etree.Element("inertial")
     etree.SubElement(inertial, "origin", xyz=" ".join(map(_number, center)), rpy="0 0 0")
     etree.SubElement(inertial, "mass", value=_number(mass))
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = list(map(_number, tensor[np.triu_indices(3)]))
+    moments = map(_number, tensor[np.triu_indices(3)])
     etree.SubElement(inertial, "inertia", dict(zip(names, moments, strict=True)))
-    # The <inertial> is inserted as the first child, as in most URDFs.
-    link.insert(0, inertial)
-
-
-def _remove(element: etree._Element, tag: str) -> None:
-    for child in element.findall(tag):
-        element.remove(child)
+    return inertial
 
 
 def _number(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Constants of drives whose 95 % intervals are in a posterior, and the straight line that approximates friction."""
+"""Constants of drives that have 95 % intervals, and friction torque approximated by a straight line over velocity."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from spelgen.runtime.motors import MotorInputs
 class DriveQuantity(NamedTuple):
     """A constant of drives that has one value per joint.
 
-    unit: format string for the `UNITS` of a joint's type. positive: True if all values are positive. joints: indices of
-    the joints that have this constant.
+    unit: format string into which the units of the joint's type (`UNITS`) are inserted, for example "{0.torque}".
+    positive: True if all values are positive. joints: indices of the joints that have this constant.
     """
 
     name: str
@@ -39,8 +39,9 @@ TORQUE_UNITS = {
 def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
     """Return the constants of drives whose input is a torque, and the function that returns their values.
 
-    The function returns (4, n) for a model, or (5, n) with trained motor gains. Viscous and Coulomb friction
-    approximate the friction by least squares up to the typical speed.
+    The constants are armature, viscous friction, Coulomb friction, torque offset and, if motor gains are trained, gain.
+    The function returns (4, n) for a model, or (5, n) with gains. Viscous and Coulomb friction approximate the friction
+    by least squares up to the typical speed of each drive.
     """
     line = friction_line(model)
     gains = model.inputs.gain_rows.tolist() if isinstance(model.inputs, MotorInputs) else []
@@ -53,7 +54,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return the constants of the drives, (4, n), or (5, n) with motor gains, in the order of `TORQUE_UNITS`."""
+        """Return armature, viscous and Coulomb friction, torque offset and, if trained, gain, (4, n) or (5, n)."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
@@ -65,10 +66,10 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
 def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n) [Nm s/rad, N s/m; Nm, N].
 
-    The coefficients are the slope and the intercept of a straight line through the friction torque at speeds up to the
-    typical speed, fitted by least squares. The friction torque is averaged over random positions. The gravity load and
-    the factor by which residual terms multiply friction at these positions are computed only once, from the argument
-    ``model``: the same load and factor are also used for models with other friction parameters.
+    The coefficients are the slope and the intercept of a straight line, fitted by least squares to the friction torque
+    at speeds up to the typical speed of each drive (`friction.speed`). The friction torque is averaged over random
+    positions. It depends on the gravity load and on the friction factor of residual terms. Both are computed once, from
+    the argument ``model``, and are then constant for all models.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]
@@ -83,7 +84,7 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 
     def line_of(model: ArmModel) -> Tensor:
-        """Return viscous and Coulomb friction coefficients of `model`, (2, n), for the precomputed load and factor."""
+        """Return viscous [Nm s/rad, N s/m] and Coulomb [Nm, N] friction coefficients of `model`, (2, n)."""
         friction = model.friction
         speed = torch.from_numpy(speeds)[:, None] * friction.speed
         slope, intercept = line @ (factor * friction.prepare().torque(speed[:, None], load)).mean(dim=1)

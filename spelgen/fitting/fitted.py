@@ -95,7 +95,7 @@ class Fit:
 
     @property
     def torque_nmse(self) -> dict[str, float]:
-        """Mean squared torque error divided by the variance of the torque, per joint name.
+        """Mean squared torque error on the fitted samples divided by the variance of their torque, per joint name.
 
         Joints with constant torque are omitted.
         """

@@ -76,9 +76,9 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: the latest computed normal equations. They belong to the last iterate if the solver ended since no
-    step from it was accepted. They belong to the iterate before it if the solver ended directly after an accepted step
-    (small decrease of the cost, maximum number of steps).
+    normal_equations: the latest computed normal equations. If the solver ended because no further step was accepted,
+    they are computed at the last iterate. If it ended directly after an accepted step (small decrease of the cost,
+    maximum number of steps), they are computed at the iterate before this step.
     """
 
     state: SolverState[Parameters]
@@ -102,13 +102,17 @@ class LeastSquaresProblem(Protocol[Parameters]):
         """Return the cost at x, computed from the result of `residual` at x; infinite if the residual diverged."""
 
     def normal_equations(self, x: Parameters, residual: Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters."""
+        """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) with respect to k free parameters.
+
+        residual: result of `residual` at x.
+        """
 
     def candidates(self, x: Parameters, step: Tensor) -> Iterable[Parameters]:
-        """Return one or more candidates x for the parameters that result from a step (k,) of the k free parameters.
+        """Return one or more candidates for the parameters x after a step (k,) of the k free parameters.
 
-        The solver evaluates the next candidate only if the gain ratio of the best candidate so far (decrease of the
-        cost divided by the predicted decrease) is low.
+        A problem may have several candidates, for example x + step, and a point on a curve along which its residual is
+        less nonlinear. The solver evaluates the next candidate only if the gain ratio of the best candidate so far
+        (decrease of the cost divided by the predicted decrease) is low.
         """
 
 

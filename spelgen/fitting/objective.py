@@ -68,7 +68,11 @@ class Objective(ABC):
         return self._checkpoint
 
     def _make_checkpoint(self, loss: float, seconds: float, substeps: int, step: int = 0) -> None:
-        """Set the checkpoint of a finished fit without epochs. loss: final validation loss. seconds: duration [s]."""
+        """Set the checkpoint of a finished fit without epochs.
+
+        loss: final validation loss. seconds: duration [s]. substeps: number of integrator steps per sample interval.
+        step: number of optimizer steps.
+        """
         self._checkpoint = {
             "epoch": 0, "step": step, "best_epoch": 0, "best_loss": loss, "seconds": seconds, "substeps": substeps,
             "best_weights": copy.deepcopy(self.model.state_dict()),

@@ -110,8 +110,8 @@ class MiniBatchAdamW(WindowOptimizer):
         value.backward()
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, TUNING.gradient_norm)
         self._optimizer.step()
-        # A gradient that is not finite makes the returned loss NaN (0 * NaN is NaN): an explicit test would wait for a
-        # GPU.
+        # If the gradient is not finite, 0 * norm is NaN, and so is the returned loss. An explicit test of the norm
+        # would wait for a GPU.
         return value.detach() + 0.0 * norm
 
 
@@ -127,7 +127,7 @@ class _EagerLBFGS(torch.optim.LBFGS):
 class LBFGS(WindowOptimizer):
     """L-BFGS (Liu and Nocedal, Math. Programming 45, 1989) with a strong-Wolfe line search on all windows.
 
-    The argument ``steps`` is the maximum number of evaluations of the loss; the learning rate is not used.
+    In `run`, ``steps`` is the maximum number of evaluations of the loss, and the learning rate is not used.
     weight_decay: factor of the penalty, which is half the sum of squares of all matrices and is added to the loss.
     """
 
@@ -154,10 +154,10 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Minimise a sum of losses; return the final sum without the penalty, NaN if no evaluation was finite.
+        """Minimise a sum of losses plus the class's penalty; return the final sum, NaN if no evaluation was finite.
 
-        Only one summand at a time is in memory with its graph of derivatives. steps: maximum number of evaluations of
-        the sum.
+        The returned sum does not include the penalty. Only one summand at a time is in memory with its graph of
+        derivatives. steps: maximum number of evaluations of the sum.
         """
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps

@@ -339,7 +339,8 @@ def _constants(model: ArmModel) -> Tensor:
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
     """Return the tensor ``name`` of a posterior's content.
 
-    Return None unless the tensor has the given shape, is float64, finite and not zero.
+    Return None if the content has no tensor of this name, of the given shape and of type float64, if an element is not
+    finite, or if all elements are zero: such a content is damaged, or of another model.
     """
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:

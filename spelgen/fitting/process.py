@@ -39,7 +39,7 @@ def require_device(device: str) -> None:
 
 @contextmanager
 def threads_of_torch(count: int) -> Iterator[None]:
-    """Set the number of torch's threads within a context.
+    """Set the number of torch's threads to ``count`` within a context.
 
     More than two threads rarely accelerate operations on small matrices; with one thread, runs are repeatable.
     """
@@ -146,7 +146,10 @@ class TrainingProgress:
         self._show_stage("momentum", step, steps, state, f"{step} steps, {state}")
 
     def round(self, number: int, rounds: int, steps: int, rms: float) -> None:
-        """Show the progress of a servo fit: outer iteration, number of solver steps, RMS position error [rad, m]."""
+        """Show the progress of a servo fit: outer iteration ``number`` of ``rounds``, and number of solver steps.
+
+        rms: RMS position error [rad, m].
+        """
         state = f"{steps} steps, errors {1000 * rms:.3g} mrad"
         self._show_stage("servos", number, rounds, state, state)
 
@@ -158,7 +161,10 @@ class TrainingProgress:
         self._show_stage("training", record["epoch"], epochs, state, line)
 
     def _show_stage(self, stage: str, done: int, total: int, state: str, line: str) -> None:
-        """Show the stage with ``state`` in the bar; without a terminal, print ``line`` when the stage ends."""
+        """Show in the bar that ``done`` of ``total`` steps of a stage are complete, and the text ``state``.
+
+        Without a terminal, ``line`` is printed when the stage ends.
+        """
         if not self._line.startswith(stage):
             self._end_stage()
             self._bar.reset(self._task, description=stage, total=total, visible=True)

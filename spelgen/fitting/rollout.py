@@ -77,9 +77,11 @@ def _adaptive_step(
     """Return q, p, z at the end of an interval, integrated with adaptive steps, and dq/dt at the start of the interval.
 
     The solver is dopri5 (Dormand and Prince, J. Comput. Appl. Math. 6, 1980); gradients are propagated through its
-    steps. All W windows are integrated together, with time divided by the duration of the window's interval.
+    steps. All W windows are integrated together, although their intervals differ in duration: time is divided by the
+    duration.
 
     Args:
+        dynamics: dynamics whose bristles are displaced (see `memory_after`).
         rhs: function of (q, p, z) that returns dq/dt and dp/dt.
         q, p: positions and momenta, (W, n).
         z: friction state of K bristles per joint, (W, n, K).
@@ -91,7 +93,7 @@ def _adaptive_step(
     def rate(t: Tensor, state: Tensor) -> Tensor:
         """Return the derivative of the state (q, p), (W, 2 n), with respect to t = time / duration of the interval.
 
-        state: (W, 2 n) for W windows. The duration `step` converts the derivative with respect to time.
+        It is the derivative with respect to time, multiplied by the duration `step`. state: (W, 2 n) for W windows.
         """
         q_now, p_now = state.chunk(2, dim=-1)
         return step * torch.cat(rhs(q_now, p_now, memory_after(dynamics, z, q_now - q)), dim=-1)
@@ -135,10 +137,10 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the divisors of the errors in the losses for windows of logs.
+    """Return the divisors of the errors of q, qd and tau in the losses for windows of logs, from the logged motion.
 
-    A joint that hardly moves has 1 % of the largest scale of all joints. Raises LogError if no joint moves, since
-    windows at rest do not determine a model.
+    A divisor is at least 1 % of the largest one of all joints, also for a joint that hardly moves. Raises LogError if
+    no joint moves, since windows at rest do not determine a model. joint_types: see `position_difference`.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)
     if moved.abs().max() < AT_REST:
@@ -156,7 +158,7 @@ def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
 
 
 def _scale(mean_square: Tensor) -> Tensor:
-    """Return the loss scales for mean squares (..., n) of n joints: square roots, at least 1 % of the largest root."""
+    """Return the loss scales of n joints, (..., n): roots of `mean_square`, at least 1 % of the largest root."""
     root = mean_square.sqrt()
     # The bound 1e-9 keeps the scale positive even if nothing varies, since errors are divided by the scale.
     smallest = (1e-2 * root.amax(dim=-1, keepdim=True)).clamp(min=1e-9)
@@ -168,7 +170,8 @@ def rollout_errors(
 ) -> Tensor:
     """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities.
 
-    There are W windows of K samples; the first sample of a window is the initial state and has no error.
+    There are W windows of K samples; the first sample of a window is the initial state and has no error. substeps,
+    solver: see `roll_out`.
     """
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q
@@ -223,7 +226,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; NaN if the rollout of a window diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges."""
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)

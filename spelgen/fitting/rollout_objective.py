@@ -62,7 +62,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the momentum stage, then epochs until the fit ends; ``save`` is called after the stage and each epoch."""
+        """Run the stage of steps on `momentum_loss`, then epochs until the fit ends; ``save`` is called after each."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -152,7 +152,7 @@ class RolloutObjective(MomentumObjective):
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate of a later step. ahead: its number minus the number of the last completed step."""
+        """Return the learning rate of the step that follows after ``ahead`` more steps; 0: of the next step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
@@ -172,9 +172,10 @@ class RolloutObjective(MomentumObjective):
         return TUNING.first_stage if self.fixed else 1.0
 
     def _release(self, end: Status) -> bool:
-        """Start the second stage of a fit; return False if there is none: no weights are fixed, or the time is up.
+        """Start the second stage of a fit, in which all weights are free; return False if there is no second stage.
 
-        end: status of the first stage.
+        There is none if the first stage fixed no weights or completed no epoch, or if the time is up. end: status of
+        the first stage.
         """
         if not self.fixed or end == "out of time" or not self.epoch:
             return False
@@ -184,7 +185,7 @@ class RolloutObjective(MomentumObjective):
         return self._end() is None
 
     def _roll_back(self, weights: Content, optimizer: Content, step: int) -> None:
-        """Restore the state before a diverged epoch, and halve all further learning rates.
+        """Restore weights, optimizer and step number from before a diverged epoch; halve all later learning rates.
 
         Raises RunError after too many diverged epochs.
         """

@@ -65,11 +65,11 @@ class RunFolder:
         content = {self.spec: f"{spec.to_json()}\n".encode()}
         # The URDF is read before files are removed: it may be the copy in this folder.
         if urdf is not None and urdf.exists():
-            content[self.urdf] = urdf_bytes(urdf)  # a xacro file is expanded
+            content[self.urdf] = urdf_bytes(urdf)  # stores the expanded URDF of a xacro file
         if urdf is not None and (settings := urdf.with_suffix(".yaml")).is_file():
             content[self.settings] = settings.read_bytes()
-        # config.json is the first attribute and is removed first: if the removal is interrupted, the folder is not
-        # treated as a run.
+        # The files are removed in the order of `__init__`. The first one is config.json, which marks the folder as a
+        # run: if the removal is interrupted, the folder is not treated as a run.
         for file in vars(self).values():
             if file != self.path:
                 remove(file)

@@ -35,7 +35,8 @@ def train(
 ) -> Fit:
     """Fit the module to the logs and write a run folder (see `RunFolder`).
 
-    A resumed run uses the recorded options and the recorded mapping of the logs, unless the arguments replace them.
+    If `options.resume` is True, the run in the folder is resumed. It uses the recorded options and the recorded mapping
+    of the logs, unless the arguments replace them.
 
     Args:
         module: the built module; None: the fit continues from the model of ``source``.
@@ -43,19 +44,21 @@ def train(
         config: a configuration, or options by name; the default objective depends on the logs.
         urdf: URDF that the module was built from, for the regularizer and the baselines; by default, the file with the
             URDF's original name in the module's folder.
-        source: run folder with a fitted model, by default ``folder``.
+        source: run folder with the fitted model, used only if ``module`` is None; by default ``folder``.
         of_logs: dict with fields of `Preprocessing`, validation_fraction and seed.
         require: function that checks the logs before the fit: it raises an error for unusable logs and returns
             diagnostics.
+        options: device, files and messages of the run (see `RunOptions`).
 
     Raises ModuleError, LogError, and RunError if the folder contains a run or cannot be resumed with these arguments.
     """
     run = RunFolder(folder)
     robot, notes, settings = None, list[Diagnostic](), dict(of_logs or {})
     if options.resume:
-        # The record is read first, so that a missing run is reported before the logs are read.
+        # The record of the run (config.json) is read first, so that a folder without a run is reported before the logs
+        # are read.
         record = run.read_record()
-        # Validation logs that were passed from Python are not stored in a file, so the run cannot be resumed here.
+        # Validation logs that were passed from Python are not stored in a file, so this function cannot resume the run.
         if record.validation_fraction is None and record.validation:
             raise RunError(
                 "a run whose validation logs were passed from Python", file=run.path,
@@ -101,7 +104,12 @@ def _resumed(config: FitConfig | FitOptions | None, record: Record) -> FitConfig
 def robot_of(
     module: Path | None, urdf: Path | str | None, spec: ModelSpec
 ) -> tuple[Path | None, list[Diagnostic]]:
-    """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF."""
+    """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF.
+
+    The URDF is `urdf` or, if it is None, the file named in `spec` in the folder of `module`. It must be the URDF from
+    which the module was built: otherwise ModuleError is raised for `urdf`, and a warning is returned for the file in
+    the folder of `module`. Raises RunError if there is no file `urdf`.
+    """
     if urdf is not None:
         path = Path(urdf)
     elif module is not None:

@@ -26,8 +26,8 @@ class FittingTuning:
     # [1] Smallest predicted decrease of the cost for which a step is tried, as a fraction of the cost; smaller ones are
     # within rounding errors.
     min_predicted_decrease: float = 1e-10
-    # [1] Gain ratio (decrease divided by predicted decrease) below which the next candidate of a step is evaluated,
-    # too.
+    # [1] Gain ratio (decrease of the cost divided by its predicted decrease) below which the next point that the
+    # problem proposes for a step (`candidates`) is evaluated, too.
     min_gain_ratio: float = 0.5
 
     # Constants of the windows on which a fit is validated (`fitting.dataset`).
@@ -45,18 +45,19 @@ class FittingTuning:
     warm_up: float = 0.02
     # [1] Learning rate at the end of the cosine schedule, as a fraction of the full learning rate.
     final_rate: float = 0.01
-    # [1] Fraction of the allowed time that momentum steps may take.
+    # [1] Fraction of the time limit of a fit that steps on the loss of momenta (`momentum_loss`) may take.
     momentum_fraction: float = 0.5
-    # [1] Learning rate of momentum steps, which are cheap and noisy, as a multiple of the configured learning rate.
+    # [1] Learning rate of steps on `momentum_loss`, which are cheap and noisy, as a multiple of the configured learning
+    # rate.
     momentum_factor: float = 10.0
 
-    # Constants of epochs of predicted windows (`fitting.rollout_objective`).
+    # Constants of fits to predicted motion in windows of the logs (`fitting.rollout_objective`).
 
     # [1] Largest fraction of all steps, or of the time limit, for the first stage. In the first stage, residual terms
     # that the torque fit did not select are fixed.
     first_stage: float = 0.8
-    # [1] The second stage ends after this number of epochs without improvement. Residual terms that describe the arm
-    # lower the loss within few epochs.
+    # [1] The second stage, in which all terms are free, ends after this number of epochs without improvement. Residual
+    # terms that describe the arm lower the loss within few epochs.
     second_patience: int = 3
     # [1] Number of epochs after which the integration step is chosen again: the fitted friction may have become too
     # stiff for the present step.

@@ -38,9 +38,10 @@ class UrdfRegularizer(NamedTuple):
     def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
-        The loss is the sum of two terms, averaged over the positions: the squared Frobenius norm of the difference of
-        W (M - mean M) W^T, divided by n, and the mean square over the joints of the difference of the gravity torque,
-        divided by `gravity_scale`.
+        The loss is the sum of two terms, averaged over the positions. The first one is the squared Frobenius norm,
+        divided by n, of the difference of W (M - mean M) W^T, where W is `whitening`, and mean M is over the positions,
+        for model and URDF separately (see the module). The second one is the mean square over the joints of the
+        difference of the gravity torques divided by `gravity_scale`.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -56,7 +57,8 @@ def urdf_regularizer(
 ) -> UrdfRegularizer | None:
     """Return the regularizer towards a URDF; None without a URDF.
 
-    If the URDF cannot be read, a message is appended to ``notes``, and the result is None.
+    If the URDF cannot be read, a message is appended to ``notes``, and the result is None. windows: windows of the
+    logs; model and URDF are compared at random positions in their range of positions.
     """
     if urdf is None or not urdf.exists():
         return None
@@ -74,7 +76,7 @@ def _at_random_positions(urdf: Path, model: ArmModel, windows: Windows) -> UrdfR
 
     Args:
         urdf: URDF file.
-        model: model before the fit; the mean of its M is the unit of M.
+        model: model before the fit. Mass matrices are made dimensionless by the mean of its M over the positions.
         windows: windows of the logs, whose positions define the range.
 
     Raises:

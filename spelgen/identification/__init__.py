@@ -1,1 +1,1 @@
-"""Linear least squares on logs: base parameters, torque delay, couplings of motors, tests of a log's geometry."""
+"""Linear least squares on logs: base parameters, torque delay, couplings of motors, faults of a log's columns."""

@@ -97,12 +97,13 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Base class of faults that factors on the motion and on the torques correct: signals of another sense or unit.
+    """Base class of faults that factors correct: motion or torques of the opposite sense or in another unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
-    All subclasses share `joint_keys`: the setting `sign` reverses both the motion and the torque of a joint, so that a
-    correction of the motion also changes the setting `gain` of the torque.
+    All subclasses share the method `joint_keys`, which converts the factors to settings: the setting `sign` reverses
+    both the motion and the torque of a joint, so a correction of only the motion also changes the setting `gain` of the
+    torque.
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
@@ -114,7 +115,7 @@ class WrongScale(Fault):
         """Return the mask (n,) of the joints with this fault, for factors (n,) that correct their motion and torque."""
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the log's torques with each candidate for factors on motion and torque."""
+        """Yield the least-squares fit of the log's torques with each of `factors` added to the hypothesis of `base`."""
         return self._scaled_by(self.factors, problem, base)
 
     def _scaled_by(
@@ -130,7 +131,7 @@ class WrongScale(Fault):
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings that correct the scale of a joint's signals, as far as they change.
+        """Return the settings that correct the scale of a joint's signals; unchanged settings are omitted.
 
         These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
         """
@@ -161,7 +162,7 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault of a log: positions and velocities of a joint have the opposite sense, with or without torque."""
+    """Kind of fault of a log: a joint's positions and velocities, and perhaps its torques, have the opposite sense."""
 
     code = "joint-sense"
 
@@ -170,11 +171,14 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense: `motion`, (n,), is negative there."""
+        """Return the mask (n,) of the joints whose motion has the opposite sense: its correction factor is negative.
+
+        motion, torque: (n,) correction factors of the joints.
+        """
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about joints of the opposite sense, which states whether it includes their torques."""
+        """Return the text about joints whose motion has the opposite sense; it states the sense of the torques, too."""
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():
@@ -193,7 +197,10 @@ class TorqueSense(WrongScale):
         super().__init__([np.stack([np.ones(n), sign]) for sign in (-np.ones(n), *(1.0 - 2.0 * np.eye(n)))])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints of which only the torque has the opposite sense (factor below 0)."""
+        """Return the mask (n,) of the joints of which only the torque has the opposite sense.
+
+        motion, torque: (n,) correction factors of the joints; here `motion` is positive and `torque` negative.
+        """
         return np.asarray((torque < 0) & (motion > 0))
 
 
@@ -201,8 +208,8 @@ class TorqueUnit(WrongScale):
     """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
     The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
-    candidate need not lower the cost much, unlike other faults: the fit without it explains torques that are too small
-    by light bodies.
+    candidate need not lower the cost much, unlike other faults: the fit without it may explain torques that are too
+    small with bodies that are too light.
     """
 
     code = "torque-unit"
@@ -213,22 +220,24 @@ class TorqueUnit(WrongScale):
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
         """Define the candidates.
 
-        factors: factors (n,) on the torques. is_open: (n,) True for joints whose torque may have another unit.
-        is_milli: (n,) True for joints whose torques are declared in mNm.
+        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
+        may have another unit. is_milli: (n,) True for joints whose torques are declared in mNm.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of torques that are multiplied by each candidate for factors (n,) on torques.
+        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        A fit with a separate factor for each joint is added if it is better.
+        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
+        yielded, too.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
         if is_open.all():
-            # Under a hypothesis with other senses or orders, the gravity in the torques has another magnitude. A factor
-            # that was found with a wrong sense is corrected.
+            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
+            # torque to the URDF's. The torque factor is therefore computed again from this ratio; this also corrects an
+            # earlier factor with a wrong sense.
             fitted, of_urdf = problem.gravity_torques(base)
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
@@ -236,8 +245,8 @@ class TorqueUnit(WrongScale):
         if not candidates:
             return
         for factor in candidates:
-            # Factors near 1000 on torques in mNm become 1000: the torques are in Nm, and the masses of the URDF are
-            # inexact.
+            # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
+            # is inexact because the masses of the URDF are.
             is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
@@ -246,18 +255,18 @@ class TorqueUnit(WrongScale):
         if is_found:
             return
         best = lowest = min(fits, key=lambda fit: fit.cost)
-        # Factors are optimised for one joint after the other, then for all joints together: the dynamic coupling of the
-        # joints determines the ratios of the factors, and the masses of the URDF determine their common factor.
+        # The torque factors are optimised for one joint after the other: the dynamic coupling of the joints determines
+        # their ratios. Then a common factor of all joints is optimised, which the masses of the URDF determine.
         for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
             exponent = minimize_scalar(
                 lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
                 bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
             ).x  # fmt: skip
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # Three conditions are tested. Separate factors also correct errors of the URDF's masses, which lowers the cost
-        # a little: one factor must be as large as of another unit, and the cost decrease must be significant. Torques
-        # of another fault, such as torques without sign, are not explained by any factor, so the relative residual of
-        # each joint must be small.
+        # Separate factors of the joints are accepted under three conditions. They also correct errors of the URDF's
+        # masses, which lowers the cost a little: (1) therefore at least one factor must be large enough for another
+        # unit, and (2) the cost decrease must be significant. (3) The relative residual of each joint must be small,
+        # since no factor explains torques with another fault, such as a lost sign.
         is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
         is_explained = best.errors.max() <= GEOMETRY.unexplained
         if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
@@ -273,13 +282,16 @@ class TorqueUnit(WrongScale):
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit: `torque`, (n,), is not 1 or -1 there."""
+        """Return the mask (n,) of the joints whose torque has another unit: its correction factor is not 1 or -1.
+
+        motion, torque: (n,) correction factors of the joints.
+        """
         return np.asarray(np.abs(torque) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about torques in another unit: the largest factor, and the opposite sense of the torques.
+        """Return the text about torques in another unit: the factor that is farthest from 1, and its sense.
 
-        The opposite sense is omitted if another fault of the hypothesis, such as `TorqueSense`, has it.
+        An opposite sense is omitted if another fault of the hypothesis, such as `TorqueSense`, already states it.
         """
         torque = correction.factors[1]
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
@@ -301,7 +313,10 @@ class TorqueUnit(WrongScale):
 
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for factors between torques and the URDF's gravity that wrong inertials do not explain."""
+    """Return True for ratios of logged gravity torques to the URDF's that wrong inertials do not explain.
+
+    The magnitude of such a ratio is at least `GEOMETRY.other_unit`, or at most its inverse.
+    """
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
 
@@ -312,7 +327,7 @@ def rounded_factor(factor: float) -> float:
     changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # The bound is wide, since the factor is only as exact as the masses of the URDF.
+        # The tolerance of 1.5 is wide, since the factor is only as exact as the masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
@@ -325,7 +340,10 @@ class PositionUnit(WrongScale):
     rarity = 2
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit: `motion`, (n,), is not 1 or -1."""
+        """Return the mask (n,) of the joints whose positions have another unit: their correction factor is not 1 or -1.
+
+        motion, torque: (n,) correction factors of the joints.
+        """
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:

@@ -1,6 +1,6 @@
-"""Kinds of faults of a log with a continuous quantity: zero offsets, delays, the vector of gravity.
+"""Kinds of faults of a log that real numbers describe: zero offsets, delays, clocks, the vector of gravity.
 
-The quantity of lowest cost is found by Gauss-Newton steps (`GeometryProblem.descend`).
+The values of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
 """
 
 from __future__ import annotations
@@ -52,8 +52,9 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # Length of a step that ends the descent: `min_offset` if it starts at the unchanged zero, since a smaller
-        # offset is only a calibration error; otherwise shorter, since the offset near a right angle has to be accurate.
+        # The descent ends at steps of the offset below `smallest`: `min_offset` if it starts at the unchanged zero,
+        # since a smaller offset is only a calibration error. From another start, a multiple of 90 degrees, `smallest`
+        # is smaller, to make the offset accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -63,7 +64,8 @@ class ZeroOffset(Fault):
             exact = problem.fit(shifted(right))
             if right.any() and exact.cost < best.cost + GEOMETRY.right_angle:
                 candidates.append(exact)
-        # an uncertain angle may be far from a multiple of 90 degrees of about the same cost: both are possible
+        # If a multiple of 90 degrees is far from the best offset, but has about the same cost, the log does not
+        # determine which of the two is right: both are candidates.
         if not candidates or abs(offset - right)[0] > GEOMETRY.serious_angle:
             candidates.append(problem.fit(shifted(offset.round(4))))
         # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only
@@ -74,7 +76,7 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets: the largest offset of the joints that have the right sense."""
+        """Return the text about zero offsets: the largest one of the joints that `JointSense` does not correct."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -84,7 +86,7 @@ class ZeroOffset(Fault):
         return f"positions with another zero, by {size}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `offset` of a joint if the hypothesis has another zero of its position; {} if not.
+        """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
 
         For a joint of the opposite sense, {} is returned, too: `JointSense` returns sign and offset of such a joint,
         since another sign may need another offset.
@@ -96,8 +98,10 @@ class ZeroOffset(Fault):
 
     def minor_code(self, correction: Correction) -> str:
         """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
-        shifts = correction.hypothesis.offset - correction.unchanged.offset
-        return self.code if np.abs(shifts).max() < GEOMETRY.serious_angle else ""
+        shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
+        is_revolute = np.array(correction.arm.joint_types) == "revolute"
+        bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
+        return self.code if (shifts < bounds).all() else ""
 
 
 class Delay(Fault):
@@ -114,7 +118,7 @@ class Delay(Fault):
 
         Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
         omitted. Nothing is yielded if the hypothesis of the fit `base` has a delay already, or if the samples lack the
-        preceding and following signals, with which they can be shifted in time.
+        signals before and after them, from which delayed signals are interpolated.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
@@ -194,10 +198,11 @@ class JointClock(Fault):
             yield from self._near(problem, base)
 
     def _near(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the best fit with delays near 0 at both ends that differ, if a step towards them lowers the cost.
+        """Yield the best fit with a drifting delay of some signals, if one step from the fit `base` lowers the cost.
 
-        The step needs the derivative of the residual with respect to the delay of each signal only: the derivative with
-        respect to the delay at the end of a recording is this derivative times the relative time.
+        `base` has no delays. For each set of `_delayed_signals`, a Gauss-Newton step gives the delays at the start and
+        end of a recording. The derivatives of the residual with respect to them are 1 - t and t times the derivative
+        with respect to a constant delay, with the relative time t from 0 to 1.
         """
         reading, parameters = base.hypothesis, base.parameters
         residual, columns = problem.residual(reading, parameters), []
@@ -218,7 +223,11 @@ class JointClock(Fault):
                 yield from self._best(problem, reading, start, signals)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time."""
+        """Yield at most three least-squares fits in which the delay of some signals changes linearly with time.
+
+        Each set of signals (`_delayed_signals`) and each final delay `GEOMETRY.clock_starts` is an initial guess; the
+        three guesses of lowest cost are refined. unchanged: fit of the unchanged log.
+        """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
             for last in GEOMETRY.clock_starts:
@@ -235,8 +244,9 @@ class JointClock(Fault):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fit in which some signals have the best delays at the start and end of a recording.
 
-        Nothing is yielded if both delays are about equal. start: (2,) [s] initial delays of the descent. signals: (2,
-        n) mask of the delayed motions and torques.
+        Between start and end the delay changes linearly. Nothing is yielded if both delays are about equal, or if the
+        torque residual hardly falls. reading: hypothesis without these delays. start: (2,) [s] initial delays of the
+        descent. signals: (2, n) mask of the delayed motions and torques.
         """
         delays, best = problem.descend(
             lambda x: self._drifting(problem, reading, x, signals), start, largest=0.3, smallest=0.002
@@ -253,7 +263,8 @@ class JointClock(Fault):
     ) -> Hypothesis:
         """Return the hypothesis in which the delay of some signals changes linearly during a recording.
 
-        delays: (2,) [s] at the start and the end. signals: (2, n) mask of the delayed motions and torques.
+        reading: hypothesis without these delays. delays: (2,) [s] at the start and the end. signals: (2, n) mask of the
+        delayed motions and torques.
         """
         first, last = delays
         drift = (last - first) / float(problem.samples.times.max())
@@ -266,15 +277,16 @@ class JointClock(Fault):
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints that have signals with times of another clock."""
+        """Return the names of the joints with signals whose times, by `correction`, are from a clock of their own."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 
 
 def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:
-    """Return True if a fit with other times explains much more of a joint's torque than the base.
+    """Return True if delayed signals explain the torque of at least one joint much better than the fit `base`.
 
-    Friction with a history also resembles a delay: the residual must be smaller with both friction models.
+    The joint's squared torque residual in `fit` must be less than `GEOMETRY.delay_gain` times the residual in `base`.
+    Hysteresis of friction resembles a delay, so this must also hold for the fits of both hypotheses with hysteresis.
     """
     stateful = problem.with_hysteresis()
     is_better = fit.errors < GEOMETRY.delay_gain * base.errors
@@ -310,9 +322,10 @@ class Compensation(Fault):
     rarity = 3
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the torques with the best fraction of gravity, or without gravity.
+        """Yield the least-squares fit of torques that contain only a fraction of the gravity torque, or none of it.
 
-        The fraction is between -0.5 and 0.5. The fit without gravity is preferred if its cost is about equal.
+        The best fraction between -0.5 and 0.5 is used; it is negative if gravity is compensated too strongly. The fit
+        without gravity is preferred if its cost is about equal.
         """
         present = np.array(base.hypothesis.gravity)
         if not present.any():
@@ -323,8 +336,8 @@ class Compensation(Fault):
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
-        # The fraction is bounded: if more than half of gravity remains in all joints, the masses of the URDF are
-        # probably wrong.
+        # The remaining fraction of gravity is between -0.5 and 0.5: if more than half of gravity remains in all joints,
+        # the masses of the URDF are probably wrong.
         fraction, _ = problem.descend(
             reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
         )
@@ -352,22 +365,24 @@ class Gravity(Compensation):
         """Yield the least-squares fit of the torques with the best direction of gravity.
 
         Directions along the axes of the root link are preferred. Nothing is yielded if the direction differs from the
-        present one by less than errors of the mounting, or if the torques may contain no gravity.
+        direction in `base` by less than errors of the mounting (`GEOMETRY.min_tilt`), or if a gravity compensation
+        explains the torques equally well.
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
-        standard = size or 9.81  # [m/s^2] magnitude of gravity
+        standard = size or 9.81  # [m/s^2] magnitude of gravity in `base`
 
         def turned(gravity: np.ndarray) -> Hypothesis:
             """Return the hypothesis that gravity is this vector, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
-            """Return the vector (3,) [m/s^2] in the direction of `gravity`, with the present magnitude."""
+            """Return the vector (3,) in the direction of `gravity` with the magnitude `standard` [m/s^2]."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
         # Gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as for
-        # an arm whose only joint that gravity loads is vertical and prismatic.
+        # an arm whose only joint with a gravity load is vertical and prismatic: the load is constant, like the torque
+        # offset of the friction model.
         starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
         lowest = min(fit.cost for fit in starts)
         start = next(fit for fit in starts if fit.cost < lowest + 1.0)
@@ -380,9 +395,9 @@ class Gravity(Compensation):
                 )
             )
         new, best = min(descents, key=lambda x: x[1].cost)
-        # Torques without gravity are explained equally well by gravity parallel to the axes of all joints. Of these
-        # directions only -z is accepted; instead of any other direction, a gravity compensation is the more likely
-        # explanation.
+        # Torques without gravity are also explained by gravity parallel to the axes of all joints. A direction found
+        # from the start -z is accepted. Any other direction must have a lower cost than zero gravity; otherwise a
+        # gravity compensation is more likely.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
         if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())

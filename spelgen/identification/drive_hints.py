@@ -51,7 +51,10 @@ class Coupling:
 
 
 def friction_compensated(values: str) -> Diagnostic:
-    """Return the warning about torques that decrease with velocity. values: friction or compensation per joint."""
+    """Return the warning about torques that decrease with velocity.
+
+    values: text with joint names and their negative viscous friction, or their coefficient of friction compensation.
+    """
     message = (
         f"the measured torque decreases with velocity: {values}; friction falls with speed (Stribeck effect), or the "
         "drive compensates friction: check the signs of the torques, and whether the controller subtracts friction"
@@ -136,7 +139,8 @@ class DriveProblem:
         solution = normal_solution(fitted, 1)
         left = np.append(solution, np.full_like(solution[:, :1], -1.0), axis=1)
         errors = left.swapaxes(1, 2) @ products @ left
-        # bounded from below: the residual of an exact model consists of rounding errors
+        # the errors are bounded from below, since they are divisors: the residual of an exact model consists of
+        # rounding errors
         return np.asarray(np.maximum(errors[..., 0, 0].T, TUNING.negligible))
 
     def cost(self, coupling: Coupling) -> float:
@@ -152,7 +156,7 @@ class DriveProblem:
         joint, moved_by, ratio = coupling.joint, coupling.moved_by, coupling.ratio
         motion = self.samples.motion[1:]
         qd, qdd = motion[..., [joint]] + ratio * motion[..., [moved_by]]
-        columns = FRICTION.columns(qd, qdd)[:, 0]  # columns: (S, effects) of the motor
+        columns = FRICTION.columns(qd, qdd)[:, 0]  # (S, effects): friction and inertia of the motor
         n, effects = self.rows.shape[1], columns.shape[1]
         of_motor = np.arange(effects) * n + joint - effects * n - 1
         rows = self.rows[:, coupling.pair].copy()
@@ -171,7 +175,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     The second value is the squared torque residual of both joints with the coupling, divided by the residual without
     it. Joints with a declared coupling are omitted.
     """
-    # all pairs are compared on every fourth sample with three ratios, which suffices to find the best pair
+    # all pairs of joints are compared on every fourth sample with three speed ratios, which suffices to find the best
+    # pair
     coarse = problem.in_one_block(4)
     candidates: list[Coupling] = []
     for joint, moved_by in permutations(problem.free, 2):
@@ -179,7 +184,8 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
             # Only neighbours are tried, which shafts and belts couple; fits of other pairs explain other effects, such
             # as springs.
             continue
-        # three ratios of motor speed are tried; the best one is refined later, within half to twice its value
+        # three magnitudes of the ratio of motor speed to the speed of the joint `moved_by` are tried; the best one is
+        # refined later, within half to twice its value
         for ratio, sign in product((0.4, 1.0, 2.5), (1.0, -1.0)):
             candidates.append(Coupling(joint, moved_by, sign * ratio, "joints"))
             candidates.append(Coupling(joint, moved_by, sign * ratio, "motors"))
@@ -224,7 +230,8 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     """
     if mended.mean() >= gain * logged.mean():
         return False
-    # `gains` are relative differences between -1 and 1, so that no single block dominates their mean
+    # `gains`: error decrease of each block, divided by the sum of its errors without and with the candidate; the values
+    # are between -1 and 1, so that no single block dominates their mean
     gains = (logged - mended) / (logged + mended)
     standard_error = gains.std(ddof=1) / np.sqrt(len(gains))
     # The best of hundreds of candidates is always better by chance. The significance level of 1/400 is therefore

@@ -42,7 +42,8 @@ def kinds_of_faults(
     return (
         WrongOrder("joint-order", "the columns of other joints", (0, 1)),
         WrongOrder("torque-order", "the torques of other joints", (1,)),
-        # fewer starts for orders of only the motion: such logs are rare, and each order requires a new regressor
+        # exchanged columns of only the motion are searched from fewer initial orders: such logs are rare, and each
+        # order requires a new regressor
         WrongOrder("motion-order", "the positions and velocities of other joints", (0,), starts=3),
         JointSense(n),
         TorqueSense(n),
@@ -56,29 +57,40 @@ def kinds_of_faults(
     )
 
 
+def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
+    """Return the kinds of faults that positions and commands of servos share, such as a joint of the opposite sense."""
+    sense = JointSense(len(arm.coordinates))
+    sense.factors = [factor for factor in sense.factors if (factor[1] < 0).any()]
+    order = WrongOrder("joint-order", "the columns of other joints", (0, 1), starts=3)
+    return order, sense, ZeroOffset(), Gravity()
+
+
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    The hypotheses have about the same cost, and the best one is first. If there is none, the result has only the fit of
-    the unchanged log. Kinds of faults with other evidence, such as a comparison of the torques with the URDF's gravity,
-    need no significant decrease of the cost. faults: kinds of faults; each kind and combinations are tested.
+    The hypotheses have about the same cost, and the best one is first. If no decrease is significant, the best
+    hypothesis with other evidence, such as a comparison of the torques with the URDF's gravity, is returned, too, if it
+    lowers the cost at all. Otherwise the result has only the fit of the unchanged log. faults: kinds of faults; each
+    kind and combinations are tested.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # At most three corrections are combined, where an order of all joints is one correction: more corrections could
-    # explain any log.
+    # At most three corrections are combined, where any permutation of the columns is one correction: more corrections
+    # could explain any log.
     for _ in range(3):
         base = min(fits, key=RANK)
-        # one fault of two may look like another one: the first correction is then left open
+        # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
+        # several of the best single corrections.
         is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
         tried: list[HypothesisFit] = []
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
         better = min(tried, key=RANK)
-        # orders of all joints and long drifts are searched only if no single correction explains the torques; a drift
-        # of other signals may be nearer than the right one
+        # To save time, permutations of all joints and long drifts of delays are searched only if no single correction
+        # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
+        # wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -103,6 +115,39 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     return unchanged, *_likely(unchanged, confirmed)
 
 
+def deviating_recordings(problem: GeometryProblem) -> list[int]:
+    """Return the indices of the recordings whose torques contradict those of the other recordings; at most half of all.
+
+    Without the recording, the torques of the others determine parameters that explain them, and not the recording.
+    """
+    coarse = problem.thinned(GEOMETRY.confirming_samples)
+    number, unchanged = coarse.samples.recording, coarse.unchanged
+    tau = unchanged.signals(coarse.samples).tau
+    remaining, deviating = np.unique(number).tolist(), list[int]()
+
+    def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
+        """Return {recording: squared residual (n,) of a fit to the recordings `fitted`, relative to the variance}."""
+        counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
+        residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
+        scale = np.maximum(tau.var(axis=0), 1e-30)
+        return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
+
+    while 2 * len(deviating) + 1 < len(remaining) + len(deviating):
+        present = errors(remaining)
+        worst = max(remaining, key=lambda x: float(present[x].max()))
+        if present[worst].max() < GEOMETRY.unexplained / 5:
+            break
+        reduced = [x for x in remaining if x != worst]
+        without = errors(reduced)
+        usual = np.mean([without[x] for x in reduced], axis=0)
+        if not (
+            (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
+        ).any():
+            break
+        remaining, deviating = reduced, [*deviating, worst]
+    return deviating
+
+
 def _weighed(
     problem: GeometryProblem, fits: Sequence[HypothesisFit], base: HypothesisFit
 ) -> list[HypothesisFit]:
@@ -111,14 +156,16 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    A friction model with hysteresis shows the whole decrease, but also larger decreases of wrong hypotheses: on
-    recorded arms up to 32, instead of 17 without hysteresis. Its decreases are therefore halved. The larger one of the
-    decrease without hysteresis and the halved decrease is used. For a hypothesis with another delay, the smaller one of
-    both decreases (not halved) is used, since hysteresis resembles a delay.
+    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis without hysteresis, and b the
+    decrease with hysteresis. No part of b is hidden, but b is also larger for wrong hypotheses: on recorded arms up to
+    32, and a only up to 17. Therefore half of b counts, and the new cost is the cost of `base` minus max(a, b / 2). For
+    a hypothesis with another delay than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a
+    delay.
 
     Args:
         problem: problem without hysteresis.
-        fits: fits of `problem`; only the best ones, with a cost below the cost of `base`, get other costs.
+        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
+            with hysteresis.
         base: fit of `problem` with which the costs are compared.
     """
     stateful, best = problem.with_hysteresis(), sorted(fits, key=RANK)

@@ -1,4 +1,4 @@
-"""Hypotheses about a log: which signals of the joints and which gravity its columns represent."""
+"""Hypotheses about a log: joint, scale, zero and delay of its columns, and the direction of gravity."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ class Hypothesis:
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
 
-        samples: logged samples. The result has signals only at the samples, and not around them.
+        samples: logged samples. The result has signals only at the samples, and not at times before and after each
+        sample: the last axis of `values` has the length 1.
         """
         delays = _per_signal(self.delay)
         if self.drift.any():
@@ -75,7 +76,7 @@ class Hypothesis:
         return samples._replace(values=signals[..., None])
 
     def logged(self, samples: MotionSamples) -> MotionSamples:
-        """Return the inverse of `signals`: logged samples for `samples` of the joints.
+        """Return the samples that a log with these faults has for the true signals `samples` (inverse of `signals`).
 
         The hypothesis must have no delays, and no exchanged columns.
         """
@@ -90,7 +91,10 @@ def _per_signal(values: np.ndarray) -> np.ndarray:
 
 
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E) with the motion of joint source[0, k] and the torque of source[1, k] at joint k."""
+    """Return signals (S, n, 4, E), with the motion of joint source[0, k] and the torque of joint source[1, k] at k.
+
+    values: (S, n, 4, E), see `MotionSamples`.
+    """
     return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
 
 

@@ -70,7 +70,7 @@ class Identification:
         samples: number of samples.
         drives: map of logged torques to joint torques.
         diagnostics: remarks and warnings about the logs.
-        torque_delay: estimated or given delay by which the logged torques were shifted back.
+        torque_delay: estimated or given delay [s] of the logged torques after the positions, which was removed.
     """
 
     arm: Chain

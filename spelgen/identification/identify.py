@@ -113,8 +113,8 @@ def least_squares(
     return _Equations(arm, samples, drives or Drives(identity, identity)).solved(method or LeastSquares())
 
 
-# [1] Smallest number of samples of a jackknife block, 2 s. Without a prior, a fit without one block fails if only this
-# block excites some parameter, which is likely for short blocks.
+# [1] Smallest number of samples of a jackknife block, 2 s at 100 Hz. Without a prior, the fit to all other blocks fails
+# if some parameter is excited only in the omitted block, which is likely for short blocks.
 MIN_BLOCK = 200
 
 

@@ -15,7 +15,7 @@ QUANTILE = 1.96
 # Number of contiguous blocks of samples in a jackknife. More blocks would be shorter than the correlation time of the
 # errors, and fewer blocks would not determine a covariance.
 BLOCKS = 10
-# [1] Smallest number of samples of a jackknife block, half a second, for fits with a prior.
+# [1] Smallest number of samples of a jackknife block for fits with a prior, half a second at 50 Hz.
 MIN_BLOCK = 25
 DETERMINED = ("firm", "fair", "weak", "may be zero")
 PRECISE = DETERMINED[:2]
@@ -91,10 +91,10 @@ def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") 
 
 
 def student_scale(blocks: int) -> float:
-    """Return the ratio of the 95 % quantiles of Student's t distribution and of the normal distribution.
+    """Return the ratio of the 97.5 % quantiles of Student's t and normal distribution (two-sided 95 % intervals).
 
-    Standard deviations that are estimated from few blocks are multiplied by this ratio, so that 1.96 standard
-    deviations are half the width of a 95 % interval.
+    Student's t distribution has ``blocks`` - 1 degrees of freedom. Standard deviations that are estimated from few
+    blocks are multiplied by this ratio, so that 1.96 standard deviations are half the width of a 95 % interval.
     """
     return float(stdtrit(blocks - 1, 0.975)) / QUANTILE
 
@@ -102,15 +102,16 @@ def student_scale(blocks: int) -> float:
 def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
-    The first value (B, k) has the Newton step of the estimate for the removal of each of the B blocks. The second value
-    (k, k) is the covariance J + S^-1 P S^-1, with the jackknife covariance J of these steps, the Hessian S of all
-    blocks and the prior, and the precision P of the prior. Errors of samples may be correlated within blocks, and their
-    variance may differ between blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    The first value (B, k) has, for each of the B blocks, the Newton step from the estimate to the estimate without this
+    block. The second value (k, k) is the covariance V + S^-1 P S^-1, with the jackknife covariance V of these steps,
+    the Hessian S of all blocks and the prior, and the precision P of the prior: the second term is for the prior, which
+    no block contains. Errors of samples may be correlated within blocks, and their variance may differ between blocks
+    (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
-        descent: (B, k) negative gradient of each block at the estimate; the sum over blocks is the gradient of the
-            prior's negative log density.
+        descent: (B, k) negative gradient of each block's cost at the estimate. Because the total gradient is zero
+            there, the sum of `descent` over the blocks is the gradient of the prior's negative log density.
         prior: (k, k) precision P of the prior.
     """
     count, hessian = len(curvature), curvature.sum(dim=0) + prior
@@ -126,10 +127,10 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     In coordinates in which the lower bound is the identity, eigenvalues of the covariance below one become one. The
     lower bound must be positive definite.
     """
-    # the lower bound is scaled to a unit diagonal, since parameters have different units
+    # the matrix `lower_bound` is scaled to a unit diagonal, since parameters have different units
     scale = lower_bound.diagonal().sqrt()
-    # The eigenvalues of the lower bound are clamped: for samples without noise it is singular except for rounding
-    # errors.
+    # The eigenvalues of the scaled `lower_bound` are clamped, since it is inverted: for samples without noise it is
+    # singular except for rounding errors.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

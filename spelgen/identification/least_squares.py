@@ -68,10 +68,10 @@ class Solution:
         (White, Econometrica 48:817, 1980).
 
         Args:
-            products: (n, K + 1, K + 1) Gram matrices of the regressor and the torque, per joint.
-            errors: (n,) s_j w_j^2, with the standard deviation s_j of the torque error and the weight w_j of joint j;
-                the middle factor of the sandwich is the sum of (s_j w_j^2)^2 Y_j^T Y_j, with the regressor Y_j.
-            combination: (k, r) coefficients of the fitted parameters in each combination.
+            products: (n, K + 1, K + 1) Gram matrices of the K regressor columns and the torque, per joint.
+            errors: (n,) s_j w_j^2, with the standard deviation s_j of the torque error and the weight w_j of joint j.
+                The middle factor of the sandwich is the sum over j of (s_j w_j^2)^2 Y_j^T Y_j, with the regressor Y_j.
+            combination: (k, r) coefficients of the r fitted parameters (`columns`) in each of the k combinations.
         """
         effects = combination @ self.covariance
         middle = np.tensordot(np.square(errors), products, 1)[np.ix_(self.columns, self.columns)]
@@ -116,7 +116,8 @@ def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
 def correlation_time(residuals: Sequence[np.ndarray]) -> np.ndarray:
     """Return the integrated autocorrelation time (n,), in samples, of the residuals (T, n) of all trajectories.
 
-    It is 1 plus twice the sum of the autocorrelations up to the first negative one (Geyer, Stat. Sci. 7:473, 1992).
+    It is 1 plus twice the sum of the autocorrelations before the first negative one, a simpler form of the initial
+    sequences of Geyer (Stat. Sci. 7:473, 1992).
     """
     max_lag = min(500, max(map(len, residuals)) - 1)  # [samples] largest lag, 5 s at 100 Hz
     power = sum(np.square(x).sum(axis=0) for x in residuals)

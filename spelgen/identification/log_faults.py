@@ -82,6 +82,9 @@ class Fault(ABC):
         needed: smallest cost decrease of an accepted hypothesis.
         evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
         advice: remedy of a fault that no setting corrects.
+
+    Methods with an argument `correction` return texts or settings for the hypothesis `correction.hypothesis`, which has
+    a fault of this kind.
     """
 
     code: str
@@ -96,9 +99,10 @@ class Fault(ABC):
         """Return least-squares fits of hypotheses that correct one more fault of this kind in the log than `base`."""
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return least-squares fits of hypotheses that take seconds to find, such as orders of all joints.
+        """Return least-squares fits of hypotheses that take seconds to find, such as permutations of all columns.
 
-        `compare_hypotheses` calls this function only if none of the quick `fits` explains the torques.
+        `compare_hypotheses` calls this function only if none of the quick `fits` explains the torques, or if the best
+        one has a drifting delay. unchanged: fit of the unchanged log.
         """
         return ()
 
@@ -127,5 +131,5 @@ class Fault(ABC):
         return {}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if the fault may be an error of the URDF or mounting; "" for an error."""
+        """Return the code of a warning if an inexact URDF or mounting may be the cause; "" if the fault is an error."""
         return ""

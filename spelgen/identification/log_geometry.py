@@ -36,6 +36,8 @@ class GeometryProblem:
         speeds: np.ndarray,
         seconds: float,
         unchanged: Hypothesis | None = None,
+        *,
+        free_gains: bool = False,
     ) -> None:
         """Define the least-squares problem of the torques in logs of an arm with n joints.
 
@@ -45,6 +47,8 @@ class GeometryProblem:
             speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
+            free_gains: True for torques up to an unknown positive factor per joint, which each fit estimates, such as
+                the position errors of servos.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
@@ -59,6 +63,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
+        self._free_gains = free_gains
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
         self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
@@ -74,7 +79,7 @@ class GeometryProblem:
 
         The other torques and their regressor rows become zero.
 
-        counted: mask (S, n), True for the torques that are fitted, of each joint in the unchanged log.
+        counted: mask (S, n), True for the torques that are fitted, per sample and per joint of the uncorrected log.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -93,7 +98,7 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the least-squares problem with logged torques that are multiplied by `signs`, (S, n), 1 or -1 each."""
+        """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint."""
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
@@ -131,7 +136,10 @@ class GeometryProblem:
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
-        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N]."""
+        """Return the torques of the model with parameters (K,) minus the logged torques, (S, n) [Nm, N].
+
+        The logged torques and the motion are first corrected by ``hypothesis``.
+        """
         torque = self.equations(hypothesis)[0] @ parameters
         return np.asarray(torque - hypothesis.signals(self.samples).tau)
 
@@ -148,9 +156,10 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # `bent`: deflections of the bristles under the hypothesis. They are stored for the current mapping, so
-                # the joints are permuted and the signs reversed like the motion. The friction of drive j, which
-                # includes the force of its bristles, acts on joint i with the factor C_ji of C = `speeds`.
+                # `bent`: deflections of the bristles under the hypothesis. The samples contain deflections for the
+                # current mapping, so the joints are permuted and the signs reversed like the motion. C = `speeds` maps
+                # joint speeds to motor speeds; by virtual power, friction of drive j, bristles included, acts on joint
+                # i with the factor C_ji.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 bristles = bent[:, None] * self.speeds.T[:, :, None]
                 rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
@@ -177,16 +186,20 @@ class GeometryProblem:
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
-        for _ in range(6):  # number of reweightings: further ones change the cost by less than 0.1
-            weights = self._count / ((errors + GEOMETRY.error_floor) * variance)
+        x, gains = mean, np.ones(len(normal))
+        # Number of reweightings: further ones change the cost by less than 0.1. Gains converge more slowly.
+        for _ in range(12 if self._free_gains else 6):
+            if self._free_gains:
+                gains = self._gains(x, normal, right, variance)
+            weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ flat).reshape(precision.shape)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
             drives = np.diagonal(matrix)[self._bodies :]
             ridge = np.append(np.zeros(self._bodies), 1e-9 * drives + 1e-9)
             matrix += scale * precision
             np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
-            x = solution(matrix, weights @ right + scale * precision @ mean)
-            squares = total - 2 * right @ x + (normal @ x) @ x
+            x = solution(matrix, (weights * gains) @ right + scale * precision @ mean)
+            squares = total - 2 * (right @ x) / gains + (normal @ x) @ x / gains**2
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
@@ -195,6 +208,30 @@ class GeometryProblem:
         cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
+
+    def _gains(
+        self, x: np.ndarray, normal: np.ndarray, right: np.ndarray, variance: np.ndarray
+    ) -> np.ndarray:
+        """Return the factors (n,) on the logged torques that fit the torques of the bodies best, with free friction.
+
+        Args:
+            x: (K,) parameters, of which the inertial ones are used.
+            normal: (n, K, K) Gram matrices of the regressor per joint.
+            right: (n, K) products of the regressor and the logged torques per joint.
+            variance: (n,) sums of squared deviations of the logged torques from their means.
+        """
+        bodies, gains = self._bodies, []
+        for gram, product, power in zip(normal, right, variance, strict=True):
+            columns = np.flatnonzero(gram.diagonal()[bodies:] > 0) + bodies
+            friction = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-9, hermitian=True)
+            coupled = gram[columns, :bodies] @ x[:bodies]
+            load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - coupled @ friction @ coupled)
+            agreement = float(product[:bodies] @ x[:bodies] - coupled @ friction @ product[columns])
+            # The factor is positive, and at most 1,000 times the one with which loads are as large as the torques. It
+            # is 1 if the bodies do not load the joint.
+            agreement = max(agreement, 1e-3 * float(np.sqrt(max(load, 0.0) * power)))
+            gains.append(load / agreement if load > 1e-9 * power and agreement > 0 else 1.0)
+        return np.array(gains)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
@@ -253,11 +290,12 @@ class GeometryProblem:
         return values, fit
 
     def _beyond_limits(self, q: np.ndarray) -> float:
-        """Return the penalty for positions q (S, n) beyond the position limits: at most 15 for each joint.
+        """Return the penalty on the cost for positions q (S, n) beyond the position limits: at most 15 for each joint.
 
-        Limits of a URDF may be wrong, and zeros may be calibrated badly: the penalty is proportional to the distance
-        beyond the limits up to half of the range between them. Revolute joints may be logged a whole turn beyond their
-        limits.
+        The penalty of a joint is 15 min(1, 2 d / r), with the largest distance d of its positions beyond the limits and
+        the range r between the limits. It is bounded, because limits of a URDF may be wrong and zeros may be calibrated
+        badly. For a revolute joint, whose positions may be logged with another number of turns, d is the smallest
+        distance without a shift and with shifts by plus or minus one turn.
         """
         penalty = 0.0
         for coordinate, low, high in zip(self.arm.coordinates, q.min(axis=0), q.max(axis=0), strict=True):
@@ -286,8 +324,9 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n, len(x)))
         functionals[drives, armature] = 1.0
-        # The second n functionals are the powers that friction takes from the motion of each joint, qd (viscous qd +
-        # Coulomb sign(qd)), summed over the samples. The sums are entries of the Gram matrices.
+        # `functionals` @ x: first the n rotor inertias, then for each joint the power dissipated by friction, qd
+        # (viscous qd + Coulomb sign(qd)), summed over the samples. The sums of qd^2 and qd sign(qd) are entries of its
+        # Gram matrix.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         negative = np.minimum(functionals @ x, 0.0)
@@ -325,8 +364,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # without <inertial> the prior is wide: standard deviations of 20 times the typical mass, at an extent of at
-        # least 0.5 m
+        # without <inertial> the prior is wide: standard deviations of 20 m, 20 m L and 20 m L^2, with the typical mass
+        # m and the distance L to the body's farthest joint, at least 0.5 m
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
@@ -343,7 +382,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # the standard deviations are 50 %: of masses, of centres of mass relative to the extent of the body, and of tensors
+    # the standard deviations of the prior are 50 %: of the mass, of the body's extent for the centre of mass, and of
+    # mass times squared radius of gyration for the tensor
     return 0.5 * root
 
 
@@ -353,7 +393,7 @@ def _variance(tau: np.ndarray) -> np.ndarray:
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric positive definite matrix (K, K), inverted with a unit diagonal."""
+    """Return the inverse of a symmetric positive definite matrix (K, K), which is first scaled to a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
 
@@ -361,7 +401,7 @@ def inverse(matrix: np.ndarray) -> np.ndarray:
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Return `inverse(matrix) @ vector`, (K,), for a matrix (K, K) and a vector (K,).
 
-    The linear system is solved without the inverse, which takes a third of the time.
+    The linear system is solved without computing the inverse, in a third of the time.
     """
     scaled, scale = _with_unit_diagonal(matrix)
     return np.asarray(np.linalg.solve(scaled, vector / scale) / scale)

@@ -1,4 +1,4 @@
-"""Samples of the motion of an arm and its torques, at and around each sample, from successive trajectories."""
+"""Samples of an arm's motion and torques, with signals shortly before and after each, of successive trajectories."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from spelgen.logs.dynamics_samples import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-# [samples] Times around a sample at which its signals are kept: signals of the filter's bandwidth are determined by
-# values every 20 ms.
+# [samples at 100 Hz] Times around a sample at which signals are kept for it: every 20 ms, which determines signals of
+# the filter's bandwidth.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 # [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
 ENDS = 3
@@ -44,18 +44,23 @@ class MotionSamples(NamedTuple):
             break-away displacements; K = 0 for samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
         times: (S,) times of the samples since the start of their recording [s]; 0 for E = 1.
+        recording: (S,) index of the recording of each sample, in the order in which recordings were added.
     """
 
     values: np.ndarray
     bent: np.ndarray
     direction: np.ndarray
     times: np.ndarray
+    recording: np.ndarray
 
     @classmethod
-    def of(cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray) -> MotionSamples:
+    def of(
+        cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
+    ) -> MotionSamples:
         """Return samples of signals, (S, n) each, that are stored only at the samples, and not around them."""
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
-        return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)))
+        numbers = np.full(len(q), recording)
+        return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)), numbers)
 
     @property
     def motion(self) -> np.ndarray:
@@ -75,9 +80,9 @@ class MotionSamples(NamedTuple):
     def at(self, delays: np.ndarray) -> np.ndarray:
         """Return the signals (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: the signals around each sample
-        are interpolated. Or (S, n, 4), of any magnitude: the signals around another sample are interpolated, the one
-        that is nearest to the delayed time.
+        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: interpolated from the signals
+        stored with each sample. Or (S, n, 4), of any magnitude: interpolated from the signals stored with the sample
+        nearest to the delayed time.
         """
         if not delays.any():
             return self.central
@@ -86,8 +91,7 @@ class MotionSamples(NamedTuple):
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
         # `present`: times of the samples on a common axis. 1e6 s are added from one recording to the next, so that the
         # nearest sample always belongs to the same recording.
-        recording = np.cumsum(np.diff(self.times, prepend=self.times[:1]) < 0)
-        present = self.times + 1e6 * recording
+        present = self.times + 1e6 * self.recording
         times = present[:, None, None] + delays
         nearest = np.searchsorted((present[1:] + present[:-1]) / 2, times)
         rest = np.clip(times - present[nearest], -self.longest_delay, self.longest_delay)
@@ -96,12 +100,16 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest time before or after a sample up to which its signals are stored [s]; 0 without such signals."""
+        """Largest time before or after a sample at which signals are stored for it [s]; 0 if none are stored there."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
+
+    def part(self, rows: slice | np.ndarray) -> MotionSamples:
+        """Return the subset of the samples that a slice or a mask (S,) selects."""
+        return MotionSamples(*(column[rows] for column in self))
 
     def every(self, stride: int) -> MotionSamples:
         """Return a subset that contains every `stride`-th sample."""
-        return MotionSamples(*(column[::stride] for column in self))
+        return self.part(slice(None, None, stride))
 
     def thinned(self, count: int) -> MotionSamples:
         """Return at most `count` samples, evenly spaced."""
@@ -142,10 +150,11 @@ class DriveLog:
         self._reach = replace(reach_of(joint_types, drives.speeds), smoothing_velocity=smoothing)
         self._samples: list[MotionSamples] = []
         self._every = self._step = 1
-        self._number = 0
+        self._number, self._index = 0, -1
 
     def add(self, trajectory: Trajectory) -> None:
         """Add the samples of a trajectory; nothing is added if it is too short, or its sample rate is too low."""
+        self._index += 1
         # the duration is tested before filtering, which would take too long for a log of ten thousand short motions
         if trajectory.duration < SHORTEST:
             return
@@ -186,8 +195,9 @@ class DriveLog:
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")
         around = sliding_window_view(signals, 2 * OFFSETS[-1] + 1, axis=0)[ENDS:-ENDS, ..., ::2]
         times = start + np.arange(len(samples.q)) / FREQUENCY
-        columns = (around, inner.z / self._reach.values, inner.direction, times[ENDS:-ENDS])
-        return MotionSamples(*(column[moving[:: self._every]] for column in columns))
+        bent, numbers = inner.z / self._reach.values, np.full(len(around), self._index)
+        moved = MotionSamples(around, bent, inner.direction, times[ENDS:-ENDS], numbers)
+        return moved.part(moving[:: self._every])
 
     @property
     def _count(self) -> int:

@@ -29,8 +29,8 @@ class TorqueDelay:
     Attributes:
         delay: delay [s], positive if torques are logged later than positions; 0 if no delay is significant.
         interval: half the width of the delay's 99 % interval [s].
-        coupling: coupling of motors and its error ratio, see `find_coupling`. If a coupling is found, no delay is
-            estimated, since the estimate would be biased.
+        coupling: coupling of motors, and the squared torque residual with it divided by the residual without it, see
+            `find_coupling`. If a coupling is found, no delay is estimated, since the estimate would be biased.
     """
 
     delay: float = 0.0
@@ -39,7 +39,7 @@ class TorqueDelay:
 
     @property
     def notes(self) -> list[Diagnostic]:
-        """Message about the delay, or about a coupling, with which no delay is estimated; [] without both."""
+        """Message about the delay, or about the motor coupling that prevents its estimation; [] if there is neither."""
         if self.coupling is not None:
             joint, other = (number + 1 for number in self.coupling[0].pair)
             message = (
@@ -91,9 +91,9 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques in a `DriveProblem`; the result contains a coupling of motors instead, if found.
+    """Return the delay of the torques in a `DriveProblem`; if a coupling of motors is found, it is returned instead.
 
-    Both are detected by the decrease of the torque residual of least squares.
+    Both are detected by the decrease of the torque residual of least squares; the coupling after removal of the delay.
     """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
@@ -115,14 +115,15 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     if not varying(problem.rows[..., -1]).any():
         return NO_DELAY
     estimates = []
-    # Both friction models have dry friction with the same filter as the torques, one with and one without a state. A
-    # delay that only one of both models shows is an error of this model.
+    # Two friction models are fitted, with and without a friction state. Their dry friction has the same filter as the
+    # torques. A delay that only one of the models shows is ascribed to an error of this model.
     _, qd, qdd = samples.motion
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The model without a friction state is always used: its errors do not lag behind the motion, and do not resemble a
-    # delay. Errors of a friction state lag behind the motion, and do resemble a delay.
+    # The delay must be significant without a friction state: errors of this model do not lag behind the motion, and do
+    # not resemble a delay. A friction state depends on past motion: its errors lag behind the motion, and do resemble a
+    # delay.
     memory, direct = estimates
     likely = [direct]
     # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
@@ -164,9 +165,10 @@ def _estimate(rows: np.ndarray) -> _Estimate:
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the delay [s] with the smallest torque residual, and the coefficients (K + D,) of this residual.
 
-    products: (K + D, K + D) Gram matrix of the K columns of the regressor and of the torques at the D times `OFFSETS`.
-    The residual is the sum of these K + D columns times the coefficients. A torque between two of the times is
-    interpolated by a cubic spline, since filtered torques are smooth over one step.
+    products: (K + D, K + D) Gram matrix of the K columns of the regressor and of D columns of torques, which were
+    shifted by the D times in `OFFSETS`. The residual is the sum of these K + D columns times the coefficients: K
+    parameters, and minus the D weights of a cubic spline that interpolates the torque at the delay. The spline is
+    valid, since filtered torques are smooth over one step.
     """
     moved = len(OFFSETS)
     parameters = normal_solution(products, moved)

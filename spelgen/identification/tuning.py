@@ -1,4 +1,4 @@
-"""Constants of linear least squares on logs: identification, torque delays, couplings, tests of a log's geometry."""
+"""Constants of linear least squares on logs: identification, torque delays, couplings, faults of a log's columns."""
 
 from dataclasses import dataclass
 
@@ -29,18 +29,18 @@ class DriveHintTuning:
     # [1] Number of blocks of time in the cross-validation; each block is held out once.
     blocks: int = 10
     # [1] A coupling is accepted if its squared residual is below this fraction of the squared residual without the
-    # coupling and, in each block, of the squared torque. For the
-    # coupled wrist joints of a Staubli TX40 these fractions are 0.05 and 0.03.
+    # coupling and, in each block, below this fraction of the squared torque. For the coupled wrist joints of a Staubli
+    # TX40 these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
     # [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
     # delay may be due to friction.
     longest_delay: float = 0.02
-    # [samples] Largest time shift of the signals of one joint, 160 ms.
+    # [samples at 100 Hz] Largest delay of the signals of one joint relative to the other joints, 160 ms.
     longest_offset: int = 16
     # [1] Largest number of samples of the estimation of delays and couplings, ample for about 70 parameters of six
     # joints.
     samples: int = 1500
-    # [1] Smallest number of samples for the detection of couplings; tests of the geometry need a quarter of it.
+    # [1] Smallest number of samples for the detection of couplings; tests for faults of a log need a quarter of it.
     fewest_samples: int = 400
     # [1] Largest number of trajectories of the estimation of delays and couplings; more are subsampled evenly.
     trajectories: int = 8
@@ -48,21 +48,24 @@ class DriveHintTuning:
 
 @dataclass(frozen=True)
 class LogGeometryTuning:
-    """Constants of the tests of a log's geometry, chosen by benchmarks/log_geometry.py.
+    """Constants of the tests whether a log's columns and the URDF agree, chosen by benchmarks/log_geometry.py.
 
-    Costs are negative log posteriors.
+    Faults are exchanged joints, wrong senses, zeros, units or times of columns, and a wrong direction of gravity. Costs
+    are negative log posteriors.
     """
 
-    # [1] Constant added to a joint's relative residual variance: errors of friction models are 2 % of the torque.
+    # [1] Constant added to a joint's relative residual variance: (2 %)^2, since errors of friction models are 2 % of
+    # the torque.
     error_floor: float = 4e-4
     # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
     # is 17.
     needed: float = 20.0
-    # Smallest cost decrease without hysteresis of a hypothesis that is accepted for its decrease with hysteresis.
+    # A hypothesis is compared with hysteresis only if it lowers the cost without hysteresis by more than this value.
     slight: float = 3.0
     # [1] Number of the best hypotheses that are also compared with hysteresis.
     weighed: int = 10
-    # [1] Number of the best hypotheses to which a further correction is added if the best one is not enough.
+    # [1] Number of the best hypotheses to which a further correction is added if the best one does not explain the
+    # torques of all joints (see `explained`).
     beam: int = 3
     # Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
@@ -75,8 +78,12 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
-    # [1] Relative residual variance above which a hypothesis is no advice. Mended logs of recorded arms have at most
-    # 0.07 in the mean of the joints, and at most 0.27 at a joint whose torque is mostly friction.
+    # [1] Smallest ratio of a recording's squared torque residual to that of the other recordings, to which the model is
+    # fitted, if the recording has another fault than the others.
+    deviation: float = 5.0
+    # [1] Relative residual variance of a joint above which a hypothesis does not explain its torque, so that its
+    # correction is not advised. With the right correction, logs of recorded arms have at most 0.07 in the mean of the
+    # joints, and at most 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
     # [1] Relative residual variance of the unchanged log above which its torques are no joint torques.
     no_torque: float = 0.6
@@ -99,12 +106,16 @@ class LogGeometryTuning:
     # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
     # ratios from 0.78 on, on recordings of seven arms.
     delay_gain: float = 0.65
-    # [1] Largest ratio of a joint's squared residuals with restored signs of its torques and with logged magnitudes.
+    # [1] A joint's torques were logged as magnitudes if the squared residual with restored signs is below this fraction
+    # of the squared residual with the logged torques.
     unsigned_gain: float = 0.4
     # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
-    # Zero offsets [rad, m] and tilts of the base [rad] below this bound give warnings, not errors.
+    # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
     serious_angle: float = 0.17
+    # [m] Zero offsets of prismatic joints below this bound give warnings: a link of 0.3 m, tilted by `serious_angle`,
+    # has its end displaced by this distance.
+    serious_shift: float = 0.05
 
 
 TUNING, HINTS, GEOMETRY = IdentificationTuning(), DriveHintTuning(), LogGeometryTuning()

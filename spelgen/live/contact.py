@@ -37,10 +37,11 @@ class ContactObserver:
 
     Attributes:
         low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
-            p of the arm, filtered at the bandwidth of the observer and at twice this bandwidth; 5 to 14: regressor of
-            the payload.
+            p of the arm; 5 to 14: regressor of the payload. Row 4 is filtered at twice the bandwidth of the observer,
+            all other rows at this bandwidth.
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
-        jerk: Low-pass filtered squared change of dp/dt, (n,) [Nm^2, N^2].
+        jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
+            the change of dp/dt, (n,) [Nm^2, N^2].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -76,9 +77,10 @@ class ContactObserver:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Update the filters with a sample; return the torque residual, (n,) [Nm, N], and its variance, (n,).
 
-        The residual is the low-pass filtered measured torque minus the torques of the model, of the payload and of the
-        drift: minus the external torque. The variance has three terms: for changing accelerations, for an unknown
-        friction state and for the uncertain payload. The caller adds the noise variance of the observer.
+        The residual is the low-pass filtered difference between the measured torque and the sum of the torques of
+        model, payload and drift. It estimates the external torque with a reversed sign. The variance has three terms:
+        for changing accelerations, for an unknown friction state and for the uncertain payload. The caller adds the
+        noise variance of the observer.
 
         t, at, payload, drift: see `step`.
         """
@@ -101,8 +103,8 @@ class ContactObserver:
             self.baseline, self.jerk = disturbance, np.zeros_like(disturbance)
         else:
             gains = np.full((len(inputs), 1), gain)
-            # Row 4 of `low` has twice the bandwidth of row 3. The difference between the two estimates of dp/dt
-            # indicates how fast dp/dt changes.
+            # Rows 3 and 4 of `low` are the momentum p after low-pass filters with the bandwidths `rate` and 2 `rate`.
+            # Each gives an estimate of dp/dt; the difference of the two indicates how fast dp/dt changes.
             gains[4] = 1 - np.exp(-2 * rate * step)
             self.low = self.low + gains * (0.5 * (inputs + self.inputs) - self.low)
             # The baseline (slow disturbance) of a joint in contact is not updated, because the estimated disturbance
@@ -120,7 +122,8 @@ class ContactObserver:
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
         # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
         # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
-        # the variance of the residual therefore contains `jerk` and its low-pass filtered square.
+        # the variance of the residual therefore contains the square of `jerk` for the present error, and this square
+        # after the filter (`self.jerk`) for the persisting error.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

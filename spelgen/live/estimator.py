@@ -185,13 +185,16 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques, as measured, for a motion with the estimated payload and friction drift, (n,) [Nm, N].
+        """Return the torques for a motion with the estimated payload and friction drift, (n,) [Nm, N].
+
+        Like the logged torques, they are torques of the joints or of the motors.
 
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
-            ahead: time from the last sample to the motion [s]. The estimated disturbance decays during this time; if
-                it is longer than 0.3 s, the disturbance is omitted. With `compensate_external`, the disturbance is the
-                torque residual of the momentum observer.
+            ahead: time from the last sample to the motion [s]. The torques contain the disturbance that the drift
+                filter estimates. It decays during this time; if the time is longer than 0.3 s, the disturbance is
+                omitted. With `compensate_external`, the torque residual of the momentum observer is the disturbance,
+                which decays and is omitted in the same way.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy(self.intake.bounds.mean(axis=0))
@@ -204,12 +207,11 @@ class Estimator:
             # belong to the last body.
             regressor = regressor_of(self.model.chain, *at)[..., -10:]
             load = regressor @ torch.from_numpy(self.payload.parameters)
-            decay = np.zeros(1)
-            if ahead <= TUNING.disturbance_ahead:
-                decay = np.exp(-ahead / self.levels.drift.time_constant)
+            decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:
-                # The bound is for measured torques with errors: commands are not larger than torques of the arm.
+                # Errors of measured torques may make the external torque arbitrarily large. The compensation is limited
+                # to torques that the drives can exert.
                 limit, d = self.levels.effort, self.observer.baseline - self.contact.external_torque
                 d = np.clip(d, -limit, limit)
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)

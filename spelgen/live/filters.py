@@ -16,6 +16,7 @@ over several samples.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -129,17 +130,17 @@ class LoadFilter:
     def predict(self, duration: float) -> None:
         """Replace the state x and its covariance P by their prediction after a time `duration` [s]."""
         decay, growth = np.ones_like(self.x), np.zeros_like(self.x)
-        decay[10 + 2 * self.n :] = np.exp(-duration / self.noise.time_constant)
+        decay[-self.n :] = np.exp(-duration / self.noise.time_constant)
         growth[10 : 10 + self.n] = TUNING.friction_walk * duration
-        growth[10 + 2 * self.n :] = (1 - decay[10 + 2 * self.n :] ** 2) * self.disturbance
+        growth[-self.n :] = (1 - decay[-self.n :] ** 2) * self.disturbance
         self.x *= decay
         self.P = self.P * np.outer(decay, decay) + np.diag(growth)
         self.surprise = 0.0
 
     def update(self, block: Block, joint: int) -> None:
-        """Update the state with the measurement y of one joint.
+        """Update the state with the torque residual y (`block.y`) of one joint.
 
-        A joint at rest updates only its own disturbance d.
+        A joint at rest updates only its own disturbance d (see the module).
 
         block: means over a block of samples. joint: index of the joint.
         """
@@ -162,8 +163,8 @@ class LoadFilter:
             self.P -= product
             self.P[:10, :10] += kept * product[:10, :10]
         else:
-            # The Kalman gains of all states except d are set to zero. Such a gain is not optimal, so the covariance is
-            # updated by Joseph's form, which is valid for any gain.
+            # A joint at rest updates only its disturbance d: the Kalman gains of all other states are set to zero. Such
+            # a gain is not optimal, so the covariance is updated by Joseph's form, which is valid for any gain.
             d, product = columns[-1], gain[columns[-1]] * covariance
             self.x[d] += gain[d] * residual
             self.P[d] -= product
@@ -203,7 +204,7 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the drift filters of the estimator: their states are the friction change a, a random walk, and d."""
+        """Return the drift filters of the estimator: states are friction change a, a random walk, and disturbance d."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
@@ -215,7 +216,8 @@ class JointFilters:
             torque: Torque residual of the block minus the torque of the payload, (n,) [Nm, N].
 
         Returns:
-            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each.
+            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each,
+            with an axis (...) for filters with different noise.
         """
         decay = np.ones_like(self.x)
         decay[..., -1] = np.exp(-block.duration / self.time_constant)
@@ -286,7 +288,7 @@ class PayloadEstimate:
     def _rows(self, block: Block) -> Iterator[None]:
         for each in self.filters:
             each.predict(block.duration)
-        rows = [(each, joint) for each in self.filters for joint in range(len(block.y))]
+        rows = list(itertools.product(self.filters, range(len(block.y))))
         for number, (each, joint) in enumerate(rows, start=1):
             each.update(block, joint)
             if number == len(rows):

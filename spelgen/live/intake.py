@@ -34,7 +34,7 @@ class DelayLine:
             samples.append((t, values))
         while len(samples) > 2 and samples[1][0] <= past:
             del samples[0]
-        (begin, first), (end, second) = samples[0], samples[-1 if len(samples) == 1 else 1]
+        (begin, first), (end, second) = samples[0], samples[:2][-1]
         if past <= begin:
             return first
         weight = (past - begin) / (end - begin)
@@ -87,8 +87,8 @@ class Intake:
         # After `TUNING.restart` consecutive samples that are refused as "reversed" or "jump", a permanent change of the
         # clock or of the positions is assumed, and the checks restart with the current sample.
         self.ignored += refusal in ("reversed", "jump")
-        restarts = self.ignored >= TUNING.restart
-        refusal = "gap" if restarts else refusal
+        if self.ignored >= TUNING.restart:
+            refusal = "gap"
         if refusal not in IGNORED:
             begins = refusal == "gap" or self.t == -np.inf
             if begins:
@@ -100,9 +100,7 @@ class Intake:
             position = self.aligned[0]
             start = position if begins else self.path
             path = np.clip(start, position - self.levels.encoder, position + self.levels.encoder)
-            moved = path - start
-            if self.bristles.motors is not None:
-                moved = self.bristles.motors @ moved
+            moved = self.bristles.of_drives(path - start)
             self.bounds = np.clip(self.bounds + moved[:, None], -self.limit, self.limit)
             self.path, self.t, self.q, self.ignored = path, t, q, 0
         self.counts[refusal] += 1
@@ -140,7 +138,7 @@ def balance_along(
 
     Args:
         model: model in double precision.
-        levels: noise levels, with the position of the tip, whose Jacobian is among the terms.
+        levels: noise levels; they also have the position of the tip (`point`), whose Jacobian is one of the terms.
         intake: checks of the samples; its state is updated.
         t: times, (T,) [s].
         samples: q [rad, m], qd [rad/s, m/s] and tau [Nm, N], (T, n) each.

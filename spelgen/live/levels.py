@@ -122,7 +122,10 @@ class HeldOutSample(NamedTuple):
 
 
 def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> list[HeldOutSample]:
-    """Return the accepted samples of a held-out log, with the terms of the momentum balance of ``model``."""
+    """Return the accepted samples of a held-out log, with the terms of the momentum balance of ``model``.
+
+    Samples are accepted or refused by the limits in ``levels`` (see `Intake`); its noise values are not used.
+    """
     intake, blocks = Intake(levels, bristle_reach(model)), Blocks(levels.rest_speed)
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
@@ -169,12 +172,13 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
-    logs are without payload, so each estimate x is an error, and the factor is the mean of x^T P^-1 x / k over trials.
-    A trial is an estimate from several consecutive blocks; x is the mass (k = 1), or mass and first moments (k = 4). A
-    prior value is included in each mean, with the weight of `prior_trials` trials. The factor is the largest mean of
-    both k and all lengths of trials: errors of the model are correlated over time, so that the mean may be larger for
-    longer trials.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. A
+    trial is an estimate x of the payload from several consecutive blocks, where x is the mass (k = 1), or mass and
+    first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
+    Its mean is computed for each k and each length of trials, together with `prior_trials` imaginary trials of the
+    value `prior_variance`. The factor is the largest mean: errors of the model are correlated over time, so that the
+    mean may be larger for longer trials. The degrees of freedom are the number of trials of the largest mean's length,
+    imaginary ones included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -238,7 +242,8 @@ def _likelihood(
     # assumed to be at most a few standard deviations of the white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # The filters have drifts=False: joints at rest update no state, so the noise of joints in motion is estimated.
+        # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is
+        # estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)
@@ -252,9 +257,8 @@ def _likelihood(
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
     """Return ``levels`` with the noise of the momentum observer, and the distribution of its largest residuals (peaks).
 
-    The new fields are ``observer`` to ``peak_count`` of `NoiseLevels`, from which contact thresholds are computed.
-
-    tested: held-out samples of each log.
+    The new fields `observer`, `resting`, `resting_speed`, `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`
+    determine the contact thresholds. levels: noise levels without these fields. tested: held-out samples of each log.
     """
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
@@ -273,11 +277,12 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
     """Return the exponential distribution of the largest peaks of all logs, as fields of `NoiseLevels`.
 
-    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. The
-    peaks are multiplied by a factor for the differences between logs, determined by cross-validation: for each log,
-    contact thresholds are computed from all other logs. With thresholds multiplied by the factor, all held-out logs
-    together have at most the number of alarms that the default rate of false alarms allows. The factor is the same for
-    all joints, because the joint that needs the largest factor differs between logs.
+    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. Peaks
+    differ between logs, so thresholds from some logs cause too many alarms on others. The distribution is therefore
+    fitted to all peaks times a factor, which multiplies the contact thresholds, too. Cross-validation determines the
+    factor: for each log, thresholds are computed from all other logs. With these thresholds times the factor, all
+    held-out logs together have at most the number of alarms that the default rate of false alarms allows. The factor is
+    the same for all joints, because the joint that needs the largest factor differs between logs.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].
@@ -294,7 +299,10 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 def _observer_residuals(
     levels: NoiseLevels, samples: Sequence[HeldOutSample]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the torque residual of the momentum observer, its variance, and qd, (T, n) each, at T held-out samples."""
+    """Return the torque residual of the momentum observer, its variance, and qd, (T, n) each, at T held-out samples.
+
+    levels: noise levels; the noise of the observer is not yet known, and is not part of the variance.
+    """
     observer = ContactObserver(levels, TUNING.alarms_per_minute)
     drift = JointFilters.of_drift(levels.drift)
     columns = []
@@ -315,12 +323,14 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     """
     together = factor * np.concatenate(peaks)
     start = np.quantile(together, 1 - TUNING.tail, axis=0)
-    # The number of peaks above `start` is the same for all joints, except for joints whose residuals are all zero.
+    # `start` is the same quantile for each joint, so the number of peaks above it is the same for all joints, except
+    # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, and the error of each is 1 / sqrt(count) of its value. The scales are shrunk
-    # towards their mean; the weight of the mean is the variance of the error divided by the variance over the joints
-    # (James and Stein, 1961). It is at most 1 - 1 / n, since the mean over n joints is estimated from n `count` peaks.
+    # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
+    # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
+    # the joints (James and Stein, 1961). It is at most 1 - 1 / n: `peak_count` is then at most n `count`, the number of
+    # peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)
@@ -338,7 +348,7 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
     Args:
         signal: torque residual of the observer, (T, n) [Nm, N].
         qd: velocities, (T, n) [rad/s, m/s].
-        levels: largest speeds and torque limits of the joints.
+        levels: its largest speeds are the unit of v, and its torque limits determine the lower bound of s.
     """
     grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
     noise, costs = np.zeros((2, len(grid), len(levels.speed)))

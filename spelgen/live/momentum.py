@@ -28,12 +28,13 @@ class Balance(NamedTuple):
 
     Attributes:
         momentum: Momentum p of the arm, (T, n).
-        torque: G (tau - offset) + friction compensation of the drives + dL/dq, (T, n).
+        torque: G (tau - offset) + dL/dq, with the symbols of the module, plus the friction compensation of the drives,
+            (T, n).
         friction: Mean of the friction torques at the two bounds of the friction state, (T, n).
         uncertainty: Half the difference of the friction torques at the two bounds, (T, n).
         load_momentum: P, momentum per inertial parameter of the payload, (T, n, 10).
         load_torque: N, torque per inertial parameter of the payload, (T, n, 10).
-        jacobian: Jacobian of a point of the last body, in root axes, (T, 3, n).
+        jacobian: Jacobian of a point of the last body, such as the tip, in root axes, (T, 3, n).
         velocity: Velocities qd, (T, n).
     """
 
@@ -56,8 +57,8 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
         point: position of the point in the frame of the last body, (3,) [m].
 
     Returns:
-        P, generalised momentum per inertial parameter of the payload, (T, n, 10); N, torque per inertial parameter,
-        (T, n, 10); Jacobian of the point in root axes, (T, 3, n).
+        P and N of the module's equation: generalised momentum, and centrifugal and gravity torque, per inertial
+        parameter of the payload, (T, n, 10) each; Jacobian of the point in root axes, (T, 3, n).
     """
     # `chain.forward` transforms points of the bodies. The columns of the identity are passed as points, so that the
     # result contains the whole homogeneous transform of each body.

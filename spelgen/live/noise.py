@@ -54,11 +54,11 @@ class NoiseLevels(BaseModel):
     fifth of the peaks is modelled by an exponential distribution.
 
     Attributes:
-        drift: Noise of the blocks of the drift filter.
-        load: Noise of the blocks of the payload filter.
+        drift: Noise of the torque residual, averaged over the blocks of samples of the drift filter.
+        load: Noise of the torque residual, averaged over the blocks of samples of the payload filter.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
-        resting: Additional threshold for a joint at rest: three standard deviations of its additional noise, (n,)
-            [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
+        resting: Additional threshold for a joint at rest: three standard deviations of the noise at rest that is added
+            to `observer`, (n,) [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
         peak_start: Smallest value of the exponential distribution, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
@@ -101,9 +101,9 @@ class NoiseLevels(BaseModel):
     def load_quantile(self) -> float:
         """Half width of 95 % intervals of a payload, in standard deviations.
 
-        It is a quantile of Student's t distribution, because the variance is an estimate, multiplied by a factor above
-        1 for two reasons. First, errors are larger on other days than in the training logs. Second, a payload increases
-        friction and its errors, but `load_variance` is estimated from logs without payload.
+        It is a quantile of Student's t distribution, because the variance is an estimate. The quantile is multiplied by
+        a factor above 1 for two reasons. First, errors are larger on other days than in the training logs. Second, a
+        payload increases friction and its errors, but `load_variance` is estimated from logs without payload.
         """
         width = max(TUNING.other_days, math.sqrt(TUNING.prior_variance / self.load_variance))
         return float(stdtrit(self.load_freedom, 0.975)) * width
@@ -138,8 +138,10 @@ class NoiseLevels(BaseModel):
         """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
         Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
-        With the prior density 1 / scale of the uncertain scale, a new peak exceeds `peak_start` by more than x with
-        the probability (1 + x / (m `peak_scale`))^-m.
+        With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds it by more than x
+        with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start` + x, with the x
+        for which this probability times `tail_peaks`, the rate of peaks above `peak_start`, is the rate of false
+        alarms.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

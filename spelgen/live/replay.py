@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -114,7 +114,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or "no payload" with limit."""
+    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or its mass limit."""
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(
@@ -171,8 +171,7 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
         # The logs are processed as one recording with pauses. Each pause exceeds `TUNING.gap`, so that the estimator
         # resets the friction state.
         begin = float(t[-1]) + 2 * TUNING.gap
-        for _ in estimator.steps(t, log.q, log.qd, log.tau):
-            pass
+        estimator.replay(replace(log, t=t))
     return estimator.report()
 
 

@@ -52,14 +52,15 @@ class LiveTuning:
     uncertainty: float = 3.0
 
     # [1] Fraction of the variance of torque errors that recurs if the motion recurs. More motion does not reduce this
-    # part: the variance of a payload's torque remains at least this fraction. Without it, the normalised squared error
-    # of a payload of zero grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
+    # part: it is the lower bound of the variance of the torque of the estimated payload, divided by the variance of
+    # torque errors. Without this bound, the squared error of the payload estimated for an arm without payload, divided
+    # by its variance, grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
     recurring: float = 0.03
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
-    # [1] The hypotheses of a changed load and of a contact start if the sum of the squared residuals of a block exceeds
-    # its expected value by this number of its standard deviations.
+    # [1] The filters for the two hypotheses, a changed load and a contact, are started if the sum of the squared
+    # residuals of a block exceeds its expected value by this number of its standard deviations.
     surprise: float = 3.0
     # [1] Factor on the standard deviation of the disturbance under the hypothesis of a contact.
     contact_disturbance: float = 8.0
@@ -67,9 +68,9 @@ class LiveTuning:
     # "changed load" exceeds the log likelihoods of "no change" and of "contact" by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion. They are dropped
-    # after `changed_after` [s] if "changed load" is unlikely: if its log likelihood minus the larger one of "contact"
-    # and "no change" is below `unlikely` [1].
+    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion at the latest. They
+    # are dropped earlier, after `changed_after` [s], if "changed load" is unlikely: if its log likelihood minus the
+    # larger one of "contact" and "no change" is below `unlikely` [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -79,7 +80,8 @@ class LiveTuning:
     bandwidth: float = 20.0
     # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
     # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt, with the
-    # bandwidth of the observer and with twice this bandwidth. This is the error for a lag of 1 / (4 bandwidth) = 12 ms.
+    # bandwidth of the observer and with twice this bandwidth. The estimates lag by 1 / bandwidth and half of this, so
+    # 0.5 times their difference is the error for a lag of torques of 1 / (4 bandwidth) = 12 ms.
     jerk: float = 0.5
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.
@@ -139,8 +141,9 @@ class LiveTuning:
     # have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] The grid of the noise of the momentum observer near standstill: velocity scales divided by the largest speed,
-    # and the additional noise at rest divided by the noise in motion.
+    # [1] The grid of the noise of the momentum observer near standstill, s^2 (1 + (r exp(-|qd| / v))^2)
+    # (`live.levels`): velocity scales v divided by the largest speed, and ratios r of additional noise at rest to noise
+    # s in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 

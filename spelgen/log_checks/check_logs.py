@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from spelgen.errors import Diagnostic, LogError, collect
+from spelgen.errors import Diagnostic, LogError, Severity, collect
 from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, TorqueLogs
 from spelgen.log_checks.geometry_finding import WARNINGS
 from spelgen.log_checks.limits_in_logs import AT_A_STOP
@@ -72,10 +72,27 @@ def check_logs(
         trajectories=tuple(x.clock for x in measured),
         joints=completed,
         tables=tables,
-        findings=tuple(summary.notes),
+        findings=_joined(summary.notes),
         errors=tuple(summary.errors),
         examples=tuple(examples),
     )
+
+
+def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
+    """Return the notes on logs; notes on several joints with the same text are one note, which names these joints."""
+    groups = dict[tuple[Severity, str, str, str], list[str]]()
+    for note in notes:
+        prefix, joint, name = note.where.partition("joint '")
+        groups.setdefault(
+            (note.severity, note.code, prefix if joint else note.where, note.message), []
+        ).append(joint + name)
+    joined = []
+    for (severity, code, prefix, message), names in groups.items():
+        listed = ", ".join(x.removeprefix("joint ") for x in names)
+        joined.append(
+            Diagnostic(severity, code, f"{prefix}joint {listed}" if names[0] else prefix, None, message)
+        )
+    return tuple(joined)
 
 
 def require_sound_logs(

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from spelgen.arm.actuation import Drives
 from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_servo_faults
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.motion_samples import DriveLog
+from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.labels import UNITS
 from spelgen.listing import Listing, number
+from spelgen.log_checks.geometry_finding import geometry_finding, stated_hypothesis
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import POSITION_CHECKS, JointEvidence
-from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.log_checks.statistics import quantisation_step
+from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.filtering import derivative
-from spelgen.logs.joint_signals import Advice, is_factor, mapping_line
+from spelgen.logs.joint_signals import Advice, joint_keys, mapping_line
 from spelgen.logs.parquet_files import UNLESS_NORMALISED
+from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
+from spelgen.settings.log_mapping import SCALES
 
 if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
-    from spelgen.settings.log_mapping import LogMapping
 
 MOVING = SAMPLES.moving
 # [s] Candidates for the delay of positions after commands. Negative delays show that rows of the log are shifted; the
@@ -32,7 +41,7 @@ NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] Smallest number of samples of a segment without gaps, for the smoothing polynomial.
 FOLLOWS = SIGNALS.agreement
 # [rad, m] Constant distance of commands from positions that shows another zero; servos deviate less under their load.
-OTHER_ZERO = 0.17
+OTHER_ZERO = {"revolute": GEOMETRY.serious_angle, "prismatic": GEOMETRY.serious_shift}
 # Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
 # step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
 # at each joint: 200 divided by the counts of the joint's calibrated range. NORMALISED_RANGE is the largest magnitude of
@@ -44,42 +53,47 @@ NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
 SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 
 
-def find_servo_unit(joints: Sequence[JointReport], unit: str) -> Advice | None:
-    """Return a finding if the positions of servos have another unit than `unit`, "deg" or "rad"; else None.
+def find_servo_unit(logs: Sequence[Trajectory], joints: Sequence[str], unit: str) -> Advice | None:
+    """Return a finding if the positions of servos have another unit than `unit`, one of `ANGLES`; else None.
 
-    The quantisation steps of the encoders show the unit: see the comment at `NORMALISED_RANGE`. Positions without steps
-    were not in degrees if all joints move by less than 0.1 rad when the positions are read in degrees, and a joint
-    moves by more than 0.5 rad when they are read in radians. Normalised positions have another step at each joint.
+    1. In one of both units, the positions have the quantisation steps of encoders (see the comment at
+       `NORMALISED_RANGE`): this is their unit.
+    2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by 0.5 rad or more, but
+       not by over two turns: the unit is "rad".
+    3. `unit` is "deg", and each joint has another step: the positions are normalised.
 
     Args:
-        joints: statistics of all joints, converted to radians from `unit`.
+        logs: recordings, with positions converted to radians from `unit`.
+        joints: names of the joints.
         unit: unit of the positions in the mapping.
     """
-    steps = {joint.name: float(np.degrees(joint.steps["q"])) for joint in joints if joint.steps["q"]}
-    ranges = np.array([joint.high["q"] - joint.low["q"] for joint in joints])
-    other, factor = ("rad", 180 / np.pi) if unit == "deg" else ("deg", np.pi / 180)
-    values = np.array(list(steps.values()))
-    if _are_encoders(values):
+    q = np.concatenate([log.q for log in logs])
+    steps, width = _steps(logs), float(np.ptp(q, axis=0).max())
+    if _are_encoders(steps):
         return None
-    message = f"positions in {other}: they move by up to {ranges.max():.3g} rad when read in {unit}"
-    if _are_encoders(values * factor):
-        counts = 360 / float(np.median(values * factor))
-        return Advice(
-            f"{message}, in steps of an encoder with {counts:.0f} counts", keys={"units": {"q": other}}
-        )
-    if unit != "deg":
-        return None
-    if ranges.max() < 0.1 and 0.5 < ranges.max() * factor < 4 * np.pi:
-        return Advice(message, keys={"units": {"q": other}})
+    for other in ANGLES:
+        factor = SCALES.get(other, 1.0) / SCALES.get(unit, 1.0)
+        message = f"positions in {other}: they move by up to {width:.3g} rad when read in {unit}"
+        keys = {"units": {"q": other}}
+        if other != unit and _are_encoders(steps * factor) and width * factor < 4 * np.pi:
+            counts = 360 / float(np.nanmedian(steps * factor))
+            return Advice(f"{message}, in steps of an encoder with {counts:.0f} counts", keys=keys)
+        if unit == "deg" and other == "rad" and width < 0.1 and 0.5 < width * factor < 4 * np.pi:
+            return Advice(message, keys=keys)
     low, high = NORMALISED_STEPS
-    is_normalised = max(joint.largest("q") for joint in joints) <= np.radians(NORMALISED_RANGE)
-    is_normalised &= len(values) > 1 and values.min() >= low and values.max() <= high
-    if not is_normalised or np.ptp(values) < SAME_STEP * values.max():
+    is_normalised = unit == "deg" and np.abs(q).max() <= np.radians(NORMALISED_RANGE)
+    is_normalised &= np.isfinite(steps).sum() > 1 and np.nanmin(steps) >= low and np.nanmax(steps) <= high
+    if not is_normalised or np.nanmax(steps) - np.nanmin(steps) < SAME_STEP * np.nanmax(steps):
         return None
-    listed = ", ".join(f"{name} {step:.4f}" for name, step in steps.items())
+    listed = ", ".join(f"{x} {step:.4f}" for x, step in zip(joints, steps, strict=True) if np.isfinite(step))
     return Advice(
-        f"degrees of another step for each joint ({listed}), as LeRobot's normalised positions have"
+        f"degrees of another step for each joint ({listed}), as normalised positions of LeRobot have"
     )
+
+
+def _steps(logs: Sequence[Trajectory]) -> np.ndarray:
+    """Return the quantisation steps (n,) [degrees] of the positions; NaN for joints without steps."""
+    return np.degrees([quantisation_step(column) for column in np.concatenate([x.q for x in logs]).T])
 
 
 def _are_encoders(steps: np.ndarray) -> bool:
@@ -87,11 +101,15 @@ def _are_encoders(steps: np.ndarray) -> bool:
 
     Encoders of position servos have these steps.
     """
-    counts = 360 / steps
+    counts = 360 / steps[np.isfinite(steps)]
     powers = np.clip(np.round(np.log2(counts)), 10, 14)
-    return bool(len(steps) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
+    return bool(len(counts) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
 
 
+# [s] Delays of the commands, of which the best one is used in the test of senses, order and zeros of the joints.
+COMMAND_DELAYS = (0.0, 0.02, 0.035, 0.05, 0.075, 0.1)
+ONE_ZERO = "one zero of positions and commands"
+ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
 UNIT: Check[Sequence[JointReport]] = Check(
     "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
 )
@@ -107,14 +125,15 @@ class Following(NamedTuple):
 
     Attributes:
         moves: (n,) True for joints whose command changes.
-        delay: (n, n) [s] delay of the position of joint j (column) after the command of joint i (row) at which the
-            magnitude of their correlation is largest.
+        delay: (n, n) [s] delay of the position of joint j (column) after the command of joint i (row) at which their
+            correlation is largest, or most negative.
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
-        offset: (n,) [rad, m] mean of u - q; 0 if the mean is less than two standard deviations of u - q, as for joints
-            that carry a load.
+        offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a
+            changing load causes smaller means.
         joints: tracking errors and lag of each joint.
+        saturation: (n,) [rad, m] see `measure_following`.
     """
 
     moves: np.ndarray
@@ -123,13 +142,14 @@ class Following(NamedTuple):
     gain: np.ndarray
     offset: np.ndarray
     joints: list[JointFollowing]
+    saturation: np.ndarray
 
 
 def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Following | None:
     """Return the tracking of the commands of n position servos over all recordings: delay, correlation, errors.
 
     None is returned if no recording is long enough. saturation: (n,) [rad, m] distance of a position from its command
-    at which the servo's torque is at its limit; infinity if the limit is unknown.
+    at which the servo's torque is at its limit, for the fraction of saturated samples; infinity if it is unknown.
     """
     pieces: list[Trajectory] = []
     for log in logs:
@@ -146,8 +166,12 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
-    best = np.abs(correlations).argmax(axis=0)
-    correlation = np.take_along_axis(np.array(correlations), best[None], axis=0)[0]
+    stacked = np.array(correlations)
+    # A periodic motion is also correlated, negatively, with commands half a period before: a negative correlation must
+    # be clearly larger.
+    is_opposite = -stacked.min(axis=0) > stacked.max(axis=0) + 0.1
+    best = np.where(is_opposite, stacked.argmin(axis=0), stacked.argmax(axis=0))
+    correlation = np.take_along_axis(stacked, best[None], axis=0)[0]
     # [rad, m] standard deviation below which a command is treated as constant with noise
     moves = u_std > 0.01
     saturated = np.mean(np.abs(commands - q) > saturation, axis=0)
@@ -162,7 +186,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     offset = np.where(
         2 * difference.std(axis=0) < np.abs(difference.mean(axis=0)), difference.mean(axis=0), 0.0
     )
-    return Following(moves, DELAYS[best], correlation, gain, offset, joints)
+    return Following(moves, DELAYS[best], correlation, gain, offset, joints, saturation)
 
 
 def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
@@ -196,11 +220,27 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
     return np.asarray((x[1:] + x[:-1]) / 2)
 
 
+class CommandFault(NamedTuple):
+    """Finding that the commands of a joint are not those that its servo tracked.
+
+    Attributes:
+        got: the finding.
+        expected: expected commands; findings of several joints with the same expectation are one error.
+        keys: settings of the joint, in the group `logs`, that correct the log; empty if there are none.
+        do: remedy without settings.
+    """
+
+    got: str
+    expected: str
+    keys: Mapping[str, object] = {}
+    do: str = ""
+
+
 class ServoLogs:
     """Checks of logs of commanded positions, on all trajectories together: `add` each trajectory, then `check`."""
 
     def __init__(self, arm: Arm) -> None:
-        self._arm = arm
+        self._arm, self._names = arm, arm.chain.joint_names
         self._logs: list[Trajectory] = []
 
     def add(self, trajectory: Trajectory) -> None:
@@ -215,42 +255,28 @@ class ServoLogs:
 
         The findings are added to `summary`. reports: statistics of each joint.
         """
-        names = self._arm.chain.joint_names
-        saturation = np.full(len(names), np.inf)
+        saturation = np.full(len(self._names), np.inf)
         for k, coordinate in enumerate(self._arm.chain.coordinates):
             kp = self._arm.settings.joint(coordinate.name).kp
             if coordinate.effort and kp:
                 saturation[k] = coordinate.effort / kp
-        mapping = self._logs[0].mapping
-        self._check_unit(reports, {mapping.unit("q", name) for name in names}, summary)
-        following = measure_following(self._logs, saturation)
+        self._check_units(summary)
+        following, completed = measure_following(self._logs, saturation), list(reports)
         if following is None:
             message = f"no {FILTER_SAMPLES} samples without a gap: no servo is determined"
             summary.notes.append(Diagnostic("warning", "idle-command", "logs", None, message))
-        exchanged, summed = list[int](), following
-        if following is not None and (following.correlation.diagonal() < FOLLOWS).any():
-            exchanged = _exchanged_commands(following)
-            if exchanged:
-                summary.errors.append(_exchange_error(exchanged, names, following, mapping))
-            sums = [x.q[0] + np.cumsum(require_commands(x), axis=0).clip(-1e6, 1e6) for x in self._logs]
-            logs = [replace(log, u=u) for log, u in zip(self._logs, sums, strict=True)]
-            summed = measure_following(logs, saturation)
-        completed = []
-        for k, (coordinate, report) in enumerate(zip(self._arm.chain.coordinates, reports, strict=True)):
-            if following is not None:
-                report = replace(report, following=following.joints[k])
-            completed.append(report)
-            if k in exchanged:
-                continue
-            if following is not None and summed is not None:
-                wrong = _command_error(k, report, following, summed.correlation[k, k])
-                if wrong is not None:
-                    summary.errors.append(wrong)
-                    continue
-                summary.notes.extend(_command_warning(k, report, following, self._logs))
-            for check, found in run_checks(
-                POSITION_CHECKS, JointEvidence(coordinate, report, mapping.offset("q", coordinate.name))
-            ):
+        else:
+            completed = [replace(x, following=y) for x, y in zip(reports, following.joints, strict=True)]
+        # Commands are compared only with sound positions: a wrong unit or a wrap of the positions has been reported.
+        if following is not None and not summary.errors:
+            wrong = self._check_commands(following, saturation, summary)
+            for k in set(range(len(completed))) - wrong:
+                summary.notes.extend(_command_warning(k, completed[k], following, self._logs))
+            if not summary.errors and following.moves.any():
+                self._check_geometry(summary)
+        for coordinate, report in zip(self._arm.chain.coordinates, completed, strict=True):
+            evidence = JointEvidence(coordinate, report, self._logs[0].mapping.offset("q", coordinate.name))
+            for check, found in run_checks(POSITION_CHECKS, evidence):
                 summary.add(check, found.message, f"joint {coordinate.name!r}")
         for log in self._logs:
             if log.sample_rate < 20.0:
@@ -260,87 +286,202 @@ class ServoLogs:
                 break
         return completed, (*signal_tables(completed, ("q", "u")), _following_table(completed))
 
-    def _check_unit(
-        self, reports: Sequence[JointReport], units: Collection[str | None], summary: Findings
-    ) -> None:
-        """Add an error to `summary` if the positions have another unit than the mapping states.
+    def _check_geometry(self, summary: Findings) -> None:
+        """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Nothing is tested unless all joints have the same unit in the mapping. units: the different units of the joints'
-        positions in the mapping.
+        Servos that no hypothesis explains, for example those with backlash, are not tested.
         """
-        (unit, *others) = units
-        if others or unit not in (None, "rad", "deg"):
+        problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
+        fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
+        logarithms = [float(np.log(errors + GEOMETRY.error_floor).sum()) for errors in fits]
+        best = int(np.argmin(logarithms)) if fits else -1
+        if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
             return
-        finding = find_servo_unit(reports, unit or "rad")
-        if finding is None:
+        unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
+        # The cost must fall twice as much as for torques: with times stretched by two, the best wrong hypothesis lowers
+        # it by 20, and right ones by 40 to 240, on simulated arms.
+        is_sure = better and better[0].cost < unchanged.cost - 2 * GEOMETRY.needed
+        if not is_sure or better[0].errors.max() > GEOMETRY.explained:
             return
-        check = UNIT if finding.keys else NORMALISED
-        # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
-        # states more.
-        summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
-        if check.code not in self._logs[0].accepted:
-            summary.add(check, finding.message, "all joints", keys=finding.keys)
+        if {fault.code for fault in better[0].hypothesis.faults} <= set(self._logs[0].accepted):
+            return
+        summary.extend([geometry_finding(problems[best], self._logs[0].mapping, unchanged, better)])
+
+    def _geometry_problem(self, delay: float) -> GeometryProblem | None:
+        """Return the least-squares problem of the torques kp (u - q), with unknown kp of each servo.
+
+        Friction in it includes the damping of the servos. delay: delay of the commands u [s]. None is returned for too
+        few samples.
+        """
+        chain, alone = self._arm.chain, np.eye(len(self._names))
+        collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())
+        for log in self._logs:
+            u = np.stack([np.interp(log.t - delay, log.t, x) for x in require_commands(log).T], axis=1)
+            collected.add(replace(log, tau=u - log.q, u=None))
+        samples, seconds = collected.samples(), sum(log.duration for log in self._logs)
+        if samples is None or len(samples.values) < HINTS.fewest_samples / 4 or not samples.tau.any():
+            return None
+        stated = stated_hypothesis(chain, self._logs[0].mapping)
+        return GeometryProblem(chain, samples, alone, seconds, stated, free_gains=True)
+
+    def _check_units(self, summary: Findings) -> None:
+        """Add an error to `summary` if positions of one or of all recordings have another unit than the mapping states.
+
+        Nothing is tested unless all joints have the same unit in the mapping, or if there is already an error.
+        """
+        mapping = self._logs[0].mapping
+        units = {mapping.unit("q", name) or "rad" for name in self._names}
+        if len(units) > 1 or not units <= set(ANGLES) or summary.errors:
+            return
+        (unit,) = units
+        findings = [(log, find_servo_unit([log], self._names, unit)) for log in self._logs]
+        is_sound = any(_are_encoders(_steps([log])) for log, finding in findings if not finding)
+        for log, finding in {str(x.keys): (log, x) for log, x in findings if x}.values():
+            check = UNIT if finding.keys else NORMALISED
+            # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
+            # states more.
+            summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
+            if check.code in log.accepted:
+                continue
+            names = ", ".join(x.name for x, y in findings if y and y.keys == finding.keys)
+            if is_sound:
+                summary.add(replace(check, do=OF_ONE), finding.message, f"trajectory {names}", log.file)
+            else:
+                summary.add(check, finding.message, "all joints", keys=finding.keys)
+
+    def _check_commands(self, following: Following, saturation: np.ndarray, summary: Findings) -> set[int]:
+        """Add the faults of the commands to `summary`; return the indices of the joints with errors.
+
+        Each recording is tested by itself. A fault names its recordings if the joint tracks its commands in another.
+
+        following: tracking of the commands in all recordings. saturation: see `measure_following`.
+        """
+        faults, sound = dict[str, dict[int, list[tuple[str, CommandFault]]]](), set[int]()
+        for log in self._logs:
+            tracking = following if len(self._logs) == 1 else measure_following([log], saturation)
+            if tracking is None:
+                continue
+            new = _command_faults(tracking, log, self._names, is_only=len(self._logs) == 1)
+            bounds = [OTHER_ZERO[x] for x in self._arm.chain.joint_types]
+            for k in np.flatnonzero(np.abs(tracking.offset) > bounds).tolist():
+                got = f"commands that are {tracking.offset[k]:.3g} above the positions throughout"
+                new.setdefault(k, CommandFault(got, ONE_ZERO))
+            for k, fault in new.items():
+                faults.setdefault(fault.expected, {}).setdefault(k, []).append((log.name, fault))
+            tracks = tracking.moves & (tracking.correlation.diagonal() > FOLLOWS)
+            sound |= set(np.flatnonzero(tracks).tolist()) - new.keys()
+        groups = dict[tuple[str, str], dict[int, CommandFault]]()
+        for expected, by_joint in faults.items():
+            for k, occurrences in by_joint.items():
+                names = ", ".join(name for name, _ in occurrences) if k in sound else ""
+                # A command offset of all recordings is a warning: it may be due to the load of a soft servo.
+                if names or expected != ONE_ZERO:
+                    groups.setdefault((expected, names), {})[k] = occurrences[0][1]
+        for (expected, names), group in groups.items():
+            fault = next(iter(group.values()))
+            entries = {self._names[k]: x.keys for k, x in group.items() if x.keys}
+            do = mapping_line(joint_keys(entries, self._names)) if entries else fault.do
+            joints = f"joint {', '.join(repr(self._names[k]) for k in group)}"
+            where = f"trajectory {names}, {joints}" if names else joints
+            summary.errors.append(
+                LogError(fault.got, element=where, expected=expected, do=OF_ONE if names else do)
+            )
+        return {k for group in groups.values() for k in group}
 
 
-def _exchanged_commands(following: Following) -> list[int]:
-    """Return the indices of the joints whose command is tracked by another joint, and not by the joint itself."""
+def _command_faults(
+    following: Following, log: Trajectory, joints: Sequence[str], *, is_only: bool
+) -> dict[int, CommandFault]:
+    """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
+
+    The commands may be those of other joints, in another unit or sense than the positions, or increments of the
+    position.
+
+    Args:
+        following: tracking of the commands in a recording.
+        log: the recording.
+        joints: names of all joints.
+        is_only: True if there are no other recordings.
+    """
+    faults = dict[int, CommandFault]()
+    correlations, mapping = following.correlation.diagonal(), log.mapping
     is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
-    return np.flatnonzero(is_tracked & (following.correlation.diagonal() < 0.5)).tolist()
-
-
-def _exchange_error(
-    exchanged: Sequence[int], joints: Sequence[str], following: Following, mapping: LogMapping
-) -> LogError:
-    """Return the error about joints whose commands are tracked by other joints.
-
-    The error names the setting with the right column of each joint. exchanged: indices of the joints from
-    `_exchanged_commands`. joints: names of all joints.
-    """
-    entries = {}
-    for k in exchanged:
-        for source in np.flatnonzero(following.correlation[:, k] > FOLLOWS)[:1].tolist():
-            entries[joints[k]] = {"columns": {"u": mapping.column("u", joints[source])}}
-    do = mapping_line({"joints": entries}) if entries else "check the names of the columns"
-    where = f"joint {', '.join(repr(joints[k]) for k in exchanged)}"
-    got = "commands that other joints follow, and these do not"
-    return LogError(got, element=where, expected="their own commands", do=do)
-
-
-def _command_error(k: int, report: JointReport, following: Following, of_sum: float) -> LogError | None:
-    """Return the error that the logged commands of joint k cannot be its commands; None if they can.
-
-    The commands may be in another unit or sense than the positions, or be increments of the position. of_sum:
-    correlation of the position with the cumulative sum of the commands, which is high for increments.
-    """
+    exchanged = np.flatnonzero(is_tracked & (correlations < 0.5)).tolist()
+    # In one of several recordings, a joint may rest at an obstacle while another one moves as its command does by
+    # chance: at least two joints must track each other's commands.
+    if len(exchanged) > 1 or is_only:
+        for k in exchanged:
+            source = int(following.correlation[:, k].argmax())
+            is_found = following.correlation[source, k] > FOLLOWS
+            keys = {"columns": {"u": mapping.column("u", joints[source])}} if is_found else {}
+            got, do = "commands that other joints follow, and these do not", "check the names of the columns"
+            faults[k] = CommandFault(got, "their own commands", keys, do)
+    of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, log)
     # Correlation and gain are those at the delay of largest correlation, so that a slow servo is not reported as a
     # fault.
-    correlation, gain = following.correlation[k, k], following.gain[k]
-    # a gain (ratio of amplitudes) of about 57.3 or 1/57.3 shows that the command or the position is in degrees
-    if correlation > FOLLOWS and (is_factor(gain, 180 / np.pi) or is_factor(gain, np.pi / 180)):
-        got = f"positions that move {gain:.3g} times as far as commands (180/pi is 57.3)"
-        units = {"q": "deg", "u": "rad"} if gain > 1 else {"q": "rad", "u": "deg"}
-        expected, do = "both in radians", mapping_line({"joints": {report.name: {"units": units}}})
-    elif of_sum > FOLLOWS > correlation:
-        got = f"increments: the position follows the sum of the commands (correlation {of_sum:.2g})"
-        expected, do = "commanded positions", "log the commanded positions, or add the increments up"
-    elif following.moves[k] and correlation < -FOLLOWS:
-        got = f"positions that move against commands (correlation {correlation:.2g})"
-        expected = "one sense"
-        do = "multiply the column of u or that of q by -1: the setting 'sign' applies to both"
-    else:
-        return None
-    return LogError(got, element=f"joint {report.name!r}", expected=expected, do=do)
+    for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
+        if k in faults:
+            continue
+        if correlation > FOLLOWS and abs(np.log(gain)) > np.log(3):
+            units = _command_units(gain, mapping.unit("q", joints[k]), mapping.unit("u", joints[k]))
+            got, do = f"positions that move {gain:.3g} times as far as commands", "log both in one unit"
+            faults[k] = CommandFault(got, "both in the same unit", {"units": units} if units else {}, do)
+        elif correlation < FOLLOWS < of_sum[k]:
+            got = f"increments: the position follows the sum of the commands (correlation {of_sum[k]:.2g})"
+            do = "log the commanded positions, or add the increments up"
+            faults[k] = CommandFault(got, "commanded positions", do=do)
+        elif following.moves[k] and correlation < -FOLLOWS:
+            got = f"positions that move against commands (correlation {correlation:.2g})"
+            do = "multiply the column of u or that of q by -1: the setting 'sign' applies to both"
+            faults[k] = CommandFault(got, "one sense", do=do)
+    return faults
+
+
+def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
+    """Return the correlation (n,) of each position with the sum of the commands of its joint.
+
+    It is 0 if the position moves neither as far as the sum (commands that are increments) nor as far as the integral
+    (commands that are velocities): a sum of periodic commands is correlated with any motion of this period.
+    """
+    u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
+    summed = measure_following([replace(log, u=u)], following.saturation)
+    if summed is None:
+        return np.zeros(len(following.gain))
+    factors = summed.gain[:, None] / [1.0, 1.0 / log.sample_rate]
+    is_sum = ((factors > 0.5) & (factors < 2)).any(axis=1)
+    return np.where(is_sum, summed.correlation.diagonal(), 0.0)
+
+
+def _command_units(gain: float, q: str | None, u: str | None) -> dict[str, str]:
+    """Return the units of a joint's positions and commands, {"q": ..., "u": ...}, that explain the ratio of both.
+
+    {} is returned if no units do. gain: amplitude of positions divided by amplitude of commands, in the units q and u
+    of the mapping (None: rad).
+    """
+    present = np.array([SCALES.get(x or "", 1.0) for x in (q, u)])
+    candidates = []
+    for pair in ((x, u or "rad") if is_q else (q or "rad", x) for x in ANGLES for is_q in (True, False)):
+        scales = np.array([SCALES.get(x, 1.0) for x in pair]) / present
+        candidates.append((abs(np.log(gain * scales[0] / scales[1])), dict(zip("qu", pair, strict=True))))
+    distance, units = min(candidates, key=itemgetter(0))
+    return units if distance < np.log(1.25) else {}
 
 
 def _command_warning(
     k: int, report: JointReport, following: Following, logs: Sequence[Trajectory]
 ) -> Iterator[Diagnostic]:
-    """Yield the warning that the logged command of joint k may not be the command that its servo tracks."""
+    """Yield a warning if the logged command of joint k may not be the command that its servo tracks.
+
+    The command equals the position in all `logs`, hardly changes, is not tracked, has a constant distance from the
+    position, or comes after it.
+    """
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
-    if all(np.array_equal(log.q[:, k], require_commands(log)[:, k]) for log in logs):
+    shift = next((x for x in (0, 1, 2, -1, -2) if all(_is_shifted(log, k, x) for log in logs)), None)
+    if shift is not None:
         # commands equal to positions: the logger wrote measured positions in place of commands
         code = "commands-are-positions"
-        message = "u is q, to the last bit: are the commands those that were sent?"
+        late = f", {abs(shift)} rows {'later' if shift > 0 else 'earlier'}" * bool(shift)
+        message = f"u is q{late}, to the last bit: are the commands those that were sent?"
     elif not following.moves[k]:
         # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]
@@ -348,7 +489,7 @@ def _command_warning(
         code, message = "idle-command", f"its command {motion}: its servo is not determined"
     elif correlation < 0.5:
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
-    elif abs(offset) > OTHER_ZERO:
+    elif abs(offset) > OTHER_ZERO[report.kind]:
         side = f"{UNITS[report.kind].position} {'above' if offset > 0 else 'below'} its position throughout"
         code = "command-offset"
         message = f"its command is {abs(offset):.3g} {side}: other zeros of q and u, or a servo too soft for its load"
@@ -358,6 +499,13 @@ def _command_warning(
     else:
         return
     yield Diagnostic("warning", code, f"joint {report.name!r}", None, message)
+
+
+def _is_shifted(log: Trajectory, k: int, rows: int) -> bool:
+    """Return True if the commands of joint k are equal to its positions `rows` rows later."""
+    q, u = log.q[:, k], require_commands(log)[:, k]
+    n = len(q) - abs(rows)
+    return bool(n > 0 and np.array_equal(q[max(rows, 0) :][:n], u[max(-rows, 0) :][:n]))
 
 
 def _following_table(joints: Sequence[JointReport]) -> Listing:

@@ -1,28 +1,35 @@
-"""Checks of logs of torques against the model of the arm: geometry, torque limits and stops, couplings of motors."""
+"""Checks of logs of torques against the model of the arm: columns, torque limits and stops, couplings of motors."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.errors import Diagnostic, LogError
+from spelgen.errors import Diagnostic, LogError, SpelgenError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
-from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
-from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
+from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
+from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.log_faults import Fault
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.listing import Listing, number
-from spelgen.log_checks.geometry_finding import UNEXPLAINED, find_unexplained, geometry_finding
+from spelgen.log_checks.geometry_finding import (
+    UNEXPLAINED,
+    WARNINGS,
+    find_unexplained,
+    geometry_finding,
+    stated_hypothesis,
+)  # fmt: skip
 from spelgen.log_checks.limits_in_logs import CLIPPED, UNSIGNED, FlatTops, find_limits, find_unsigned
 from spelgen.log_checks.report import JointReport, percent, signal_tables
 from spelgen.log_checks.robot_checks import (
@@ -32,7 +39,7 @@ from spelgen.log_checks.robot_checks import (
     fit_gravity,
     torque_factors,
 )
-from spelgen.logs.checks import Check, Findings, run_checks
+from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
 from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
@@ -46,6 +53,9 @@ if TYPE_CHECKING:
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
+SMALL_MOTION = "small-motion"
+# Codes of warnings after which the drives are not tested: the torques may not be those of the joints.
+UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
 class TorqueLogs:
@@ -61,6 +71,7 @@ class TorqueLogs:
         self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
+        self._sources: list[tuple[str, Path | None]] = []
 
     def add(self, trajectory: Trajectory) -> None:
         """Add a trajectory to the logs that `check` tests. Raises LogError if it has no torques."""
@@ -68,10 +79,12 @@ class TorqueLogs:
         inputs = self._drives.inputs.T
         pieces = []
         for x in split_at_gaps(trajectory, shortest=3):
-            pieces.append(MotionSamples.of(x.q, x.qd, np.gradient(x.qd, x.t, axis=0), x.tau @ inputs))
+            qdd = np.gradient(x.qd, x.t, axis=0)
+            pieces.append(MotionSamples.of(x.q, x.qd, qdd, x.tau @ inputs, len(self._sources)))
         if pieces:
             # at most 400 samples of a trajectory are kept, which suffice, since gravity and friction change slowly
             self._samples.append(joined_samples(pieces).thinned(400))
+        self._sources.append((trajectory.name, trajectory.file))
         self._moving.add(trajectory)
         self._flat.append(FlatTops.of(trajectory.q, trajectory.tau @ inputs))
         self._declared.append(set(trajectory.accepted))
@@ -88,14 +101,10 @@ class TorqueLogs:
         """
         # a check is omitted if the mapping accepts its findings, or if the mappings of all trajectories do
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
-        chain, empty = self._arm.chain, MotionSamples.of(*np.zeros((4, 0, len(reports))))
+        empty = MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
-        completed, evidence = [], []
-        fits = fit_gravity(chain, motion)
-        for coordinate, report, gravity in zip(chain.coordinates, reports, fits, strict=True):
-            completed.append(replace(report, gravity=gravity))
-            offset = self._mapping.offset("q", coordinate.name)
-            evidence.append(JointEvidence(coordinate, completed[-1], offset))
+        evidence = self._evidence(reports, motion)
+        completed = [joint.report for joint in evidence]
         # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
         # hints.
         is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
@@ -109,10 +118,10 @@ class TorqueLogs:
             # Geometry is not tested if motor gains are unknown, since a wrong hypothesis about the log may then have
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
-            problem = None if unscaled else self._problem(motion if moving is None else moving)
-            is_right = problem is None or self._check_geometry(problem, evidence, accepted, summary)
-            if problem is not None and is_right and WITHOUT_GRAVITY not in accepted:
-                summary.notes.extend(_without_gravity(problem, completed))
+            samples = [motion, motion if moving is None else moving]
+            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted)
+            summary.extend(geometry)
+            is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
         has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
@@ -132,6 +141,53 @@ class TorqueLogs:
             summary.add(check, next(iter(joints.values())), where)
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
+    def _evidence(self, reports: Sequence[JointReport], motion: MotionSamples) -> list[JointEvidence]:
+        """Return the joints with their statistics, to which the fit of gravity to samples of a motion is added."""
+        evidence, coordinates = [], self._arm.chain.coordinates
+        fits = fit_gravity(self._arm.chain, motion)
+        for coordinate, report, gravity in zip(coordinates, reports, fits, strict=True):
+            offset = self._mapping.offset("q", coordinate.name)
+            evidence.append(JointEvidence(coordinate, replace(report, gravity=gravity), offset))
+        return evidence
+
+    def _geometry_findings(
+        self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
+    ) -> list[LogError | Diagnostic]:
+        """Return the findings about the geometry of the logs: of all recordings together, if their torques agree.
+
+        Recordings that contradict the others are tested by themselves, and the others together. Errors of such a
+        recording name it, unless the others have errors, too.
+
+        Args:
+            samples: unfiltered samples, and filtered ones, which are preferred.
+            evidence: each joint of the URDF with its statistics.
+            accepted: codes of the checks that the mapping accepts.
+        """
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 else None
+        deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
+        agreeing = [k for k in range(len(self._sources)) if k not in deviating]
+        findings = list[LogError | Diagnostic]()
+        for numbers in (agreeing, *([k] for k in deviating)):
+            chosen = [x.part(np.isin(x.recording, numbers)) if deviating else x for x in samples]
+            problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
+            problem = next((x for x in problems if x is not None), None)
+            if problem is None:
+                continue
+            joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
+            flat = FlatTops.joined([self._flat[k] for k in numbers])
+            results = list(self._findings(problem, flat, joints, accepted))
+            if numbers is agreeing:
+                findings += results
+                if any(isinstance(x, LogError) for x in results):
+                    break
+                continue
+            name, file = self._sources[numbers[0]]
+            for error in results:
+                if isinstance(error, LogError):
+                    where = f"trajectory {name}, {error.element}"
+                    findings.append(replace(error, file=file, element=where, do=OF_ONE))
+        return findings
+
     def _unscaled_currents(self) -> list[Diagnostic]:
         """Return a warning about logged motor currents whose gain is still 1, as in the draft of a mapping.
 
@@ -146,8 +202,8 @@ class TorqueLogs:
             return []
         message = (
             "currents or parts of a torque with a gain of 1: write 'gain', Nm per unit at the joint, the gear "
-            "included, under 'logs' in the robot's YAML; until then, senses, order and zeros of the joints are not "
-            "tested"
+            "included, under 'logs' in the robot's YAML, or, if it is unknown, 'torque: motor' and for each joint "
+            "'gain: trained' under 'joints'; until then, senses, order and zeros of the joints are not tested"
         )
         return [Diagnostic("warning", CURRENT, f"joint {', '.join(map(repr, names))}", None, message)]
 
@@ -155,102 +211,79 @@ class TorqueLogs:
         """Return True if the mapping states the unit of a joint's torque."""
         return self._mapping.unit("tau", joint) is not None
 
-    def _problem(self, samples: MotionSamples) -> GeometryProblem | None:
+    def _problem(self, samples: MotionSamples, share: float = 1.0) -> GeometryProblem | None:
         """Return the least-squares problem of the samples, for the comparison of hypotheses about the log.
 
-        None is returned for too few samples, or if all torques are constant.
+        None is returned for too few samples, or if all torques are constant. share: fraction of the recordings from
+        which the samples are.
         """
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
-        return GeometryProblem(
-            self._arm.chain, samples, self._drives.speeds, self._seconds, self._stated_hypothesis()
-        )
-
-    def _stated_hypothesis(self) -> Hypothesis:
-        """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
-
-        The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
-        """
-        joints, inputs, mapping = self._arm.chain.joint_names, self._drives.inputs, self._mapping
+        joints, inputs = self._arm.chain.joint_names, self._drives.inputs
+        # The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
         gears = np.diag(inputs) if np.count_nonzero(inputs) == len(joints) else np.ones(len(joints))
-        scale = np.array([[mapping.scale(quantity, joint) for joint in joints] for quantity in ("q", "tau")])
-        scale[1] *= np.where(gears, gears, 1.0)
-        offset = np.array([mapping.offset("q", joint) for joint in joints])
-        return replace(Hypothesis.unchanged(self._arm.chain), scale=scale, offset=offset)
+        stated = stated_hypothesis(self._arm.chain, self._mapping, np.where(gears, gears, 1.0))
+        return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
 
-    def _check_geometry(
-        self,
-        problem: GeometryProblem,
-        evidence: Sequence[JointEvidence],
-        accepted: set[str],
-        summary: Findings,
-    ) -> bool:
-        """Return True if the torques agree with the mapping: they are not cut off, and no hypothesis fits much better.
+    def _findings(
+        self, problem: GeometryProblem, flat: FlatTops, evidence: Sequence[JointEvidence], accepted: set[str]
+    ) -> Iterator[LogError | Diagnostic]:
+        """Yield the findings about the geometry of recordings, in the order of the tests.
 
-        Hypotheses are, for example, other signs, orders or zeros of the joints. For torques that do not agree, the
-        finding is added to `summary`, and False is returned. Warnings about mechanical stops and about inertials of the
-        URDF are added to `summary`, too.
+        The tests end with a finding that explains the torques, or that leaves them unexplained. Tested are the motion,
+        signs and limits of the torques, then hypotheses about senses, order, zeros, units and gravity, and, if the
+        torques agree with the mapping, the inertials of the URDF.
 
         Args:
             problem: least-squares problem of the samples.
+            flat: flat tops of the positions and torques.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
-            summary: findings, to which findings are added.
         """
         motion = problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
-        # Units that the mapping states wrongly make motions small, so they are tested nevertheless.
+        # A motion may only seem small because the mapping states a wrong unit of positions. Logs with a stated unit are
+        # therefore tested even if their motion is small.
         if not is_stated and np.ptp(motion, axis=0).max() < TUNING.smallest_motion:
             message = (
                 f"all joints stay within {TUNING.smallest_motion:g} rad or m: too little motion to test senses, order, "
                 "zeros, units and gravity"
             )
-            summary.notes.append(Diagnostic("warning", "small-motion", "logs", None, message))
-            return False
-        unsigned = find_unsigned(problem) if UNSIGNED not in accepted else []
-        if unsigned:
-            summary.errors.extend(unsigned)
-            return False
-        limits = find_limits(problem, FlatTops.joined(self._flat))
-        summary.notes.extend(limits.notes)
-        if limits.errors and CLIPPED not in accepted:
-            summary.errors.extend(limits.errors)
-            return False
+            yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
+            return
+        wrong: Sequence[SpelgenError] = find_unsigned(problem) if UNSIGNED not in accepted else []
+        if not wrong:
+            limits = find_limits(problem, flat)
+            yield from limits.notes
+            wrong = limits.errors if CLIPPED not in accepted else []
+        yield from (x for x in wrong if isinstance(x, LogError))
+        if wrong:
+            return
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
-        if isinstance(unexplained, LogError):
-            summary.errors.extend([unexplained] if UNEXPLAINED not in accepted else [])
-            return UNEXPLAINED in accepted
-        if unexplained:
-            summary.notes.append(unexplained)
-            return False
-        if not better:
-            summary.notes.extend(_link_notes(problem, unchanged))
-            return True
-        faults = better[0].hypothesis.faults
-        if {fault.code for fault in faults} <= accepted:
-            return True
-        # the evidence for another unit of one torque is gravity, which a wrong link of the URDF may change as well
+        if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
+            return
+        if unexplained is not None:
+            yield unexplained
+            return
+        faults = better[0].hypothesis.faults if better else ()
+        if not better or {fault.code for fault in faults} <= accepted:
+            yield from () if better else _link_notes(problem, unchanged)
+            if WITHOUT_GRAVITY not in accepted:
+                yield from _without_gravity(problem, [joint.report for joint in evidence])
+            return
+        # The only evidence for another unit of one torque is the magnitude of its gravity torque, which a wrong link of
+        # the URDF changes as well: wrong links are reported, too.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
-            summary.notes.extend(_link_notes(problem, unchanged))
-        corrections = []
-        for fit in better:
-            corrections.append(
-                Correction(problem.arm, self._mapping, self._is_bag, problem.unchanged, fit.hypothesis)
-            )
-        finding = geometry_finding(unchanged, better[0], corrections)
-        if isinstance(finding, Diagnostic):
-            summary.notes.append(finding)
-        else:
-            summary.errors.append(finding)
-        return False
+            yield from _link_notes(problem, unchanged)
+        yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test, with candidates for wrong units of torques and positions.
+        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for wrong units.
 
         The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
-        that the mapping states is not changed, unless it is mNm.
+        that the mapping states is assumed to be right, except mNm: such torques may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -305,8 +338,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
     """Yield a warning for each link whose mass or first moment, by least squares, is far from its value in the URDF.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference must change the torque of a joint by half of the torque's standard deviation, since parameters of bodies
-    that hardly affect the torques are uncertain.
+    difference between both values must change the torque of a joint by at least half of its standard deviation, since
+    parameters with a small effect on the torques are uncertain.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
@@ -325,8 +358,9 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             axis = stated / size
             ratio = float(axis @ found) / size
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
-            # Masses of CAD models are wrong by a factor of less than 2.5. The difference from the URDF must also
-            # exceed four standard deviations of the fitted value: one of many bodies may exceed two by chance.
+            # The ratio must be beyond 2.5 or its inverse: masses of CAD models are wrong by less. The difference from
+            # the URDF must also exceed four standard deviations of the fitted value: at one of many bodies, it exceeds
+            # two by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

@@ -4,35 +4,59 @@ The finding names the settings that correct the log. If no setting can correct i
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.continuous_faults import Gravity, ZeroOffset
-from spelgen.identification.hypotheses import HypothesisFit
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.log_faults import Correction, Fault
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.tuning import SAMPLES
+from spelgen.settings.log_mapping import LogMapping
 
 UNEXPLAINED = "torque-unexplained"
 WARNINGS = ("torque-scale", ZeroOffset.code, Gravity.code)
 RIGHT = "joints, zeros, units and gravity as the URDF and the settings state them"
 
 
+def stated_hypothesis(arm: Chain, mapping: LogMapping, gears: np.ndarray | float = 1.0) -> Hypothesis:
+    """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
+
+    gears: (n,) factors on the scales of the torques.
+    """
+    joints = arm.joint_names
+    scale = np.array([[mapping.scale(quantity, joint) for joint in joints] for quantity in ("q", "tau")])
+    scale[1] *= gears
+    offset = np.array([mapping.offset("q", joint) for joint in joints])
+    return replace(Hypothesis.unchanged(arm), scale=scale, offset=offset)
+
+
 def geometry_finding(
-    unchanged: HypothesisFit, best: HypothesisFit, corrections: Sequence[Correction]
+    problem: GeometryProblem,
+    mapping: LogMapping,
+    unchanged: HypothesisFit,
+    better: Sequence[HypothesisFit],
+    *,
+    by_name: bool = False,
 ) -> LogError | Diagnostic:
-    """Return the finding that the hypothesis of ``best`` explains a log better than the current settings.
+    """Return the finding that the hypothesis of lowest cost explains a log better than the current settings.
 
     The finding is an error. It is only a warning if an error of the URDF or of the mounting may be the reason: a small
     zero offset, a small tilt, or a moderate factor on the torques.
 
     Args:
+        problem: least-squares problem of the logs.
+        mapping: mapping of the logs.
         unchanged: fit of the unchanged log.
-        best: fit of the best hypothesis.
-        corrections: corrections of the log by the best hypothesis, and by others that fit about equally well.
+        better: fits of the best hypothesis, and of others that fit about equally well.
+        by_name: see `Correction`.
     """
+    best, hypotheses = better[0], [x.hypothesis for x in better]
+    corrections = [Correction(problem.arm, mapping, by_name, problem.unchanged, x) for x in hypotheses]
     faults, correction = best.hypothesis.faults, corrections[0]
     where = " and ".join(dict.fromkeys(_place(correction, fault) for fault in faults))
     evidence = faults[0].evidence
@@ -54,9 +78,10 @@ def find_unexplained(
 ) -> Diagnostic | LogError | None:
     """Return the finding that neither the unchanged log nor a hypothesis about it explains the torques, or None.
 
-    The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a
-    large residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without
-    such a hypothesis, the finding is a warning, since torques of noise or of friction may be right.
+    The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a large
+    residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without such
+    a hypothesis, the finding is a warning: torques that are mostly noise or friction are unexplained even in a log
+    without faults.
 
     best: fit of the best hypothesis; None if no hypothesis is significantly better.
     """
@@ -73,8 +98,7 @@ def find_unexplained(
         "torques that no hypothesis about senses, order, zeros, units and gravity explains: "
         f"{min(remaining, 1.0):.0%} of the variance remains"
     )
-    recordings = 1 + np.count_nonzero(np.diff(problem.samples.times) < 0)
-    do = "check each recording by itself, and " * bool(recordings > 1) + (
+    do = "check each recording by itself, and " * bool(np.ptp(problem.samples.recording)) + (
         "check that the columns are the torques of these joints, with their sign and at the times of the positions"
     )
     if best is None:
@@ -86,8 +110,13 @@ def find_unexplained(
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
     """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
 
-    A joint counts in proportion to the variance of its torque, since the torque of a joint at rest may be noise only. A
-    joint counts by itself if it moves, and if the URDF's torque is about as large as the logged one.
+    A relative residual is the squared torque residual divided by the variance of the torque; `no_torque` and
+    `no_advice` are thresholds in `GEOMETRY`.
+
+    1. If the mean residual of all joints is above `no_torque`: the joints with a residual above `no_advice`, and the
+       mean. It is weighted with the variances of the torques: the torque of a joint at rest may be only noise.
+    2. Otherwise: the moving joints with a residual above `no_torque` whose torque by the URDF varies at least half as
+       much as the logged torque, and the largest residual of these joints.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)

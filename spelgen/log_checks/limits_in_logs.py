@@ -2,7 +2,8 @@
 
 At a limit a signal is constant at its largest or smallest value: it has a flat top. But a flat top is no proof of a
 limit, since torques are also constant at rest and during uniform acceleration. It is a limit if, in addition, the
-torque contradicts the least-squares model of all samples outside flat tops.
+torque contradicts the least-squares model of all samples outside flat tops. Torques were logged without
+sign if the model explains them much better with restored signs.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the constant extreme values of positions q and torques tau of one trajectory, (T, n) each."""
+        """Return the flat bottoms and tops of positions q and torques tau of one trajectory, (T, n) each."""
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
     def joined(cls, trajectories: Sequence[FlatTops]) -> FlatTops:
-        """Return the extreme values at which signals stay (flat bottoms and tops), joined over several trajectories.
+        """Return the lowest flat bottom and the highest flat top of each signal in several trajectories; NaN if none.
 
-        The fractions of the samples at them (`shares`) are means over the trajectories.
+        The fractions of samples at flat bottoms and tops (`shares`) are means over the trajectories.
         """
         q, tau, shares = map(np.stack, zip(*trajectories, strict=True))
         sides = SIDES[:, None]
@@ -77,8 +78,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
 
     The torques get the signs of the model's torques, and the model is fitted again, in a few alternations. A joint is
-    named if this lowers its residual much, and if both signs occur: the load of a joint with only one sign may indeed
-    have always the same direction.
+    named if this lowers the joint's squared residual much, and if both signs occur. If only one sign occurs, the load
+    of the joint may indeed always have the same direction.
     """
     problem = problem.thinned(GEOMETRY.confirming_samples)
     signals = problem.unchanged.signals(problem.samples)
@@ -87,7 +88,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     if not suspects.any():
         return []
     fits = []
-    # Initial signs are the signs of the URDF's torques or, for joints with little load, of the velocity (friction).
+    # Two guesses of the signs are refined: the signs of the URDF's torques and, for joints with little load, the signs
+    # of the velocity (friction).
     for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
@@ -121,7 +123,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     free = ~(at_torque | at_position).any(axis=0)
     if free.all():
         return findings
-    # the model is fitted only to samples outside flat tops, which are not at a limit
+    # The model is fitted only to samples outside flat tops: at these samples, neither torque nor position is at a
+    # limit.
     fit = problem.on_torques(free).fit(problem.unchanged)
     residual = problem.residual(problem.unchanged, fit.parameters)
     deviation, (_, _, friction, *_) = problem.prediction_deviation(fit), problem.drive_parameters(fit)
@@ -135,8 +138,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # The torque excess at a flat top must be larger than the friction: friction estimated from few samples may be
-        # wrong, and its error is no evidence of a limit.
+        # At a flat top of the torque, the model's torque must exceed the logged torque by more than the friction:
+        # friction estimated from few samples may be wrong, and its error is no evidence of a limit.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():

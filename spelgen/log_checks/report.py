@@ -195,17 +195,17 @@ class LogReport:
 def joint_report(
     index: int, coordinate: Coordinate, measured: Sequence[Statistics], products: np.ndarray
 ) -> JointReport:
-    """Return the statistics of the joint number `index` over all trajectories, without gravity and tracking.
+    """Return the statistics of joint number `index` over all trajectories; fields of gravity and tracking are not set.
 
-    measured: statistics of each trajectory. products: (2n, 2n) sum of the results of `velocity_products` for all
-    trajectories, from which qd is compared with dq/dt.
+    measured: statistics of each trajectory. products: (2n, 2n) Gram matrix of increments of the n positions q and the n
+    integrals of qd, summed over all trajectories (see `velocity_products`).
     """
     low, high, noise, steps = {}, {}, {}, {}
     for name in measured[0].signals:
         lows, highs, noises, quanta = np.array([x.signals[name][:, index] for x in measured]).T
         low[name], high[name] = float(lows.min()), float(highs.max())
-        # noise and steps are medians over trajectories, so that one trajectory with contacts does not determine the
-        # noise
+        # noise and quantisation steps are medians, so that a single trajectory, for example with contacts, does not
+        # determine them
         noise[name], steps[name] = _median(noises, 0.0), _median(quanta, 0.5)
     factors, correlations = velocity_agreement(products)
     factor, correlation = factors[index], correlations[index, index]

@@ -36,8 +36,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [rad, m] Largest range of positions of a log in which friction before sliding may determine the torques: the
-    # geometry is not tested. At 0.02, wrong hypotheses are the best ones on simulated arms; at 0.1, none is.
+    # [rad, m] Hypotheses about a log are not tested if its positions range over less than this value: friction before
+    # sliding may then determine the torques. At a range of 0.02, wrong hypotheses fit best on simulated arms; at 0.1,
+    # none does.
     smallest_motion: float = 0.05
     # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
     # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
@@ -80,7 +81,7 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # `is_rounding`: signals that consist of rounding errors after the projection, e.g. a constant torque
+    # `is_rounding`: signals of which only rounding errors remain after friction is removed, e.g. a constant torque
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
@@ -110,7 +111,7 @@ def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
 class JointEvidence(NamedTuple):
     """A joint of the URDF and its statistics over all trajectories: the input of each check in `CHECKS`.
 
-    offset: offset of the logged position in the mapping [rad, m].
+    coordinate: the joint. report: its statistics. offset: zero offset of its positions in the column mapping [rad, m].
     """
 
     coordinate: Coordinate
@@ -172,19 +173,22 @@ def torque_factors(
 
     Let r be the gravity in a joint's logged torques divided by the gravity torque of the URDF; r is negative if the
     torques have the opposite sense. If |r| is above five or below a fifth, wrong inertials do not explain it. For each
-    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the median
-    of r over the joints is above five or below a fifth, there is also a candidate with 1 / median for all joints.
+    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the
+    magnitude of the median of r over the joints is above five or below a fifth, there is also a candidate with 1 /
+    median for all joints.
 
     Args:
         joints: the joints with their fits of gravity.
-        undeclared: (n,) True for joints whose torque has no unit in the mapping.
-        loaded: (n,) True for joints that gravity loads enough.
+        undeclared: (n,) True for joints whose torque may have another unit: none in the mapping, or mNm. A candidate
+            for all joints requires True for all joints.
+        loaded: (n,) True for joints that gravity loads enough. Only joints that are True in both masks have an r.
     """
     seen: list[float] = []
     factors = []
     for k, joint in enumerate(joints):
         factor, correlation = joint.report.gravity.factor, abs(joint.report.gravity.correlation or 0.0)
-        # The ratio of a joint with little gravity is known only if its torque is nearly proportional to gravity.
+        # The ratio of the logged torque to the URDF's gravity torque is known only if the torque contains much gravity,
+        # or is nearly proportional to it.
         share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
         is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
         if factor is None or not (is_known and undeclared[k] and loaded[k]):
@@ -201,7 +205,7 @@ def torque_factors(
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:
-    """Return a message if torques exceed the joint's effort limit 20 times, so that their unit is wrong; else None."""
+    """Return a message if torques exceed 20 times the joint's effort limit, so that their unit is wrong; else None."""
     # an effort of 0 in a URDF means that the limit is unknown
     limit, largest = joint.coordinate.effort or 0.0, joint.report.largest("tau")
     # The bound is 20 times the limit: torques in mNm are 1000 times as large as in Nm, and no drive gives 20 times its
@@ -235,10 +239,9 @@ def find_one_way(joint: JointEvidence) -> str | None:
     # velocity that does not agree with dq/dt does not show the direction of motion.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
-    unit = UNITS[joint.coordinate.joint_type].velocity
     return (
-        f"moves one way only, qd from {joint.report.low['qd']:.3g} to {joint.report.high['qd']:.3g} {unit}: its dry "
-        "friction is indistinguishable from gravity and a torque offset; record its motion both ways"
+        "moves one way only: dry friction is indistinguishable from gravity and a torque offset; record motion in both "
+        "directions"
     )
 
 

@@ -38,9 +38,9 @@ class Clock:
 class Statistics(NamedTuple):
     """Statistics of one trajectory of n joints.
 
-    clock: sample times. signals: for each of "q", "qd" and "tau" or "u" an array (4, n) with the lowest value, the
-    highest value, the standard deviation of white noise (NaN for sparse logs), and the quantisation step (NaN for
-    signals that are not quantised).
+    clock: statistics of the sample times. signals: for each of "q", "qd" and "tau" or "u" an array (4, n) with the
+    lowest value, the highest value, the standard deviation of white noise (NaN below 50 Hz), and the quantisation step
+    (NaN for signals that are not quantised).
     """
 
     clock: Clock
@@ -91,10 +91,10 @@ def noise_level(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def quantisation_step(values: np.ndarray) -> float:
     """Return the quantisation step of a signal (T,); NaN if the signal is constant or not quantised."""
     differences = np.diff(np.unique(values))
-    # Smaller differences are rounding errors, for example of a unit conversion.
+    # Differences below 1e-9 of the largest value are rounding errors, for example of a unit conversion.
     differences = differences[differences > 1e-9 * np.abs(values).max(initial=0.0)]
-    # A difference of two levels counts as a multiple of the step if its distance from the nearest multiple is less than
-    # 5 % of a step. At least 95 % of the differences must be multiples. `tolerance` is the 5 % of both bounds.
+    # `tolerance` is used twice. A difference of two levels counts as a multiple of the step if its distance from the
+    # nearest multiple is less than 5 % of a step. At most 5 % of the differences may be no multiples.
     tolerance = 0.05
     # Two or three levels are multiples of some step by chance.
     if len(differences) < 3:
@@ -114,5 +114,5 @@ def quantisation_step(values: np.ndarray) -> float:
 
 
 def has_few_levels(step: float, width: float) -> bool:
-    """Return True if the range `width` of a quantised signal has fewer than ten steps, too few for a reliable value."""
+    """Return True if the range `width` of a quantised signal has fewer than ten steps, so that it is not resolved."""
     return width < 10.0 * step

@@ -86,7 +86,10 @@ def _of_one_arm(
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
     if not of_arm:
         logged = list(dict.fromkeys(name for x in messages for name in x.state.name))
-        got = f"joint states of {', '.join(logged) or 'no joint'} only"
+        if not logged:
+            got = f"{counted(len(messages), 'joint state')}, none with names of joints"
+            raise LogError(got, file=path, expected=f"joint states of {', '.join(names)}")
+        got = f"joint states of {', '.join(logged)} only"
         raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, logged))
     joints_of: dict[str, set[str]] = {}
     for message in of_arm:
@@ -140,8 +143,8 @@ def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name, without a prefix of all joints, is the end of exactly one
-    logged name ("panda_j1" and "fer_j1", "j1" and "left_j1").
+    the settings that map the names if every joint name is the end of exactly one logged name ("j1" of "left_j1"). If
+    not, it is tried again without the prefix that all joint names share ("panda_j1" is then mapped to "fer_j1").
     """
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
@@ -177,8 +180,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
     try:
-        # A damaged bag could exhaust the memory, since rosbags unpacks chunks of any size. Messages decoded to arrays
-        # need ten times their size in the file, so the bound of 20 times the file size suffices.
+        # The memory of the process is limited, since a damaged bag may contain chunks that rosbags unpacks to any size.
+        # Messages decoded to arrays need ten times their size in the file, so a limit of 20 times the file size
+        # suffices.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, path)
             unfinished = [] if is_ros1 else _unfinished(path)
@@ -204,7 +208,10 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
 
 
 def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of a bag, read with `rosbags`. Raises LogError if there are none."""
+    """Yield the encoded joint states on all topics of a bag, which the function `open_bag` of `rosbags` opens.
+
+    Raises LogError if there are none.
+    """
     with open_bag(path) as reader:
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
         if not connections:

@@ -42,6 +42,8 @@ from spelgen.logs.unit_checks import (
 from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
+# Advice for a fault of some recordings: its settings would be wrong for the others.
+OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
 
 Subject = TypeVar("Subject")
 
@@ -54,8 +56,8 @@ class Check(Generic[Subject]):
         code: name of the check in reports; the option `--accept CODE` omits the check.
         severity: logs with a finding of severity "error" cannot be trained on.
         find: function of the checked object that returns a message about the fault, or None if there is no fault.
-        unless: codes of earlier checks; if one of them has a finding, which explains this fault, too, this check is
-            omitted.
+        unless: codes of earlier checks whose findings would explain this fault, too: if one of them has a finding, this
+            check is omitted.
         everywhere: if True, a fault is reported only if it occurs in all trajectories.
         expected: expected content of the log, for the error message.
         do: advice for correcting the fault, for the error message.
@@ -81,6 +83,14 @@ class Findings:
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
 
+    def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
+        """Add errors and notes."""
+        for finding in findings:
+            if isinstance(finding, Diagnostic):
+                self.notes.append(finding)
+            else:
+                self.errors.append(finding)
+
     def add(
         self,
         check: AnyCheck,
@@ -88,17 +98,21 @@ class Findings:
         where: str,
         file: Path | None = None,
         keys: Mapping[str, object] | None = None,
+        is_partial: bool = False,
     ) -> None:
         """Add the message of a check, as an error or as a note according to the check's severity.
 
         where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
         `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
-        the log without the correction.
+        the log without the correction. is_partial: True if the settings may be wrong for other recordings.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
             return
-        do = f"{mapping_line(keys) if keys else check.do}; --accept {check.code} if it is right"
+        do = mapping_line(keys) if keys else check.do
+        if is_partial:
+            do = f"{do} if this is true of all recordings; else correct this one, or leave it out"
+        do = f"{do}; --accept {check.code} if it is right"
         self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 
 
@@ -172,13 +186,13 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# REPAIRED and REMARKED find nothing and only have a code and a severity: the messages, about changed rows (REPAIRED) or
-# properties of the file (REMARKED), are from the reader of the log.
+# REPAIRED and REMARKED are no checks, but the code and severity of messages from the reader of the log, about changed
+# rows (REPAIRED) or properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals: undecoded register words of velocities differ from dq/dt, as if
-    # positions were frozen.
+    # Jumps are searched before frozen signals: a velocity in raw register words differs from dq/dt as a frozen signal
+    # does, and would otherwise be reported as one.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -236,7 +250,7 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) sum of the results of `velocity_products` for all trajectories.
+    products: (2n, 2n) Gram matrix that compares dq/dt to qd: sum of `velocity_products` over all trajectories.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -289,7 +303,12 @@ class LogChecks:
                 where += f", joint {', '.join(map(repr, names))}"
             entries = {name: self._results[name, check][0][0].joint for name in names}
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
-            summary.add(check, message, where, file, keys)
+            # Units and columns would be wrong for recordings that have others. Dropped rows, periods and sign bits do
+            # not change sound recordings.
+            is_partial = len(occurrences) < self._count and any(
+                x in str(keys) for x in ("units", "columns", "rate")
+            )
+            summary.add(check, message, where, file, keys, is_partial)
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
@@ -305,7 +324,7 @@ class LogChecks:
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
         kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
-        is_shared = entries[first].keys() == {"units"} and 2 * len(entries) > len(kin)
+        is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})

@@ -124,7 +124,8 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
     The header is the first line that has `width` cells, the number of cells of most lines, and is no comment. If this
     line has values and a comment with `width` cells precedes it, the comment is the header.
     """
-    # In rows that end with a delimiter, the last cell has no name.
+    # If all rows of values end with a delimiter, their last cell is empty and has no name: the header may have one cell
+    # less.
     is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
     full = [k for k, row in enumerate(cells) if len(row) in (width, width - is_ended)] or [0]
     first = next((k for k in full if not COMMENT.match(lines[k])), full[0])
@@ -136,7 +137,8 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
     """Return the names of the columns of a CSV file, and the index of the first line of values.
 
     Between header and values there may be lines without digits, such as units, and repeats of the header. Names may be
-    in two lines: the quantities, repeated or once for several joints, and below them the joints.
+    in two lines: the first line has the quantities, each repeated for all joints or only above its first joint; the
+    second line has the joints.
 
     lines, cells: text and cells of each line. header: index of the header.
     """
@@ -159,8 +161,9 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
     """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    A line of names or units has no digits. cells: cells of the line if it may have names with digits, such as "joint1":
-    it has no values if none of its cells is a number. None: it has no such names.
+    A line without digits has no values. In a file with joint names in a second line, names such as "joint1" have
+    digits: there, a line has no values if none of its cells is a number. cells: cells of the line for such a file; None
+    for other files.
     """
     is_name = cells is not None and not any(map(is_number, cells))
     return bool(line) and (line == header or is_name or not re.search(r"\d", line))
@@ -196,8 +199,8 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
 
 def _decoded_head(file: Path) -> tuple[str, str]:
     """Return the text encoding of a file (UTF-8, UTF-16 or Latin-1), and its first characters."""
-    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. The module
-    # csv reads no larger cells.
+    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. It is as
+    # large as the largest cell that the module csv reads.
     size = 2**17
     with file.open("rb") as source:
         head = source.read(size)

@@ -81,7 +81,7 @@ def dynamics_samples(
         if not pieces or not shows_accelerations(trajectory.sample_rate):
             continue
         columns = [_columns(piece, pauses, preprocessing.acceleration_cutoff, reach) for piece in pieces]
-        # The arrays of a single gap-free piece are not copied, since they may be hours long.
+        # A single gap-free piece is not concatenated: this would copy its arrays, which may contain hours of samples.
         joined = columns[0]
         if len(columns) > 1:
             joined = list(map(np.concatenate, zip(*columns, strict=True)))
@@ -102,8 +102,8 @@ def _columns(
 ) -> list[np.ndarray]:
     """Return the arrays of `DynamicsSamples` for one gap-free piece, at the samples at which a joint moves.
 
-    The arrays are q, qd, qdd and tau, (T, n), then z (T, n, K), if `reach` has bristles, and the direction (T, n), if
-    `reach` also has a smoothing velocity.
+    The arrays are q, qd, qdd and tau, (T, n), then the states z (T, n, K) of K bristles per joint, if `reach` has
+    bristles, and the direction (T, n) of dry friction, if `reach` also has a velocity over which its sign is smoothed.
 
     Args:
         piece: gap-free piece of a log.
@@ -137,9 +137,9 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # The filter smooths the torque steps at reversals of a joint, so the bristle states need the same filter. The
-        # steps of unfiltered states would differ in time from the torque steps by up to one sample, an error that is
-        # confounded with inertia.
+        # The filter smooths the torque steps at reversals of a joint, so the bristle states are computed at the times
+        # of the log, and get the same filter. Unfiltered states would step up to one sample earlier or later than the
+        # torque, an error that is confounded with inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)

@@ -24,7 +24,7 @@ def low_pass(trajectory: Trajectory, cutoff: float) -> Trajectory:
 
 
 def require_cutoff(trajectory: Trajectory, rate: float, cutoff: float) -> None:
-    """Raise LogError if a sample rate [Hz] is too low for a filter with this cutoff [Hz]."""
+    """Raise LogError about `trajectory` if its sample rate [Hz] is too low for a filter with this cutoff [Hz]."""
     if cutoff >= rate / 2:
         got = f"a filter of {cutoff:g} Hz on samples at {rate:.3g} Hz"
         raise trajectory.error(got, f"below {rate / 2:.3g} Hz", "lower or drop the filter")

@@ -6,6 +6,7 @@ divided by the acceleration, is H(f) = J_m + J_l / (1 - (f / f_0)^2), where f_0 
 locked motor. A rigid joint has H(f) = J + c / f^2, where the constant c is due to gravity.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,8 +15,8 @@ import yaml
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.labels import counted
-from spelgen.logs.jumps import is_lost, is_outlier, jump_count, jumps, read_as_words, signed, unwrapped
-from spelgen.logs.recording import listed_times, outlier_rows, stale_rows
+from spelgen.logs.jumps import decoded, is_lost, is_outlier, jump_count, jumps, read_as_words, unwrapped
+from spelgen.logs.recording import COMMANDED, listed_times, outlier_rows, stale_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
 
@@ -130,6 +131,12 @@ class JointSignals(NamedTuple):
         values = self.trajectory.column(quantity)
         return values[:, self.number] if values.size else np.zeros(0)
 
+    def raw(self, quantity: str) -> np.ndarray:
+        """Return the joint's signal in the unit of the log, (T,)."""
+        mapping = self.trajectory.mapping
+        values = self.signal(quantity) - mapping.offset(quantity, self.joint)
+        return np.asarray(values / mapping.scale(quantity, self.joint))
+
     @property
     def factor(self) -> float:
         """Ratio of dq/dt to qd of this joint, 1 for correct units; NaN for a joint at rest."""
@@ -142,29 +149,35 @@ class JointSignals(NamedTuple):
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a measured ratio of dq/dt to qd equals the conversion factor `unit` between units within 25 %."""
+    """Return True if a measured ratio of dq/dt to qd equals, within 25 %, the conversion factor `unit` of two units."""
     # Ratio of dq/dt to qd and conversion factor may differ by 25 %: noisy velocities make the ratio inexact, and
     # conversion factors of different units differ by more than 25 %.
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if a signal is frozen while the joint moves: constant q or qd, or repeated old values."""
+    """Return a finding if a signal is frozen while the joint moves: constant q or qd, or repeated old values.
+
+    Positions of servos are compared with their commands, other signals with the integral of qd.
+    """
     from scipy.integrate import cumulative_trapezoid
 
-    # `motion` [rad, m]: a constant qd is frozen if q changes by more than `motion`; a constant q is frozen if the
-    # integral of qd changes by more than `motion`.
-    t, q, qd, motion = signals.trajectory.t, signals.q, signals.qd, 0.05
-    if np.ptp(qd) == 0 and np.ptp(q) > motion:
+    # `motion` [rad, m]: a constant qd is frozen if q changes otherwise by more than `motion`; a constant q is frozen if
+    # the integral of qd changes by more than `motion`.
+    t, q, qd, u, motion = signals.trajectory.t, signals.q, signals.qd, signals.signal("u"), 0.05
+    if np.ptp(qd) == 0 and np.ptp(q - qd * (t - t[0])) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # A constant q is compared with the integral of qd and not with qd, because the integral averages the noise of qd.
     drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
+    if np.ptp(q) == 0 and u.size and np.ptp(u) > COMMANDED:
+        return f"q always {q[0]:g} while its command goes from {u.min():.3g} to {u.max():.3g}"
     # Stale values are not searched if another unit explains the difference between qd and dq/dt.
     is_other_unit = signals.correlation > SIGNALS.agreement and not 0.25 < signals.factor < 4
-    for name in signals.measured if "qd" in signals.measured and not is_other_unit else ():
-        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd))
+    has_motion = "qd" in signals.measured and not is_other_unit
+    for name in signals.measured if has_motion or u.size else ():
+        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd, u))
         if rows.size:
             value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
             message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"
@@ -175,9 +188,9 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
 
 def find_dropouts(signals: JointSignals) -> str | None:
     """Return a message about the first signal of the joint with lost samples or outliers; None if there is none."""
-    for name in signals.measured:
+    for name in (*signals.measured, "u") if signals.signal("u").size else signals.measured:
         values = signals.signal(name)
-        rows = np.flatnonzero(outlier_rows(name, values))
+        rows = np.flatnonzero(outlier_rows(name, values, signals.q))
         if rows.size:
             first, sound = rows[0], np.setdiff1d(np.arange(len(values)), rows)
             size = values[first] - values[sound[np.abs(sound - first).argmin()]]
@@ -192,12 +205,51 @@ def find_dropouts(signals: JointSignals) -> str | None:
 
 
 def find_words(signals: JointSignals) -> Advice | None:
-    """Return a finding if a signal of the joint consists of undecoded register words or of wrapped angles."""
+    """Return a finding if signals of the joint consist of undecoded register words or of wrapped angles.
+
+    Register words are defined in the module `jumps`. One finding has the settings for all signals of the joint.
+    """
+    mapping, joint, q = signals.trajectory.mapping, signals.joint, signals.q
+    message, keys = "", dict[str, dict[str, object]]()
     for name in signals.trajectory.quantities:
-        advice = _find_words(signals, name)
-        if advice is not None:
-            return advice
-    return None
+        reading, raw = _shared_reading(signals, name), signals.raw(name)
+        if reading is None:
+            continue
+        values = decoded(raw, reading.key, reading.size)
+        in_si = values * mapping.scale(name, joint) + mapping.offset(name, joint)
+        # Commands may have genuine jumps. A decoding of commands is therefore accepted only if it brings the commands
+        # closer to the measured positions.
+        if name == "u" and np.std(in_si - q) > 0.3 * np.std(signals.signal("u") - q):
+            continue
+        q = in_si if name == "q" else q
+        keys.setdefault(reading.key, {})[name] = plain_number(reading.size, 9)
+        if reading.in_degrees:
+            keys.setdefault("units", {})[name] = "deg"
+            speed = float(np.std(np.diff(values))) / signals.step
+            if name == "q" and is_factor(speed, float(np.std(signals.qd)) or np.inf):
+                keys["units"]["qd"] = "deg/s"
+        if message:
+            message = f"{message.partition(':')[0]}, and {name}:{message.partition(':')[2]}"
+            continue
+        is_signed = reading.key == "sign_bit"
+        what = "words with a sign bit" if is_signed else "a register or an angle that starts again"
+        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
+        # words of a signal may be 0, and would be removed as lost samples.
+        continued = values if is_signed else unwrapped(raw, reading.size)
+        count = jump_count(raw[~is_outlier(continued, smooth=name == "q")], reading.size)
+        is_angle = name in ("q", "u") and signals.kind != "prismatic"
+        unit = (
+            "deg" if reading.in_degrees else mapping.unit(name, joint) or ("rad" if is_angle else "as logged")
+        )
+        message = f"{name} that jumps by {reading.size:.6g} ({unit}), {counted(count, 'time')}: {what}"
+    if not message:
+        return None
+    # The advised settings include the sign bits that the mapping states, so that they can replace its line.
+    stated = {name: mapping.word("sign_bit", name, joint) for name in signals.trajectory.quantities}
+    if "sign_bit" in keys:
+        keys["sign_bit"] = {x: plain_number(y, 9) for x, y in stated.items() if y} | keys["sign_bit"]
+    units = {"units": keys.pop("units")} if "units" in keys else {}
+    return Advice(message, units | keys)
 
 
 def find_jumps(signals: JointSignals) -> str | None:
@@ -212,53 +264,64 @@ def find_jumps(signals: JointSignals) -> str | None:
     return f"q that jumps by {size:.4g} between two samples, {count}, at t = {listed_times(t[rows])}"
 
 
-def _find_words(signals: JointSignals, name: str) -> Advice | None:
-    """Return a finding if a signal consists of undecoded register words or wrapped angles.
+class WordReading(NamedTuple):
+    """Decoding of the register words of a signal.
 
-    name: signal, "q", "qd", "tau" or "u". Register words are defined in the module `jumps`.
+    Attributes:
+        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
+        size: value of this setting, in the unit of the log.
+        in_degrees: True if the mapping states no unit, and the size is a number of revolutions in degrees.
     """
+
+    key: str
+    size: float
+    in_degrees: bool
+
+
+def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
+    """Return the decoding of a signal of the joint as register words; None if it does not consist of such words.
+
+    The registers of all joints are of one type: of the decodings of the joints, the most frequent one that removes the
+    jumps of this joint is preferred. A single jump, or noise at an end of the register, does not determine the
+    decoding. name: signal, "q", "qd", "tau" or "u".
+    """
+    present, raw = _reading(signals, name), signals.raw(name)
+    if not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
+        return present
+    numbers = [k for k in range(len(signals.joints)) if k != signals.number]
+    readings = Counter([present, *(_reading(signals._replace(number=k), name) for k in numbers)])
+    for reading, _ in readings.most_common():
+        if reading is None:
+            continue
+        is_possible = np.ptp(raw) < 1.01 * reading.size if reading.key == "period" else raw.min() >= 0
+        signal_and_decoded = raw, decoded(raw, reading.key, reading.size)
+        jumps_of_both = [
+            np.count_nonzero(np.abs(np.diff(x)) > 0.4 * reading.size) for x in signal_and_decoded
+        ]
+        if reading == present or (is_possible and jumps_of_both[1] < 0.5 * jumps_of_both[0]):
+            return reading
+    return None
+
+
+def _reading(signals: JointSignals, name: str) -> WordReading | None:
+    """Return the decoding of a signal as register words that its own jumps show; None if there is none."""
     mapping, values = signals.trajectory.mapping, signals.signal(name)
-    scale, offset = mapping.scale(name, signals.joint), mapping.offset(name, signals.joint)
-    unit = mapping.unit(name, signals.joint)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
-        turns = [2 * np.pi / abs(scale), *([360.0] if unit is None else [])]
+        has_unit = mapping.unit(name, signals.joint) is not None
+        turns = [2 * np.pi / abs(mapping.scale(name, signals.joint)), *([] if has_unit else [360.0])]
     # Lost samples and outliers are removed before the search for register words, because their jumps have other causes
     # than register words.
-    values = values[~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))]
+    is_valid = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
     for turn in turns:
-        word = read_as_words((values - offset) / scale, turn)
-        if word is None:
-            continue
-        # Commands may have genuine jumps. A decoding of commands is therefore accepted only if it brings the commands
-        # closer to the measured positions.
-        if name == "u":
-            q = signals.q[~is_lost(signals.signal("u"))]
-            if np.std(word.values * scale + offset - q) > 0.3 * np.std(values - q):
-                return None
-        # The advised settings include the sign bits of the other signals, so that they can replace the line in the
-        # mapping.
-        stated = {x: mapping.word("sign_bit", x, signals.joint) for x in signals.trajectory.quantities}
-        words = {x: plain_number(y, 9) for x, y in stated.items() if y and word.key == "sign_bit"}
-        keys: dict[str, object] = {word.key: words | {name: plain_number(word.value, 9)}}
-        if turn == 360.0 and unit is None:
-            unit, units = "deg", {name: "deg"}
-            speed = float(np.std(np.diff(word.values))) / signals.step
-            if name == "q" and is_factor(speed, float(np.std(signals.qd)) or np.inf):
-                units["qd"] = "deg/s"
-            keys = {"units": units} | keys
-        unit = unit or ("as logged" if turn is None else "rad")
-        what = (
-            "words with a sign bit" if word.key == "sign_bit" else "a register or an angle that starts again"
-        )
-        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
-        # words of a signal may be 0, and would be removed as lost samples.
-        raw = (signals.signal(name) - offset) / scale
-        decoded = signed(raw, word.value) if word.key == "sign_bit" else unwrapped(raw, word.value)
-        count = jump_count(raw[~is_outlier(decoded, smooth=name == "q")], word.value)
-        message = f"{name} that jumps by {word.value:.6g} ({unit}), {counted(count, 'time')}: {what}"
-        return Advice(message, keys)
+        word = read_as_words(signals.raw(name)[is_valid], turn)
+        if word is not None:
+            # A multiple 2^k of 360 without a stated unit is a number of revolutions in degrees.
+            in_degrees = len(turns) > 1 and bool(
+                np.isclose(np.log2(word.value / 360) % 1, [0, 1], atol=1e-6).any()
+            )
+            return WordReading(word.key, plain_number(word.value, 12), in_degrees)
     return None
 
 
@@ -285,8 +348,8 @@ def find_elastic(signals: JointSignals) -> str | None:
     # Candidates for the resonance: at up to 1.5 times the highest excited frequency, it still changes the apparent
     # inertia noticeably.
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
-        # H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance f_0 would otherwise
-        # give a frequency band close to f_0 too much weight.
+        # The apparent inertia H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance
+        # f_0 would otherwise give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
         # Solutions in which the link has less than a tenth of the motor's inertia are rejected: such a resonance is not
@@ -299,7 +362,7 @@ def find_elastic(signals: JointSignals) -> str | None:
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
-    # A rigid model counts as valid up to the frequency at which H(f) is 10 % above H(0).
+    # A rigid model counts as valid up to the frequency f at which the apparent inertia H(f) is 10 % above H(0).
     share = 0.1 * (motor + link) / link
     valid = resonance * float(np.sqrt(share / (1 + share)))
     unit = "kg" if signals.kind == "prismatic" else "kg m^2"

@@ -6,7 +6,7 @@ are the raw integers of a drive's register: they overflow at a period, or have a
 """
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,18 +17,18 @@ FINEST_WORD = 4e-6
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
-    """Return the number of wraps of a signal (T,): steps between samples whose magnitude exceeds half a period."""
+    """Return the number of wraps of a signal (T,): jumps of more than half a period between two samples."""
     return int(np.count_nonzero(np.abs(np.diff(values)) > period / 2))
 
 
 def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
-    """Return a signal (T,) that wraps at a period without its jumps of whole periods; its first value is unchanged."""
+    """Return the continuous signal for a signal (T,) that wraps at a period; the first value is unchanged."""
     if not jump_count(values, period):
         return values
     turns = np.diff(values, prepend=values[:1]) / period
     whole = np.round(turns)
-    # Two opposite steps of about half a period are an outlier of one sample: rounded separately, the two steps would
-    # shift all later samples by a period.
+    # Two opposite steps of about half a period are an outlier of one sample. Their sum is rounded to whole periods:
+    # rounded separately, the two steps would shift all later samples by a period.
     is_half = np.abs(np.abs(turns) - 0.5) < 0.25
     rows = np.flatnonzero(is_half[:-1] & is_half[1:] & (turns[:-1] * turns[1:] < 0))
     whole[rows], whole[rows + 1] = 0.0, np.round(turns[rows] + turns[rows + 1])
@@ -45,6 +45,14 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
     return np.where(words >= sign_bit, sign_bit - words, words)
 
 
+def decoded(words: np.ndarray, key: str, size: float) -> np.ndarray:
+    """Return the numbers that register words (T,) represent.
+
+    key: "sign_bit" or "period", the type of the words. size: the sign bit or the period.
+    """
+    return signed(words, size) if key == "sign_bit" else centred(unwrapped(words, size), size)
+
+
 def is_lost(values: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples, for which loggers write exactly 0 between values far from 0."""
     lost = np.zeros(len(values), bool)
@@ -59,10 +67,10 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 
 
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
-    """Return a mask (T,) of the samples that are lost or outliers.
+    """Return a mask (T,) of the samples that are lost (see `is_lost`) or outliers.
 
     An outlier is one of at most five samples between two opposite jumps. Torques and velocities may have genuine steps:
-    their outliers must also lie above or below all other samples by more than half of the range of these samples.
+    their outliers must also lie outside the range of all other samples by more than half of this range.
 
     smooth: True for positions, which change gradually; False for torques and velocities.
     """
@@ -112,7 +120,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     return np.asarray(outliers & is_beyond)
 
 
-def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.ndarray:
+def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin: int = 0) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
     Stale values form a block of equal values that is more than 20 times as long as the median block, and within which
@@ -120,6 +128,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     such a signal, the step at the end of a stale block must also be larger than four typical steps.
 
     values: the signal (T,). changes: another signal (T,), which shows that the measured quantity must have changed.
+    margin: number of samples at both ends of a block in which the changes do not count.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -131,9 +140,9 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float) -> np.n
     is_quantised = len(np.unique(values)) < len(starts) / 2
     is_long &= (steps > 4.0 * _typical_step(steps[:-1]) * is_quantised) & (len(starts) > 1)
     for start, length in zip(starts[is_long], lengths[is_long], strict=True):
-        rows = slice(start + 1, start + length)
-        if np.ptp(changes[rows]) > min_change:
-            stale[rows] = True
+        inside = changes[start + 1 + margin : start + length - margin]
+        if inside.size and np.ptp(inside) > min_change:
+            stale[start + 1 : start + length] = True
     return stale
 
 
@@ -157,9 +166,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
     In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
-    at the end of the block is then about as large as k steps of the following motion. Equal rows of an arm at rest are
-    not repeats. The exception is a logger that writes each row m times during motion (m is the number of copies, else
-    1): at rest, too, one of m rows is original, and the others are repeats.
+    at the end of the block is then about as large as k steps between later rows. The number m of copies is the median
+    of k over these blocks, since a logger may write each row m times; m is 1 without such blocks. In all other blocks,
+    the arm was at rest: every m-th row is original, and the rows between are repeats (none for m = 1).
 
     positions: number of leading columns that are positions.
     """
@@ -186,7 +195,8 @@ def held_samples(values: np.ndarray) -> int:
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # Only changes by several quantisation steps are counted: equal samples of a slow quantised signal are genuine.
+    # Only blocks of equal samples that end with a change by several quantisation steps are counted: other blocks are
+    # genuine in a slow quantised signal.
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -197,12 +207,13 @@ class Word(NamedTuple):
     """Decoding of a logged signal as register words, the raw integers of a drive's register.
 
     Attributes:
-        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
-        value: value of this setting in the unit of the log.
+        key: setting of the mapping that decodes the signal: "period", at which words overflow, or "sign_bit", the value
+            of the bit that marks negative numbers.
+        value: period or sign bit in the unit of the log.
         values: (T,) decoded signal in the unit of the log.
     """
 
-    key: str
+    key: Literal["period", "sign_bit"]
     value: float
     values: np.ndarray
 
@@ -235,12 +246,14 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     sizes = [x for x in _word_sizes(values, turn) if 0.75 < x / jump < 1.35]
     around = np.unique(np.clip(rows[:, None] + np.arange(-2, 3), 0, len(steps) - 1))
     best, best_score = None, (len(rows) / 2, np.inf)
+    is_whole = bool((values == values.round()).all())
     for size in sizes:
-        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise).
-        # Words with a sign bit have values above the sign bit, which represent negative numbers.
+        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise, if
+        # they are not whole numbers). Words with a sign bit have values above the sign bit, which represent negative
+        # numbers.
         readings = []
-        if np.ptp(values) < 1.01 * size:
-            readings.append(Word("period", size, centred(unwrapped(values, size), size)))
+        if np.ptp(values) < (size if is_whole else 1.01 * size):
+            readings.append(Word("period", size, decoded(values, "period", size)))
         if not is_signed and values.max() >= size:
             readings.append(Word("sign_bit", size, signed(values, size)))
         for reading in readings:
@@ -260,14 +273,16 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit of register words: 2^k revolutions, and 2^k quantisation steps.
+    """Return candidates for the period or sign bit of register words (see `Word`): 2^k revolutions or 2^k steps.
 
-    values: signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not rotate.
+    The steps are the quantisation steps of ``values``, the signal (T,) in the unit of the log. turn: one revolution in
+    this unit; None if the joint does not rotate.
     """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)
     differences = np.diff(levels)
-    # Smaller differences between values are rounding errors, since the values were converted to SI units and back.
+    # Differences below the fraction `FINEST_WORD` of the signal's range are rounding errors: the values were converted
+    # to SI units and back.
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())

@@ -35,8 +35,8 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # The size of an array that the archive states bounds the memory even if it is wrong: zipfile reads no more
-            # bytes.
+            # The memory is bounded by the sizes that the archive states for its arrays. A wrong size is no risk:
+            # zipfile reads no more bytes than the archive states.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got, limit = (
@@ -57,7 +57,7 @@ class NpzArrays:
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the array of this name."""
+        """Return an error about the array of this name; other arguments as for `LogError`."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
     def is_vector(self, name: str) -> bool:
@@ -137,7 +137,7 @@ def _equally_long(
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table of all arrays with the largest number of rows, T, to draft a mapping; matrices become lists."""
+    """Return a table, for the draft of a mapping, of all arrays with the most rows; a matrix is a column of lists."""
     names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
@@ -146,11 +146,15 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return {`q_<joint>`: ("q", index)} for each column of the matrix q (T, n) of an archive; {} without this matrix.
+    """Return the columns of the mapping that are columns of a matrix (T, n) of an archive; {} without this matrix.
+
+    Keys are names of columns in the mapping, such as `q_elbow`; values are the name of the matrix and the index of its
+    column, such as ("q", 2).
 
     The array `joints` of the archive states the order of the columns; without it the order is the arm's.
 
-    pattern: name of the columns, such as `q_{joint}`. names: names of the arm's joints in the log.
+    pattern: name of the columns in the mapping, such as `q_{joint}` for the matrix `q`. names: names of the arm's
+    joints in the log.
     """
     matrix = pattern.replace("{joint}", "").rstrip("_")
     if matrix not in arrays.names or arrays[matrix].ndim < 2:

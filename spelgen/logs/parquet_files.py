@@ -19,7 +19,8 @@ from spelgen.settings.yaml_document import YamlDocument, validated
 INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
 STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
 ENDING = ".pos"
-# Largest position that LeRobot may have normalised: 100, with a tolerance for rounding to single precision.
+# Largest magnitude of positions that LeRobot has normalised to -100..100, with a tolerance for rounding to single
+# precision.
 LARGEST_NORMALISED = 100.001
 # Text of the remark that positions may be normalised and not in degrees. The check of servo logs removes this remark if
 # the step size of the encoders determines the unit.
@@ -84,6 +85,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         remarks = ()
     fps = info.get("fps")
     if isinstance(fps, int | float) and not mapping.sample_rate:
+        _require_times(files[0], fps)
         remarks += (
             f"times are frame numbers at {fps:g} frames per second and not measured: delays, damping and armatures are "
             "as right as this rate; 'sample_rate: HZ' under 'logs' states another one",
@@ -93,6 +95,21 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         with reading(file):
             tables += [table._replace(remarks=remarks) for table in read_parquet(file, joints, mapping)]
     return tables
+
+
+def _require_times(file: Path, fps: float) -> None:
+    """Raise LogError if the times of a LeRobot data set contradict its number of frames per second."""
+    with reading(file):
+        if TIMESTAMP not in pa.parquet.read_schema(file).names:
+            return
+        steps = np.diff(pa.parquet.read_table(file, columns=[TIMESTAMP])[TIMESTAMP].to_numpy().ravel())
+    step = float(np.median(steps)) if steps.size else 0.0
+    if step > 0 and fps > 0 and abs(step * fps - 1) > 0.05:
+        raise LogError(
+            f"{1 / step:.4g} times per second for {fps:g} frames per second in {INFO}", file=file,
+            element=f"column {TIMESTAMP}", expected="one of both to be right",
+            do=f"write 'sample_rate: {fps:g}', or the measured rate, under 'logs' in the robot's YAML",
+        )  # fmt: skip
 
 
 def _with_scale(
@@ -107,6 +124,8 @@ def _with_scale(
     largest = 0.0
     for file in files:
         with reading(file):
+            if STATE not in pa.parquet.read_schema(file).names:
+                return mapping, ()
             states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
             values = np.abs(states.flatten().to_numpy(zero_copy_only=False))
             largest = max(largest, float(values.max(initial=0.0)))

@@ -18,8 +18,9 @@ class Preprocessing:
 
     Attributes:
         cutoff: cutoff [Hz] of the zero-phase low-pass on q, qd and tau; 0: no filter; None: 8 Hz, but no filter for
-            windows if a log is sampled at 50 Hz or less.
-        decimation: number of log samples from one sample of a window to the next; None: chosen according to the cutoff.
+            windows (segments of logs for momentum and rollout fits) if a log is sampled at 50 Hz or less.
+        decimation: number of log samples from one sample of a window to the next; None: 1 without a filter, otherwise
+            the largest number with at least three samples per period of the cutoff.
         gap: a time step longer than this multiple of the median step is a gap, at which a recording is cut.
         torque_delay: delay of logged torques relative to positions [s]; None: estimated in fits to torques.
     """
@@ -42,8 +43,8 @@ class Preprocessing:
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
         """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
 
-        The record of a training run contains the resolved options, in which an absent torque delay is 0. The cutoff
-        remains None, no filter, for logs whose rate is too low for the default filter.
+        The record of a training run contains the resolved options. A torque delay of None becomes 0. A cutoff of None
+        becomes 8 Hz if all logs are sampled above 50 Hz. Otherwise it remains None, and the logs are not filtered.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
@@ -66,7 +67,8 @@ class Preprocessing:
     def filtered(self) -> bool:
         """True if q, qd and tau are filtered before windows are cut from the logs.
 
-        The options must be a result of ``resolved``: before, the cutoff None is not yet decided.
+        The options must be a result of ``resolved``: in other options, a cutoff of None does not state whether there is
+        a filter.
         """
         return bool(self.cutoff)
 

@@ -85,9 +85,9 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files, whose rows `segments` collects and reduces.
+    """Return the trajectories of all files; `segments` collects their rows, or a part of them above a memory limit.
 
-    If files have faults, the first error of each file is raised, all of them together.
+    If files have faults, one LogError with the first error of each file is raised.
 
     Args:
         paths, role: see `read_logs`.

@@ -22,6 +22,9 @@ from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import SIGNALS, TUNING
 from spelgen.logs.values import foreign_rows, is_split
 
+# [rad, m] Change of a command during which the position of a servo must change.
+COMMANDED = 0.2
+
 
 class Rows:
     """Rows of one recording in SI units while they are repaired.
@@ -119,7 +122,8 @@ def _unwrap(rows: Rows) -> None:
         count = jump_count(column, period)
         if count and quantity == "q":
             word = read_as_words((column - offset) / scale, 2 * pi / abs(scale))
-            # Words with a sign bit are not unwrapped, since their jumps are no wraps: a check reports them.
+            # Register words with a separate sign bit are not unwrapped: their jumps are changes of sign and no wraps at
+            # a period. A check reports such words.
             if word is not None and word.key == "sign_bit":
                 continue
         result = unwrapped(column, period)
@@ -127,8 +131,8 @@ def _unwrap(rows: Rows) -> None:
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
             # whole periods, so that their median difference from the positions is at most half a period.
             result = result - period * np.round(np.median(result - columns["q", joint]) / period)
-        # Other signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
-        # period. Exception: an angle without wraps whose period is one turn is correct as logged.
+        # Measured signals are shifted by whole periods to a median close to 0, because registers start in an arbitrary
+        # period. Exception: a signal with a period of one turn that never wraps is an angle, and correct as logged.
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
@@ -169,11 +173,11 @@ def _leave_out_outliers(rows: Rows) -> None:
     outliers = np.zeros(len(rows.t), bool)
     dropped, columns = [], rows.columns
     for (quantity, joint), values in columns.items():
-        faulty = outlier_rows(quantity, values)
-        if ("qd", joint) in columns:
-            faulty |= stale_rows(quantity, values, rows.t, columns["q", joint], columns["qd", joint])
-        # Jumps of commands are no faults, since a command may jump at any time.
-        if quantity != "u" and faulty.any():
+        faulty = outlier_rows(quantity, values, columns["q", joint])
+        if ("qd", joint) in columns or ("u", joint) in columns:
+            motion = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
+            faulty |= stale_rows(quantity, values, rows.t, *motion)
+        if faulty.any():
             outliers |= faulty
             dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[faulty])}")
     rows.leave_out(outliers, f"left out as dropouts: {'; '.join(dropped)}")
@@ -198,28 +202,44 @@ def _remove_delays(rows: Rows) -> None:
     rows.keep(covered)
 
 
-def outlier_rows(quantity: str, values: np.ndarray) -> np.ndarray:
+def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    quantity: "q", "qd" or "tau". Velocities of exactly 0 are no lost samples: a joint at rest has them.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may be 0 for some time, and jump: an
+    outlier is a single 0 or a value other than 0, twice as far from the position as all other commands.
+
+    quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
     rows = is_outlier(values, smooth=quantity == "q")
+    if quantity == "u" and rows.any():
+        present = np.pad(values != 0, 1, constant_values=True)
+        distance = np.abs(values - q)
+        rows &= present[1:-1] | (present[:-2] & present[2:])
+        rows &= distance > 2 * distance[~rows].max(initial=0.0)
     return np.asarray(rows & (values != 0)) if quantity == "qd" else rows
 
 
-def stale_rows(quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+def stale_rows(
+    quantity: str, values: np.ndarray, t: np.ndarray, q: np.ndarray, qd: np.ndarray, u: np.ndarray
+) -> np.ndarray:
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
     A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
-    torque. A torque that is constant until the end of the recording is not stale, since the motor may be at rest.
+    torque. A torque with the last value of the recording is not stale: the motor may be off while the joint moves.
 
     Args:
-        quantity: name of the signal, "q", "qd" or "tau".
+        quantity: name of the signal, "q", "qd", "tau" or "u". Commands are never stale.
         values: (T,) the signal of one joint.
         t: (T,) times [s].
         q: (T,) positions of the joint [rad, m].
-        qd: (T,) velocities of the joint [rad/s, m/s].
+        qd: (T,) velocities of the joint [rad/s, m/s]; empty if they were not logged.
+        u: (T,) commanded positions of the joint [rad, m]; empty for joints without position servo.
     """
+    if u.size:
+        # Positions lag behind their commands by less than 0.25 s. Dry friction holds servos of an SO-101 while their
+        # commands change by up to 0.13 rad.
+        margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3)) if len(t) > 1 else 0
+        return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
@@ -241,8 +261,9 @@ def _order_in_time(rows: Rows) -> None:
     """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
     Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
-    kept. If many of them differ, the resolution of the clock is too low, and evenly spaced times are reconstructed.
-    Raises LogError for a clock that restarts, and for times that cannot be reconstructed.
+    kept. If many rows have the time of the row before but other values, the resolution of the clock is too low: all
+    rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that restarts, and for times
+    that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
@@ -316,7 +337,8 @@ def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # A time step that is too long for the resolution of the clock is a gap: times are evenly spaced between gaps.
+    # A time step of more than `TUNING.gap` ticks and mean steps is a gap, since the resolution of the clock does not
+    # explain it. Times are evenly spaced between gaps.
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):

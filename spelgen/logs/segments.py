@@ -40,7 +40,7 @@ class Segment(NamedTuple):
     start: float
 
     def continued_by(self, other: "Segment") -> bool:
-        """Return True if another file continues this one: times and positions proceed by a step that is no gap."""
+        """Return True if `other`, of another file, continues this segment without a gap in times and positions."""
         mine, others, count = self.layout, other.layout, 1 + len(self.layout.joints)
         if mine.file == others.file or (mine.columns, mine.mapping) != (others.columns, others.mapping):
             return False
@@ -113,8 +113,8 @@ class LogSegments:
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
         """Return the segments to keep of `pieces`, the segments of a table.
 
-        If the limit of memory is exceeded, `every` is doubled, and every second one of the segments that were collected
-        before is removed. row_bytes: memory of one row of the table [B].
+        If the limit of memory is exceeded, `every` is doubled (one of `every` segments is kept), and every second one
+        of the segments that were collected before is removed. row_bytes: memory of one row of the table [B].
         """
         while True:
             selected = pieces[-self._count % self.every :: self.every]

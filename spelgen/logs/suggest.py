@@ -31,8 +31,8 @@ WORDS = {
         ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
-        ("tau", "tau τ torque torques trq tq tor effort efforts force forces qfrc moment load current currents curr "
-                "cur drehmoment strom couple par 力矩 扭矩"),
+        ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
+                "curr cur drehmoment strom couple par 力矩 扭矩"),
     )
 }  # fmt: skip
 # Words that distinguish the names of commanded values from the names of measured values.
@@ -87,8 +87,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
-    read, if all its columns are of positions or of torques only, or of commanded positions and no torques without
-    `commands`.
+    read, if it has only positions or only torques, or if it has commanded positions and no torques, but `commands` is
+    False.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -108,7 +108,7 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
 
 
 def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
-    """Return the draft for a table of the log `file`; see `suggest_mapping`."""
+    """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
     columns_of = _by_quantity(columns, commands, joints)
@@ -152,7 +152,10 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> ColumnName:
-    """Return the column of times, or "sec + nsec" of two columns; with the name "" if there is none."""
+    """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
+
+    If it contains seconds, and ``columns`` (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
+    """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
     none = ColumnName("", set(), "s")
@@ -167,7 +170,10 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> Colum
 def _joint_lines(
     joint: str, by_joint: Mapping[str, Mapping[str, ColumnName]], units: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield the lines of a joint: its columns, and the conversions whose values the user must write."""
+    """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
+
+    by_joint: {quantity: {joint: column}}. units: {quantity: unit of its columns}.
+    """
     entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
     yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
     if units.get("tau") in CURRENTS:
@@ -177,7 +183,7 @@ def _joint_lines(
 
 
 def _ranges(names: Sequence[str]) -> list[str]:
-    """Return the names, in which runs such as x1, x2, x3, that differ only in a number, are `x1 ... x3`."""
+    """Return the names, with runs that differ only in a number, such as x1, x2, x3, abbreviated to `x1 ... x3`."""
     groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
     return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
 
@@ -208,7 +214,7 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 def _column_name(name: str, words: set[str]) -> ColumnName:
     """Return the words and the unit in a column's name; the unit is in brackets, or the last word.
 
-    words: additional words of the column, which its name does not contain.
+    words: additional words that describe the column, such as "time" for a column of dates.
     """
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
     base, unit = bracketed.groups() if bracketed else (name, "")
@@ -229,7 +235,8 @@ def _by_quantity(
     The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
 
     commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints.
-    The name of a joint in a column's name does not mark commands, even if it is a word such as "d" or "target".
+    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques. Words of joints' names
+    do not count as words for commands.
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
     names = set().union(*(_column_name(joint, set()).words for joint in joints))
@@ -237,7 +244,7 @@ def _by_quantity(
         quantity = next((x for x, words in WORDS.items() if column.words & words), None)
         if quantity is None:
             quantity = next((x for x, units in UNITS.items() if column.unit in units), None)
-        if commands and column.words & COMMANDED and quantity in ("q", None):
+        if commands and column.words & (COMMANDED - names) and quantity in ("q", None):
             quantity = "u"
         elif column.words & (NOT_MEASURED - names):
             continue
@@ -279,9 +286,9 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: index of its columns in the log}, from cells of the first row that contain joint names.
+    """Return {joint: number in the names of its columns, such as 2 in `q[2]`}, from joint names in the first row.
 
-    Such cells are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
+    Joint names are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
     omitted.
     """
     order: dict[str, int] = {}
@@ -342,8 +349,9 @@ def _by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names. order: {joint:
-    number}; if it does not contain all joints, the joints are assigned to the numbers in ascending order.
+    If no column name contains a joint name, columns are assigned by the last number in their names: to the joint with
+    this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
+    number}, the result of `_order_in_cells`.
     """
     named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]

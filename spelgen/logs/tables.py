@@ -19,7 +19,7 @@ from spelgen.settings.log_mapping import LogMapping
 UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
-UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units that files of spelgen declare
+UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units declared in logs that spelgen writes
 
 # Types of the errors that Arrow, NumPy and zipfile raise for damaged files.
 UNREADABLE = (
@@ -55,7 +55,10 @@ class Layout:
     header: int | None = None
 
     def row_error(self, got: str, row: int, column: str, expected: str, do: str | None = None) -> LogError:
-        """Return an error about the value in a row (from 0) and column; for a text file it also states the line."""
+        """Return an error about the value in a row (from 0) and column; for a text file it also states the line.
+
+        got, expected, do: arguments of `LogError`.
+        """
         line = int(row) + 1 + self.header if self.header is not None else None
         element = f"row {row + 1}, column {column}"
         return LogError(got, file=self.file, line=line, element=element, expected=expected, do=do)
@@ -115,7 +118,7 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
     Raises LogError if a column is missing or occurs twice.
 
     Files that spelgen wrote have SI units and default column names. Of the mapping, only the input (torque or
-    position), the accepted checks and the wraps of angles apply to them.
+    position), the codes of checks to omit (``accept``) and the wraps of angles apply to them.
     """
     schema, mapping = log.schema, log.mapping
     metadata = schema.metadata or {}
@@ -197,8 +200,8 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
-    # If only some joints have no column at all, these joints were not logged: a wrong name in the mapping would affect
-    # one column only, or all joints.
+    # If only some joints have no column at all, the error states that these joints were not logged: a wrong column name
+    # would affect only one column of a joint, and a wrong pattern all joints.
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (

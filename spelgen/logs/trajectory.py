@@ -146,7 +146,7 @@ class Trajectory:
             raise self.error(got, "an array of numbers", column=column) from error
 
     def error(self, got: str, expected: str, do: str | None = None, column: str = "") -> LogError:
-        """Return an error about the trajectory, or about its signal `column`; for other texts see `SpelgenError`."""
+        """Return an error about the trajectory, or about its signal `column`; got, expected, do: see `SpelgenError`."""
         element = f"trajectory {self.name}" + (f": {column}" if column else "")
         return LogError(got, file=self.file, element=element, expected=expected, do=do)
 
@@ -208,8 +208,8 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
     A gap is a time step longer than `gap` median steps and longer than `hole` [s].
     """
     steps = np.diff(t)
-    # Few recordings have gaps. A comparison of the longest with the shortest step shows it for most of them, without
-    # the median, which takes most of the time.
+    # Few recordings have gaps. For most of the others, a comparison of the longest with the shortest step shows that
+    # there is no gap, and saves the computation of the median, which takes most of the time.
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]
@@ -280,10 +280,11 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # The first of the `held_rows` contains the command that acts at the earliest delayed time.
+    # `held_rows`: rows whose commands act between the times samples[0] - delay and samples[-1] - delay. A command acts
+    # until the next one, so the row before samples[0] - delay is included.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    # `previous`: command that acts in the interval before each sample, (H, n) [rad, m] for H held rows.
+    # `previous`: (H, n) [rad, m], for each of the H held rows the command of the row before, which acts until this row.
     previous = np.concatenate([u[:1], u[:-1]])
     # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])

@@ -8,8 +8,8 @@ class LogTuning:
     """Constants of the reading and preprocessing of logs."""
 
     # [B] Memory limit of the log samples that a fit keeps. It suffices for 25 minutes of seven joints at 1 kHz, from
-    # which a torque fit makes 76,000 samples, about the number that its last iterations use. Windows of five samples
-    # take five times this memory.
+    # which a torque fit makes 76,000 samples, about the number that its last iterations use. If a fit cuts the samples
+    # into windows of five, the windows need five times this memory.
     kept_bytes: int = 2**28
     # [1] Largest number of samples of a segment. Logs that exceed `kept_bytes` are divided into segments, of which only
     # some are kept. 16 s at 1 kHz is long compared with filter transients.
@@ -66,7 +66,7 @@ class SignalCheckTuning:
 
 @dataclass(frozen=True)
 class SampleTuning:
-    """Constants of the filtered samples at a common rate to which dynamics are fitted."""
+    """Constants of the samples, filtered and at a common rate, to which dynamics are fitted."""
 
     # [rad/s, m/s] A joint is at rest at a sample if its speed is at most this number. Samples at which all joints are
     # at rest are omitted.
@@ -88,5 +88,5 @@ def shows_accelerations(rate: float) -> bool:
 
 
 def is_dense(rate: float) -> bool:
-    """Return True if linear interpolation between samples suffices at this sample rate [Hz]."""
+    """Return True if linear interpolation between samples suffices at this sample rate [Hz]: at least 50 Hz."""
     return rate * FAST >= TUNING.dense_rate

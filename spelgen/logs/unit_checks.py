@@ -73,7 +73,11 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-    # Of combinations of units whose distances differ by rounding only, the first is used: its units are most frequent.
+            # Without velocities, whole numbers may be counts or degrees.
+            if not _knows_ratio(signals):
+                return message
+    # `distance`: implausibility of a combination of units. Of combinations whose distances differ by rounding only, the
+    # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     if distance > log(1.25):
@@ -83,23 +87,31 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
+    # Commands have the unit of q by default, unless they move much less: then they are in the SI unit.
+    if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
+        keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     return Advice(f"{message}: {units}", keys) if keys else None
+
+
+def _knows_ratio(signals: JointSignals) -> bool:
+    """Return True if velocities were logged and are proportional to dq/dt, so that their ratio shows units."""
+    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
 def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float, dict[str, Any]]]:
     """Yield (distance, settings of the joint) for all units of q and qd that the column mapping permits.
 
-    The settings with the smallest distance are the most plausible ones. The distance is |log r|, with r the ratio of
-    dq/dt to qd in these units, plus a penalty for units other than SI.
+    The smaller the distance, the more plausible are the settings. The distance is |log r|, with r the ratio of dq/dt to
+    qd in these units, plus a penalty for units other than SI.
 
-    is_far: True if q of a revolute joint with limits has no stated unit and, as logged, a range above 4 pi (two turns
-    in rad): units in which |q| would exceed two turns are then omitted.
+    is_far: True if q of a revolute joint has no stated unit and spans more than two turns if read in rad. Units in
+    which |q| exceeds two turns are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
     # unknown, only the range of q indicates a unit.
-    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
-    is_known &= "qd" in mapping.quantities
+    is_known = _knows_ratio(signals)
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
     stated = mapping.unit("q", joint)
     # A wrong unit in the mapping, such as deg for positions in rad, makes the motion of all joints implausibly small.
@@ -158,19 +170,21 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 def _rate_by_velocities(signals: JointSignals) -> float | None:
     """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
 
-    Return None if the times may be right, or if another unit of the times, such as ms, explains the factor.
+    Return None if the times may be right, or if the ratio of dq/dt to qd is the ratio of two units of time, such as
+    1000.
     """
     factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
     if "qd" not in mapping.quantities or len(factors) < 2 or len(steps) <= 2 * SIGNALS.increments:
         return None
     factor = float(np.median(factors))
-    # The times are assumed to be wrong only if dq/dt is the same multiple of qd for all joints, and steps are even.
+    # The times are assumed to be wrong only if dq/dt is the same multiple of qd for all joints, and time steps are
+    # equal.
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    # A factor near 1 is more probably an error of the velocities. For a factor between two units of time, such as 1000,
-    # the caller reports the unit.
+    # A ratio of dq/dt to qd near 1 is more probably an error of the velocities than of the times. If the ratio is a
+    # factor between two units of time, such as 1000, the caller reports the unit.
     if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
@@ -204,8 +218,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         )
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # A log of at most ten samples has a single increment, whose correlation is always 1 or -1: too little for
-        # advice.
+        # Increments are changes over ten samples. A log of at most ten samples has only one, the change from its first
+        # to its last sample, whose correlation is always 1 or -1: too little for advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
@@ -258,8 +272,8 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # The delay must explain 75 % of the squared difference between q and the integral of qd, since noise also causes
-    # one.
+    # The delay must explain 75 % of the squared difference between q and the integral of qd: noise also results in an
+    # apparent delay, but explains little of the difference.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 
@@ -322,7 +336,8 @@ def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    # Logged velocities in both directions have a sign, and so have velocities computed from positions.
+    # The check is omitted for velocities with a sign: logged velocities in both directions, and velocities computed
+    # from positions.
     if "qd" not in trajectory.mapping.quantities or not is_one_sided(qd, share) or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

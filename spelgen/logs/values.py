@@ -58,6 +58,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     elif not foreign.all():
         bad &= ~foreign[:, None]
     if layout.mapping.dropouts == "dropped" and np.isfinite(data).all(axis=1).any():
+        data[np.isinf(data)] = np.nan
         bad &= ~np.isnan(data)
     if bad.any():
         first, k = np.argwhere(bad)[0]
@@ -91,9 +92,9 @@ def is_split(data: np.ndarray) -> bool:
 
 
 def clock_start(table: pa.Table, layout: Layout) -> tuple[pa.Scalar | None, float]:
-    """Return the first logged time, as logged and [s], to be subtracted from all times, if the times are dates.
+    """Return the first logged time, as logged and in seconds, if the times are dates; else (None, 0.0).
 
-    The result is (None, 0.0) for relative times.
+    The first time is subtracted from all times, since dates have too few digits as floating-point numbers.
     """
     first_row = table.slice(0, 1)
     times, unit = _clock(first_row, layout)
@@ -146,7 +147,8 @@ def _nanoseconds(texts: Column) -> pa.Array | None:
         numbers, units = (pa.compute.struct_field(groups, name) for name in ("number", "unit"))
         factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
         return pa.array(_numbers(numbers) * factors / TIMES["ns"])
-    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)$"
+    zone = r"(?: ?Z| ?UTC| ?[+-]\d\d:?\d\d)?$"
+    clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)" + zone
     if not re.match(clock, first):
         return None
     groups = pa.compute.extract_regex(texts, clock)
@@ -171,8 +173,9 @@ def _numbers(texts: Column) -> np.ndarray:
 def _column(table: pa.Table, name: str) -> Column:
     """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
-    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. Row
-    numbers replace absent times, which the mapping's `sample_rate` makes superfluous.
+    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. If
+    the log has no times and the mapping has a `sample_rate`, row numbers are returned as the column of times, and the
+    caller converts them to times.
     """
     stored = stored_names(name, table.schema.names)
     if len(stored) != 1:

@@ -84,9 +84,9 @@ def cut_windows(
         window: number of samples of a window.
         stride: number of samples of a piece from the start of a window to the start of the next window.
         decimation: number of samples of a piece from one sample of a window to the next.
-        measured: if True, tau[k] was measured at t[k], and the torque between two samples is the mean of both;
-            otherwise torques would be delayed by half a sample. If False, tau[k] is constant from t[k] to t[k+1], as in
-            a simulation with zero-order hold.
+        measured: if True, tau[k] was measured at t[k], and the torque between two samples is the mean of both; without
+            this mean, torques would be delayed by half a sample. If False, tau[k] is constant from t[k] to t[k+1], as
+            in a simulation with zero-order hold.
         reach: (n, B) break-away displacements of the B bristles of each joint, whose states z are computed, starting
             from zero at the start of each piece; None: z is not computed.
 
@@ -147,6 +147,8 @@ def split_validation(trajectories: Sequence[Trajectory], fraction: float, seed: 
         (trajectory,) = trajectories
         t = trajectory.t
         cut = int(np.searchsorted(t, t[-1] - fraction * trajectory.duration))
+        if not cut:
+            raise trajectory.error("1 sample", "a motion: samples to fit, and others for validation")
         message = (
             f"only one trajectory: training on its first {t[cut - 1] - t[0]:.3g} s, "
             f"validation on the last {t[-1] - t[cut]:.3g} s"

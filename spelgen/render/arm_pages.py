@@ -23,7 +23,6 @@ from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
 from spelgen.render.charts import TUNING
 from spelgen.render.parameters import base_table
 from spelgen.render.plots import JointRow, Panel, stacks
-from spelgen.structure.structure import derive
 from spelgen.templates import render_page
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ def inspection_page(
 
     Args:
         inspection: The derived structure.
-        closed: Closed-form formulas of the entries of M and V; None: the page has no formulas.
+        closed: Closed-form formulas of the mass matrix M(q) and the potential energy V(q); None: the page has none.
         proof: Verification of the structure; None: the structure was not verified.
         urdf: URDF of the arm, from which the picture of the arm is drawn; None: the page has no picture.
     """
@@ -57,9 +56,9 @@ def inspection_page(
 
 
 def identification_page(identification: Identification, arm: Arm) -> str:
-    """Return the page about an identification: base parameters with intervals, the arm, and the torque residual.
+    """Return the page about an identification: base parameters with intervals, and the torque residual.
 
-    identification: result of least squares. arm: the arm, for its picture and the values of its URDF.
+    identification: result of least squares. arm: the arm, for the values of its URDF.
     """
     record: Content = identification.to_dict()
     # The page is made from the content of the JSON output, so that page and JSON agree.
@@ -73,9 +72,7 @@ def identification_page(identification: Identification, arm: Arm) -> str:
         count=len(words),
         never=never,
         residuals=identification.listings()[0],
-        parameters=base_table(None, arm, record),
-        cells=matrix(arm.chain, derive(arm.chain)),
-        arm=arm_section(arm.chain, arm.robot.path),
+        parameters=base_table(arm, record),
         heading=identification.heading(),
         notes=identification.diagnostics,
     )
@@ -131,7 +128,8 @@ def log_charts(log: Trajectory, arm: Chain, inputs: np.ndarray) -> list[Panel]:
     t, q = joined_column(segments, "t"), joined_column(segments, "q")
     position = [("logged", q, "truth")]
     rows = [JointRow("position", "position", "position", position)]
-    # Logs of position servos contain commands and no torques, so charts of velocity and torque are omitted.
+    # Logs of position servos contain commands in place of velocities and torques, so the charts of velocity and torque
+    # are omitted.
     if log.u is not None:
         position.append(("commanded", joined_column(segments, "u"), "predicted"))
     else:

@@ -9,15 +9,13 @@ import numpy as np
 from markupsafe import Markup
 
 from spelgen.arm.arm import Chain
-from spelgen.certificate.expressions import text
-from spelgen.certificate.facts import facts
-from spelgen.certificate.formulas import formulas
+from spelgen.certificate.facts import Fact, facts
 from spelgen.certificate.inspection import cell_text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
 from spelgen.labels import MODEL, entry_name, joints_in_ranges
 from spelgen.render.scene import scene
-from spelgen.structure.structure import Structure
+from spelgen.structure.structure import MassEntry, Structure
 from spelgen.templates import json_data
 
 
@@ -29,7 +27,7 @@ class Cell:
         style: "zero", "constant" or "varying".
         text: "0" for a zero entry, "C" for a constant entry, otherwise the joints on which the entry depends.
         joints: Indices of the joints on whose positions the entry depends.
-        explanation: Reason for the structure of the entry, and its formula.
+        explanation: Reason for the structure of the entry.
     """
 
     style: str
@@ -63,8 +61,8 @@ class AnimatedMotion:
 class AnimatedArm:
     """The animated picture of an arm.
 
-    data: JSON for the script. motions: labels of the motions to choose from. tubes: sentence about links without
-    meshes, which are drawn as tubes.
+    data: JSON for the script, the shapes of the links and the motions. motions: labels of the motions to choose from.
+    tubes: sentence about links without meshes, which are drawn as tubes.
     """
 
     data: Markup
@@ -74,44 +72,30 @@ class AnimatedArm:
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
     """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M."""
-    explanations = _explanations(arm, structure)
+    # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
+    every_fact = facts(arm, structure)
     cells = {}
     for entry in structure.entries:
-        explanation = explanations[entry_name(entry.row, entry.column)]
+        explanation = _explanation(entry, every_fact)
         cell = Cell(entry.kind, cell_text(entry), tuple(entry.joints), explanation)
         cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
     joints = range(len(structure.joints))
     return [[cells[row, column] for column in joints] for row in joints]
 
 
-def _explanations(arm: Chain, structure: Structure) -> dict[str, str]:
-    """Return {name of an entry of M: explanation of its structure for the reader of a page}.
-
-    The explanation states the joints that the entry depends on, the facts that mention the entry, and its formula.
-    """
-    # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
-    every_fact = facts(arm, structure)
-    closed = {formula.name: formula for formula in formulas(arm, structure).rows}
-    explanations = {}
+def _explanation(entry: MassEntry, every_fact: Sequence[Fact]) -> str:
+    """Return the explanation of an entry of M: the joints that it depends on, and the facts that mention it."""
+    name = entry_name(entry.row, entry.column)
     predicates = {"zero": "is always zero", "constant": "is constant"}
-    for entry in structure.entries:
-        name = entry_name(entry.row, entry.column)
-        default = f"depends on {joints_in_ranges(entry.joints)} only"
-        lines = [f"{name} {predicates.get(entry.kind, default)}."]
-        for fact in every_fact:
-            # The fact "M does not depend on ..." mentions no entry by name, but applies to every varying entry.
-            of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
-            if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
-                lines.append(str(fact))
-        formula = closed[name]
-        # Long formulas are omitted: they would fill the page, and `spelgen inspect --formulas` prints them.
-        if formula.expression is not None:
-            lines.append(f"{name} = {text(formula.expression)}")
-        elif entry.kind != "zero":
-            terms = formula.terms or "too many"
-            lines.append(f"Its formula has {terms} terms: `spelgen inspect --entry` writes it.")
-        explanations[name] = "\n".join(lines)
-    return explanations
+    default = f"depends on {joints_in_ranges(entry.joints)} only"
+    lines = [f"{name} {predicates.get(entry.kind, default)}."]
+    for fact in every_fact:
+        # The fact "M does not depend on ..." mentions no entry by name, but is listed for every varying entry, since it
+        # applies to all.
+        of_all = entry.kind == "varying" and fact.statement.startswith("M does not depend")
+        if of_all or name in re.findall(r"M\d+(?:,\d+)?", fact.statement):
+            lines.append(str(fact))
+    return "\n".join(lines)
 
 
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
@@ -148,7 +132,8 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 def _colour(error: np.ndarray) -> np.ndarray:
     """Return colours (T, n) of the links of the animated arm, as numbers, for relative errors (T, n) of its joints.
 
-    0: no error, 1: an error of 0.5 or -0.5.
+    A colour is proportional to the magnitude of the error; 1: an error of 0.5. Position errors are divided by the
+    extent of the motion, torque residuals by the standard deviation of the torque, see `evaluated_motions`.
     """
     return np.asarray((np.abs(error) / 0.5).round(3))
 

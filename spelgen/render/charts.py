@@ -163,7 +163,7 @@ class Band:
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
         """Return the outline of the area between two curves as an SVG path, clipped to both axes.
 
-        NaN is drawn at the top.
+        NaN in a curve, as of diverged predictions, is drawn at the top of the chart.
         """
         # Quantiles of diverged predictions are NaN or infinite: the band of such times extends to the top of the chart.
         low, high = (np.nan_to_num(_floats(y), nan=np.inf) for y in (self.low, self.high))
@@ -225,7 +225,7 @@ def line_chart(
         return Chart(render("chart.html.jinja", **size, x=None), ())
     bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
     x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
-    # SVG counts pixels from the top, so the first pixel of the y axis is the bottom.
+    # SVG counts pixels from the top, so the y axis starts at the larger coordinate `bottom`.
     y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
     legend, beyond = [], []
     for mark in marks:
@@ -265,7 +265,7 @@ def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
-    """Return an axis for a vector of values, with margins of `pad` times the range of the values on both sides."""
+    """Return an axis for values (T,), from `start` to `end` [pixels], with margins of `pad` times the range."""
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)
@@ -281,7 +281,7 @@ def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool
 
 
 def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks and labels of a logarithmic axis: powers of ten, if at least three are on the axis.
+    """Return ticks and labels of a logarithmic axis from low to high: powers of ten, if at least three are on it.
 
     Otherwise the ticks are 1, 2 and 5 times powers of ten. If fewer than three of these values are on the axis, the
     ticks are equidistant, as on a linear axis (`_steps`).
@@ -300,11 +300,11 @@ def _log_steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
 
 
 def _steps(low: float, high: float) -> tuple[np.ndarray, list[str]]:
-    """Return ticks and labels of a linear axis: multiples of 1, 2 or 5 times a power of ten."""
+    """Return ticks and labels of a linear axis from low to high: multiples of 1, 2 or 5 times a power of ten."""
     # The step is the smallest of 1, 2, 5 or 10 times a power of ten that gives at most five intervals.
     rough = (high - low) / 5
     fine = 10.0 ** math.floor(math.log10(rough)) * np.array([1, 2, 5, 10])
-    # The tolerance 1e-9 accepts a step that is smaller than `rough` only by rounding.
+    # `rough`: step for exactly five intervals. The tolerance 1e-9 accepts a step that is smaller only by rounding.
     step = fine[fine >= rough * (1 - 1e-9)][0]
     values = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     return values, [f"{value:.6g}" for value in values]

@@ -1,43 +1,27 @@
-"""Tables of the numerical parameters of a model: inertial parameters, drives, friction, constants of M."""
+"""Tables of the numerical parameters of a model: inertial parameters, drives and friction."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center
-from spelgen.dynamics.friction import FrictionModel
-from spelgen.dynamics.parameters import parameters_of_kind
 from spelgen.dynamics.regressor_dynamics import urdf_parameters
 from spelgen.emission.assemble import ArmModel
-from spelgen.exporting.rigid_body_projection import nearest_friction, sampled_positions
+from spelgen.fitting.drive_quantities import TORQUE_UNITS, torque_drive_quantities
 from spelgen.fitting.posterior import Posterior
 from spelgen.fitting.run_record import Content
-from spelgen.identification.base_parameters import base_parameters
-from spelgen.identification.intervals import PRECISE, Interval
-from spelgen.labels import UNITS, entry_name
+from spelgen.identification.intervals import Interval
+from spelgen.labels import UNITS
 from spelgen.listing import Listing
-from spelgen.runtime.derived_mass import ConstantMass, DerivedMass
-from spelgen.runtime.network_dynamics import NetworkDynamics
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-Rows = tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class ParameterTable(Listing):
-    """A table with a name in the first column. folded: rows that are hidden on a page until the reader opens them."""
-
-    folded: Rows = ()
-    folded_title: str = ""
+from spelgen.structure.base_parameters import base_parameters
 
 
 def parameter_tables(
     model: ArmModel | None, arm: Arm | None, identified: Content | None, posterior: Posterior | None
 ) -> list[Listing]:
-    """Return the tables of the parameters of a run for a page: base parameters, bodies, joints, constants of M.
+    """Return the tables of the parameters of a run for a page: base parameters, bodies and joints.
 
     Args:
         model: The trained model; None if the run has no weights.
@@ -47,58 +31,38 @@ def parameter_tables(
     """
     tables: list[Listing] = []
     if arm is not None and identified and "base_parameters" in identified:
-        tables.append(base_table(model, arm, identified, posterior))
+        tables.append(base_table(arm, identified, posterior))
     elif posterior is not None:
         tables.append(posterior.listings[0])
     if isinstance(model, RigidBodyDynamics):
-        tables.append(_body_table(body_parameters(model), arm, posterior))
+        tables.append(_body_table(model.inertial_parameters.detach().numpy(), arm, posterior))
         tables.append(_joint_table(model, arm, posterior))
-    elif isinstance(model, NetworkDynamics):
-        mass = model.mass
-        if isinstance(mass, DerivedMass | ConstantMass) and len(mass.raw_constants):
-            tables.append(_constant_table(mass, model.joint_types))
     return tables
 
 
-def body_parameters(model: RigidBodyDynamics) -> np.ndarray:
-    """Return the inertial parameters of the bodies of a model, (bodies, 10) [kg, kg m, kg m^2].
+def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None) -> Listing:
+    """Return the table of base parameters: values of the URDF, of the model and of linear least squares.
 
-    They are in the order of ``Body.inertia``.
-    """
-    return np.asarray(model.inertial_parameters.detach())
-
-
-def base_table(
-    model: ArmModel | None, arm: Arm, identified: Content, posterior: Posterior | None = None
-) -> ParameterTable:
-    """Return the table of base parameters.
-
-    Its columns are the values of the URDF, of the model and of linear least squares. The values of least squares have
-    95 % intervals; the values of the model have 95 % intervals if there is a posterior.
+    The values of the model and of least squares have 95 % intervals.
 
     Args:
-        model: The trained model; None: no column of the model.
         arm: The arm with the parameters of the URDF.
         identified: Result of linear least squares, as JSON content.
-        posterior: Posterior of the model; None: no intervals of the model.
+        posterior: Posterior of the model; None: no column of the model.
     """
-    effects = identified["method"]["effects"]
-    friction = FrictionModel(stribeck="stribeck" in effects, polynomial="cubic" in effects)
-    # The base parameters are derived again here, because they depend on the URDF and friction model only, not on logs.
-    base = base_parameters(arm.chain, friction, arm.actuation.drives().speeds)
     parameters = identified["base_parameters"]
     names, determined = ([parameter[key] for parameter in parameters] for key in ("name", "determined"))
-    nominal = base.combination[:, : 10 * len(arm.chain.bodies)] @ urdf_parameters(arm.chain)
-    # A cell of the URDF's column is empty if the URDF has no value: it has none for friction and drives, and may have
-    # no inertials.
-    nominal[base.bodies :] = np.nan
-    if not arm.chain.inertials_complete:
-        nominal[:] = np.nan
-    columns = {"parameter": names, "URDF": list(map(_number, nominal))}
+    # The base parameters of bodies are first. The URDF has no values of the base parameters of friction and drives.
+    urdf = [""] * len(names)
+    for k, base in enumerate(base_parameters(arm.chain)):
+        if base.value is not None:
+            urdf[k] = f"{float(base.value):.4g}"
+    columns = {"parameter": names, "URDF": urdf}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # The posterior has only base parameters of bodies and armatures, because the friction model of the fit differs
-        # from the friction model of least squares. The other cells of this column are empty.
+        # The posterior has only the base parameters of bodies and armatures. Parameters of friction cannot be compared,
+        # because the fit and least squares have different friction models: the rows of friction have an empty column
+        # "model".
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)
@@ -107,30 +71,12 @@ def base_table(
             "; a value of least squares may lie outside the interval of the model because of an effect that least "
             "squares has no column for"
         )
-    elif isinstance(model, RigidBodyDynamics):
-        # The regressor of least squares starts with the columns of the inertial parameters and armatures, which are
-        # also parameters of the trained model. The columns of friction have no counterpart in the model.
-        common = np.concatenate([body_parameters(model).ravel(), model.armature.detach().numpy()])
-        learned = base.combination[:, : len(common)] @ common
-        for k in range(base.bodies, len(names)):
-            if not names[k].startswith("armature"):
-                learned[k] = np.nan
-        columns["model"] = list(map(_number, learned))
     columns["least squares, 95 %"] = list(map(_interval, parameters))
     columns["determined"] = determined
     # The formula of a base parameter is omitted if it equals the name: the parameter is then not a combination.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
-    rows = list(zip(*columns.values(), strict=True))
-    sure = tuple(row for row in rows if row[-2] in PRECISE)
-    unsure = tuple(row for row in rows if row[-2] not in PRECISE)
-    title = "Base parameters: identifiable combinations"
-    folded_title = f"{len(unsure)} more, not significantly different from zero"
-    return ParameterTable(title, tuple(columns), sure, f"{note}.", folded=unsure, folded_title=folded_title)
-
-
-def _number(value: float) -> str:
-    """Return the text of a number with four significant digits; "" for NaN."""
-    return f"{value:.4g}".replace("nan", "")
+    rows = tuple(zip(*columns.values(), strict=True))
+    return Listing("Base parameters: identifiable combinations", tuple(columns), rows, f"{note}.")
 
 
 def _interval(parameter: Content) -> str:
@@ -139,7 +85,7 @@ def _interval(parameter: Content) -> str:
     parameter: the base parameter in its JSON form.
     """
     if parameter["deviation"] is None:
-        return _number(parameter["value"])
+        return f"{parameter['value']:.4g}"
     return Interval("", parameter["value"], parameter["deviation"]).text
 
 
@@ -195,56 +141,24 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
 
     The values have 95 % intervals if there is a posterior.
     """
-    units = [UNITS[joint_type] for joint_type in model.joint_types]
-    torques = [unit.torque for unit in units]
-    dampings = [f"{unit.torque} s/{unit.position}" for unit in units]
     columns = {"joint": list(model.joint_names)}
     note = "Viscous and Coulomb friction are fitted to the model's friction law."
     if posterior is not None:
-        # The posterior contains friction parameters and their intervals. Without a posterior, `nearest_friction` fits
-        # viscous and Coulomb friction to the friction torque of the model.
         columns |= posterior.drive_columns
         note += " Intervals are of 95 %."
     else:
-        columns["armature"] = _with_units(model.armature.tolist(), [unit.inertia for unit in units])
-        columns["offset"] = _with_units(model.torque_offset.tolist(), torques)
+        quantities, constants = torque_drive_quantities(model)
+        for quantity, values in zip(quantities, constants(model).tolist(), strict=True):
+            columns[quantity.name] = _with_units(values, quantity.unit, model.joint_types)
     if arm is not None:
-        joints = arm.chain.coordinates
-        if posterior is None:
-            friction = nearest_friction(arm.chain, model, sampled_positions(arm.chain))
-            # A model of position servos has no column of viscous friction, because the damping gain of the servo
-            # includes it.
-            if not parameters_of_kind(model, "damping"):
-                columns["viscous"] = _with_units(friction.viscous, dampings)
-            columns["coulomb"] = _with_units(friction.coulomb, torques)
-        columns["URDF: viscous"] = _with_units([joint.damping for joint in joints], dampings)
-        columns["URDF: coulomb"] = _with_units([joint.friction for joint in joints], torques)
+        damping = [joint.damping for joint in arm.chain.coordinates]
+        friction = [joint.friction for joint in arm.chain.coordinates]
+        columns["URDF: viscous"] = _with_units(damping, TORQUE_UNITS["viscous"], model.joint_types)
+        columns["URDF: coulomb"] = _with_units(friction, TORQUE_UNITS["coulomb"], model.joint_types)
     return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
 
 
-def _with_units(values: Sequence[float] | np.ndarray, units: Sequence[str]) -> list[str]:
-    return [f"{value:.3g} {unit}" for value, unit in zip(values, units, strict=True)]
-
-
-def _constant_table(mass: DerivedMass | ConstantMass, joint_types: Sequence[str]) -> Listing:
-    """Return the table of the learned constants of M, with the entries of M that contain each constant."""
-    count = len(mass.raw_constants)
-    # M is linear in the learned functions of q and in the learned constants. Therefore the derivative of M with respect
-    # to a constant does not depend on q. `bases` contains the derivatives, (constants, n, n).
-    functions = len(mass.function_mean) if isinstance(mass, DerivedMass) else 0
-    # The derivative of M with respect to a constant is M for the value 1 of this constant, if all other constants and
-    # all functions are 0.
-    zeros = torch.zeros(functions, count, dtype=torch.float64)
-    units = torch.eye(count, dtype=torch.float64)
-    rows = []
-    bases = mass.entries(*zeros.unbind(), *units.unbind())
-    for basis, value in zip(bases, mass.constants().tolist(), strict=True):
-        indices = basis.tril().nonzero().tolist()
-        terms = [f"{basis[row, column].item():+.4g} {entry_name(row, column)}" for row, column in indices]
-        # A constant in entries of different units is shown with the unit of the first entry.
-        first, second = (UNITS[joint_types[k]].inertia for k in indices[0])
-        unit = first if first == second else "kg m"
-        entries = " ".join(terms).replace("+1 ", "+ ").removeprefix("+ ")
-        rows.append((entries, f"{value:.4g}", unit))
-    note = "An entry of M is the sum of its constants and learned functions."
-    return Listing("Constants of the mass matrix", ("entries", "learned", "unit"), tuple(rows), note)
+def _with_units(values: Sequence[float], unit: str, joint_types: Sequence[str]) -> list[str]:
+    """Return the text of one value per joint. unit: format string for the units of a joint type."""
+    pairs = zip(values, joint_types, strict=True)
+    return [f"{value:.3g} {unit.format(UNITS[joint_type])}" for value, joint_type in pairs]

@@ -1,14 +1,14 @@
 """Groups of charts that several pages show: quantities per joint, prediction errors, entries of M."""
 
 from collections import defaultdict
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from spelgen import labels
 from spelgen.evaluation.drawn_motions import PredictedMotion
-from spelgen.evaluation.traces import Growth, Quantiles
+from spelgen.evaluation.traces import MassTrace, Quantiles
 from spelgen.render.charts import MARGINS, TUNING, Band, Chart, Line, Mark, Values, line_chart
 
 STYLES = defaultdict(
@@ -24,10 +24,6 @@ STYLES = defaultdict(
     },
 )
 """Predictor -> CSS class of its lines."""
-MEASURES: tuple[tuple[str, str, Callable[[Growth], Mapping[str, Quantiles]]], ...] = (
-    ("Relative error", "error / motion", lambda growth: growth.relative),
-    ("Tip error", "tip error [mm]", lambda growth: growth.tip_mm),
-)
 
 
 @dataclass(frozen=True)
@@ -84,48 +80,41 @@ def stacks(
     return panels
 
 
-def growth_panels(
-    growths: Mapping[str, tuple[Growth, str]], styles: Mapping[str, str], banded: Container[str]
-) -> list[Panel]:
-    """Return the charts of relative error and tip error over the prediction horizon.
+def growth_chart(
+    errors: Mapping[str, tuple[Values, Quantiles]], styles: Mapping[str, str], banded: Container[str]
+) -> Chart:
+    """Return the chart of the relative error over the prediction horizon.
 
     Args:
-        growths: {name of a line: (errors of all predictors of an evaluation, name of the predictor to show)}.
+        errors: {name of a line: (times since the start of a prediction [s], relative error)}.
         styles: {name of a line: CSS class}.
         banded: Names of the lines with a band from the 10 % to the 90 % quantile.
     """
-    panels = []
-    for title, label, errors_of in MEASURES:
-        marks: list[Mark] = []
-        errors = {}
-        for name, (growth, predictor) in growths.items():
-            error = errors_of(growth).get(predictor)
-            if error is None:
-                continue
-            errors[name] = error
-            marks.append(Line(name, growth.seconds, error.median, styles[name]))
-            if name in banded:
-                marks.append(Band(f"{name}, 10 to 90 %", growth.seconds, error.low, error.high, styles[name]))
-        if marks:
-            chart = line_chart(
-                marks, f"{title}: error by horizon", "horizon [s]", label, log=True, log_x=True,
-                limits=_error_limits(errors), width=520, height=260,
-            )  # fmt: skip
-            panels.append(Panel(title, (chart,)))
-    return panels
+    marks: list[Mark] = []
+    for name, (seconds, error) in errors.items():
+        marks.append(Line(name, seconds, error.median, styles[name]))
+        if name in banded:
+            marks.append(Band(f"{name}, 10 to 90 %", seconds, error.low, error.high, styles[name]))
+    return line_chart(
+        marks, "Relative error: error by horizon", "horizon [s]", "error / motion", log=True, log_x=True,
+        limits=_error_limits(errors), width=520, height=260,
+    )  # fmt: skip
 
 
-def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None:
+def _error_limits(errors: Mapping[str, tuple[Values, Quantiles]]) -> tuple[float, float] | None:
     """Return the limits of the axis of prediction errors, so that errors of diverged baselines do not extend it.
 
-    The limits include the medians of all predictors and the quantiles of the model. None is returned if `errors`, {name
-    of a line: quantiles}, has no entry of the model, or no positive error.
+    The limits include the quantiles of the model, and the medians of all predictors except values above
+    `TUNING.outlier` times the largest quantile of the model. None is returned if `errors`, see `growth_chart`, has no
+    entry of the model, or no positive error.
     """
-    # A page of several runs has one line per run and no baselines, so its axis is not limited.
+    # A page of several runs has one line per run and no baselines that could extend the axis, so the axis is not
+    # limited.
     if labels.MODEL not in errors:
         return None
-    model_errors = np.concatenate([errors[labels.MODEL].low, errors[labels.MODEL].high])
-    values = np.concatenate([model_errors, *(error.median for error in errors.values())])
+    _, of_model = errors[labels.MODEL]
+    model_errors = np.concatenate([of_model.low, of_model.high])
+    values = np.concatenate([model_errors, *(error.median for _, error in errors.values())])
     # Zeros are excluded from the logarithmic axis. Diverged baselines are excluded, as they would compress all lines.
     values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
     if not values.size:
@@ -134,66 +123,51 @@ def _error_limits(errors: Mapping[str, Quantiles]) -> tuple[float, float] | None
 
 
 def trajectory_panels(
-    predictions: Mapping[str, PredictedMotion],
-    styles: Mapping[str, str],
-    joints: Sequence[labels.NamedJoint],
-    motion: str = "",
+    example: PredictedMotion, joints: Sequence[labels.NamedJoint], motion: str
 ) -> list[Panel]:
     """Return the charts of each joint: position and position error and, if logged, velocity and velocity error.
 
     Args:
-        predictions: {name of a line: prediction}; all predictions are of the same motion.
-        styles: {name of a line: CSS class}.
+        example: A measured motion and its prediction.
         joints: Names and units of the joints.
         motion: Name of the animated motion with the same time axis.
     """
-    measured = next(iter(predictions.values()))
-    # A replayed log of position servos has no velocities, so its charts of velocity are omitted.
-    positions = {name: x.predicted_q for name, x in predictions.items()}
-    velocities = {name: x.predicted_qd for name, x in predictions.items() if x.predicted_qd is not None}
     rows = []
-    quantities = ("position", measured.q, positions), ("velocity", measured.qd, velocities)
-    for quantity, values, predicted in quantities:
-        if values is None:
+    position = ("position", example.q, example.predicted_q)
+    velocity = ("velocity", example.qd, example.predicted_qd)
+    for quantity, measured, predicted in (position, velocity):
+        # A replayed log of position servos has no velocities, so its charts of velocity are omitted.
+        if measured is None or predicted is None:
             continue
-        lines, errors = [("measured", values, "truth")], []
+        lines = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
         # The command is the first curve, so that the measured curve is drawn above it.
-        if measured.u is not None:
-            lines.insert(0, ("commanded", measured.u, "hold"))
-        for name, curve in predicted.items():
-            lines.append((name, curve, styles[name]))
-            errors.append((name, curve - values, styles[name]))
+        if example.u is not None:
+            lines.insert(0, ("commanded", example.u, "hold"))
         rows.append(JointRow(quantity, quantity, quantity, lines))
-        # Errors have their own chart: on the scale of the motion they would be a flat line.
-        rows.append(JointRow(f"Error of the {quantity}", "error", quantity, errors, 100))
-    return stacks(measured.t, rows, joints, motion)
+        # The error has its own chart: on the scale of the motion it would be a flat line.
+        error = [("predicted", predicted - measured, "predicted")]
+        rows.append(JointRow(f"Error of the {quantity}", "error", quantity, error, 100))
+    return stacks(example.t, rows, joints, motion)
 
 
-def mass_panels(
-    t: Values,
-    masses: Mapping[str, np.ndarray],
-    styles: Mapping[str, str],
-    joint_types: Sequence[str],
-    width: int = 330,
-) -> list[Panel]:
+def mass_panels(trace: MassTrace, joint_types: Sequence[str]) -> list[Panel]:
     """Return one chart over time for each entry of M that is not always zero.
 
     Args:
-        t: Times, (T,) [s].
-        masses: {name of a line: lower triangle of M in row-major order, (entries, T) [kg m^2, kg m, kg]}.
-        styles: {name of a line: CSS class}.
+        trace: Entries of M along a trajectory, of one predictor at least.
         joint_types: Types of the joints, for the units of the entries.
-        width: Width of each chart [pixels].
     """
     panels = []
     # An entry of M whose magnitude never exceeds `zero` is zero except for rounding errors, and gets no chart.
-    zero = TUNING.zero * max(np.nanmax(np.abs(mass)) for mass in masses.values())
+    zero = TUNING.zero * max(np.nanmax(np.abs(curves.entries)) for curves in trace.by.values())
     for number, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
-        lines = [Line(label, t, mass[number], styles[label]) for label, mass in masses.items()]
+        lines = [
+            Line(name, trace.t, curves.entries[number], STYLES[name]) for name, curves in trace.by.items()
+        ]
         if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = labels.entry_name(i, j)
             # An entry between a revolute and a prismatic joint has the unit of a first moment.
             unit = labels.UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
-            chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=width)
+            chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330)
             panels.append(Panel(name, (chart,)))
     return panels

@@ -21,31 +21,30 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     """Return {section of the report: charts}; the value is None or empty if the evaluation has no curves for it."""
     joints = named_joints(spec.joint_names, spec.joint_types)
     # Every section has a value, None by default, because an undefined name is an error in the template.
-    drawn = dict.fromkeys(("growth", "mass", "friction", "energy"))
+    drawn = dict.fromkeys(("growth", "mass", "friction"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
-        growths = {name: (growth, name) for name in growth.relative}
+        errors = {name: (growth.seconds, error) for name, error in growth.relative.items()}
         # Only the model and least squares have bands of quantiles, since bands of all predictors would overlap.
-        drawn["growth"] = plots.growth_panels(growths, plots.STYLES, (MODEL, LEAST_SQUARES))
+        drawn["growth"] = plots.growth_chart(errors, plots.STYLES, (MODEL, LEAST_SQUARES))
     if mass is not None and mass.by:
-        entries = {name: curves.entries for name, curves in mass.by.items()}
-        drawn["mass"] = plots.mass_panels(mass.t, entries, plots.STYLES, spec.joint_types)
+        drawn["mass"] = plots.mass_panels(mass, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
-    if traces.torques:  # one trajectory is sufficient to show the terms of the energy balance
-        drawn["energy"] = energy_chart(traces.torques[0])
     torques, trajectories = {}, {}
     for trace in traces.torques:
         torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
     for example in traces.trajectories:
-        motion, lines = f"prediction {example.which}", {"predicted": example}
-        panels = plots.trajectory_panels(lines, {"predicted": "predicted"}, joints, motion)
+        panels = plots.trajectory_panels(example, joints, f"prediction {example.which}")
         trajectories[_motion_title(example, spec)] = panels
     return drawn | {"torques": torques, "trajectories": trajectories}
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of the charts of a predicted motion or a replayed log; the title contains the error."""
+    """Return the title of the charts of a predicted motion or a replayed log.
+
+    It states the relative error of a prediction, or the RMS position error of a replayed log [mrad, mm].
+    """
     which = example.which.capitalize()
     if example.start is None:
         distance = None if example.error is None else 1000 * example.error
@@ -182,15 +181,3 @@ def _histogram(name: str, histogram: Content) -> Band:
     heights = np.repeat(counts / max(counts.sum(), 1.0), 2)
     style = "train" if name == "training" else "model"
     return Band(f"{name} logs", np.repeat(edges, 2)[1:-1], np.zeros_like(heights), heights, style)
-
-
-def energy_chart(trace: TorqueTrace) -> Chart:
-    """Return the chart of the energy balance along a trajectory, in joule over time.
-
-    Its curves are the work of the drives, the stored energy, the work of friction, and the work of the torque residual.
-    """
-    styles = ("truth", "urdf", "friction", "model")
-    terms = zip(trace.energy.items(), styles, strict=True)
-    lines = [Line(name, trace.t, energy, style) for (name, energy), style in terms]
-    motion = f"torque {trace.which}"
-    return line_chart(lines, "Energy", "t [s]", "energy [J]", motion=motion, width=560, height=250)

@@ -1,6 +1,6 @@
 """HTML pages about one run and about several runs. A page names the files that are absent in the run folder."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -8,18 +8,17 @@ from jinja2 import TemplateError
 
 from spelgen.emission.text import description
 from spelgen.errors import RunError, in_one_line
-from spelgen.evaluation.results import Results
-from spelgen.evaluation.tables import figures, joined, result_tables
+from spelgen.evaluation.tables import joined, result_tables
 from spelgen.evaluation.traces import Traces
 from spelgen.files import write_json, write_text
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.report import servo_summary
-from spelgen.labels import MODEL, UNITS, listed, named_joints
+from spelgen.labels import MODEL, UNITS, named_joints
 from spelgen.render import run_facts
 from spelgen.render.arm_section import arm_section, evaluated_motions, matrix
-from spelgen.render.parameters import body_parameters, parameter_tables
-from spelgen.render.plots import growth_panels
+from spelgen.render.parameters import parameter_tables
+from spelgen.render.plots import growth_chart
 from spelgen.render.report_charts import coverage_panels, evaluation_charts, loss_chart
 from spelgen.render.run_facts import Run
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
@@ -59,10 +58,10 @@ def report_data(folder: Path | str) -> Content:
     """
     run = Run(folder)
     tables = parameter_tables(run.model, run.arm, run.baselines, run.posterior)
-    bodies = body_parameters(run.model).tolist() if isinstance(run.model, RigidBodyDynamics) else None
+    bodies = run.model.inertial_parameters.tolist() if isinstance(run.model, RigidBodyDynamics) else None
     return {
         "schema": SCHEMA,
-        "verdict": None if run.verdict is None else asdict(run.verdict),
+        "verdict": run.results and run.results.assessment and asdict(run.results.assessment),
         "bodies": bodies,
         "tables": list(map(asdict, tables)),
         "posterior": None if run.posterior is None else run.posterior.to_dict(),
@@ -108,13 +107,11 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
         spec=spec,
         about=description(spec),
         units=UNITS,
-        numbers=run_facts.head_numbers(run),
-        verdict=run.verdict,
         outliers=None if run.results is None else run_facts.outlier_note(run.results),
         config=record,
         evaluation=run.results,
         tables=tables,
-        coverage=coverage_panels(traces, run.baselines, joints, run.limits),
+        coverage=coverage_panels(traces, run.baselines, joints, [joint.limits for joint in spec.joints]),
         trained=run.model is not None,
         under_servos=record is not None and record.mapping.input == "position",
         summary=None if record is None else servo_summary(record.servo),
@@ -126,16 +123,11 @@ def _rendered(run: Run, robot: Path | str | None) -> str:
 STYLES = ("model", "train", "gravity", "coriolis", "friction", "hold")
 
 
-def write_runs(folders: Sequence[Path], output: Path) -> Path:
-    """Write the page that compares several runs; return its path.
+def render_runs(folders: Sequence[Path]) -> str:
+    """Return the page that compares several evaluated runs, as HTML.
 
     Raises RunError for a folder without an evaluated run.
     """
-    return write_text(output, render_runs(folders))
-
-
-def render_runs(folders: Sequence[Path]) -> str:
-    """Return the page that compares several evaluated runs, as HTML."""
     # All runs are read before the page is written, so that an unreadable run does not result in an incomplete page.
     runs = {}
     results = {}
@@ -145,15 +137,19 @@ def render_runs(folders: Sequence[Path]) -> str:
         if run.results is None:
             raise RunError("a run that is not evaluated", file=folder, do="spelgen evaluate")
         runs[name], results[name] = run, run.results
-    growths = {name: (x.traces.growth, MODEL) for name, x in results.items() if x.traces.growth}
+    errors = {}
+    for name, evaluated in results.items():
+        growth = evaluated.traces.growth
+        if growth is not None:
+            errors[name] = growth.seconds, growth.relative[MODEL]
+    # Styles are repeated if there are more runs than styles.
+    styles = dict(zip(runs, STYLES * len(runs), strict=False))
     return render_page(
         "runs.html.jinja",
         runs=runs,
-        verdict=_verdict(results),
         robots=sorted({run.spec.robot for run in runs.values()}),
         tables=joined(results),
-        # Styles are repeated if there are more runs than styles.
-        growth=growth_panels(growths, dict(zip(runs, STYLES * len(runs), strict=False)), runs),
+        growth=growth_chart(errors, styles, runs) if errors else None,
     )
 
 
@@ -170,27 +166,3 @@ def _names(folders: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             break
     return names
-
-
-def _verdict(runs: Mapping[str, Results]) -> str:
-    """Return sentences that name the run with the smallest value of each error that all runs have.
-
-    runs: {name of a run: its results}.
-    """
-    # `errors`: {label of an error: (value, run, text) of each run}. The value is the first element, so that `min`
-    # compares it.
-    errors: dict[str, list[tuple[float, str, str]]] = {}
-    for run, results in runs.items():
-        for figure in figures(results):
-            text = f"{figure.label} ({figure.text()})"
-            errors.setdefault(figure.label, []).append((figure.value, run, text))
-    smallest: dict[str, list[str]] = {}
-    for of_runs in errors.values():
-        if len(of_runs) == len(runs):
-            _, name, text = min(of_runs)
-            smallest.setdefault(name, []).append(text)
-    # Runs that have no error in common, for example runs with different horizons, cannot be compared.
-    if not smallest:
-        return "These runs have no common horizons or logs."
-    sentences = [f"{name} has the smallest {listed(labels)}." for name, labels in smallest.items()]
-    return " ".join(sentences)

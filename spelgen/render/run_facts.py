@@ -1,4 +1,4 @@
-"""Facts about a run for its page: most important figures, training, options, and commands that reproduce the run."""
+"""Facts about a run for its page: training, options, and commands that reproduce the run."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -8,17 +8,13 @@ from functools import cached_property
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.parameters import used_parameter_count
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import SpelgenError, shortened
-from spelgen.evaluation.results import Results, Verdict
-from spelgen.evaluation.tables import figures
-from spelgen.evaluation.verdict import Limits
+from spelgen.evaluation.results import Results
 from spelgen.fitting.posterior import Posterior, posterior_of
 from spelgen.fitting.run_folder import RunFolder, fitted_model
 from spelgen.fitting.run_record import Content, Record
-from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import MODEL, counted, share
 from spelgen.listing import duration, number
@@ -35,10 +31,8 @@ class Run:
 
     Attributes:
         config: Record of the fit.
-        verdict: Assessment of the model.
         baselines: Content of least_squares.json; {} if the file is absent.
         arm: Arm of the URDF; None also if the URDF cannot be read, in which case the page has no picture of the arm.
-        limits: Lower and upper position limit of each joint [rad, m]; None for a joint without limits.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -48,17 +42,13 @@ class Run:
         self.config = folder.read_record() if folder.config.is_file() else None
         self.baselines = folder.read_baselines()
         self.results: Results | None = None
-        self.verdict: Verdict | None = None
         if folder.evaluation.is_file():
             self.results = Results.from_dict(folder.read_json(folder.evaluation))
-            self.verdict = self.results.assessment
         self.arm: Arm | None = None
-        self.limits: Limits = [None] * len(self.spec.joints)
         if folder.urdf.exists():
             # An unreadable URDF is no error: results do not depend on it, only the picture of the arm is omitted.
             with suppress(SpelgenError):
                 self.arm = arm_of_spec(self.spec, folder.urdf)
-                self.limits = [joint.limits for joint in self.arm.chain.coordinates]
 
     @cached_property
     def metrics(self) -> list[Content]:
@@ -78,25 +68,9 @@ class Run:
         if self.model is None or self.config is None or not self.folder.checkpoint.is_file():
             return None
         content = self.folder.load_checkpoint().posterior
-        # The tables of the posterior state the torque delay, by which the fit has shifted the logged torques.
+        # `delay`: time by which the fit has shifted the logged torques [s]; shown in the tables of the posterior.
         delay = self.config.preprocessing.torque_delay or 0.0
         return None if content is None else posterior_of(self.model, content, delay, self.folder.checkpoint)
-
-
-def head_numbers(run: Run) -> list[tuple[str, str]]:
-    """Return the most important figures of a run for the head of its page: (text, label) of each."""
-    numbers = []
-    if run.results is not None:
-        numbers = [(figure.text(), figure.label) for figure in figures(run.results)]
-    summary = None if run.config is None else servo_summary(run.config.servo)
-    if summary is not None:
-        numbers.append(summary.headline)
-    # The number of parameters excludes residual terms that the fit did not select.
-    elif run.model is not None:
-        numbers.append((f"{used_parameter_count(run.model):,}", "trained parameters"))
-    for last in run.metrics[-1:]:
-        numbers.append((duration(last["seconds"]), f"of training, {last['step']:,} steps"))
-    return numbers
 
 
 def outlier_note(results: Results) -> str:
@@ -135,10 +109,6 @@ def training_facts(run: Run, record: Record) -> dict[str, str]:
         "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    # Least squares uses only samples with accelerations, so it may use fewer samples than the fit of the model.
-    if "samples" in run.baselines:
-        count = f"{run.baselines['samples']:,}"
-        facts["dense samples"] = f"{count} that move, from which least squares is fitted as well"
     if isinstance(run.model, ResidualDynamics):
         facts["residual terms"] = "; ".join(terms_in_use(run.model)) or "none selected"
     # Only fits with epochs have metrics; fits to torques have none.
@@ -196,8 +166,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record | None) -> list[str
         options |= record.options | asdict(record.preprocessing)
         for key, value in _changed(options, defaults).items():
             train += f" --set {shlex.quote(f'{key}={value}')}"
-        # The command contains a mapping that is stored in the run folder: it has replaced the mapping of the robot's
-        # settings.
+        # A mapping in the run folder has replaced the mapping in the settings of the robot, so the command must specify
+        # it.
         if run.mapping.exists():
             train += f" --mapping RUN/{run.mapping.name}"
         lines.append(train)

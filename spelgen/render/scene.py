@@ -146,8 +146,8 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
     """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
 
-    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum or block. names: the drawn
-    links. radius: radius of the tubes [m].
+    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum (revolute) or a block
+    (prismatic). names: the drawn links. radius: radius of the tubes [m].
     """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]

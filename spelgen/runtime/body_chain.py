@@ -15,17 +15,20 @@ from spelgen.runtime.rows import Joint, Link, vector
 class ChainConfiguration(NamedTuple):
     """Configuration cache of ``BodyChain``: all its quantities that depend on q only, in the base frame.
 
-    Each of the B bodies is represented by four point masses.
+    Four point masses suffice to represent a rigid body (see ``BodyChain``). Positions and velocities of a
+    point are multiplied by the square root of its mass, so that products of two of them are moments and
+    energies.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
-    mass: Tensor  # square roots of the point masses, (..., 1, B bodies, 4 points) [kg^(1/2)]
+    mass: Tensor  # sqrt(mass) of the point masses in `place`, (..., 1, B bodies, 4 points) [kg^(1/2)]
     axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, B bodies)
-    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each of B
-    # bodies, times sqrt(mass), (..., B, 12 B): 3 coordinates of 4 point masses per body.
+    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each body,
+    # times sqrt(mass), (..., B, 12 B). A body has 3 coordinates of each of its 4 point masses: coordinate,
+    # body and point are the order of the 12 B entries.
     jacobian: Tensor
-    # Minus the acceleration of gravity, times sqrt(mass), for each coordinate of each point mass of B
-    # bodies, (..., 12 B) [m/s^2 kg^(1/2)].
+    # Minus the acceleration of gravity, times sqrt(mass), for 3 coordinates of 4 point masses of each of
+    # B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
     weight: Tensor
 
 
@@ -36,8 +39,8 @@ class BodyChain(nn.Module):
     frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four point
     masses that have the same pseudo-inertia P: the columns (position, 1) * sqrt(mass) of a matrix Q with Q
     Q^T = P. Only the frames are computed recursively. A sum over the bodies that a joint carries, or over the
-    joints that carry a body, is one product with a mask: for small arms the time is proportional to the
-    number of tensor operations.
+    joints that carry a body, is one product with a matrix of zeros and ones: for small arms the time depends
+    on the number of tensor operations, not on their size.
     """
 
     def __init__(
@@ -81,7 +84,8 @@ class BodyChain(nn.Module):
                 carriers[:, index] += carriers[:, carrier]
         # `carriers`, (bodies, bodies): entry (i, j) is 1 if body i carries body j or i = j, else 0.
         self.carriers = nn.Buffer(carriers)
-        # `carried`, (bodies, 12 bodies): `carriers` with a column for each coordinate of each point mass.
+        # `carried`, (bodies, 12 bodies): `carriers`, with 12 columns for the coordinates of the four
+        # point masses of a body; it is a mask of the Jacobian.
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
         # `base`: minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
@@ -91,8 +95,9 @@ class BodyChain(nn.Module):
 
         Args:
             q: joint positions, (..., n) [rad, m].
-            points: block diagonal matrix, (4 bodies, 4 bodies); the block of a body has a column (position,
-                1) * sqrt(mass) for each of its four point masses, in the body frame [m, kg].
+            points: block diagonal matrix, (4 B, 4 B) for B bodies; the block of a body has a column
+                (position, 1) * sqrt(mass) for each of its four point masses, in the body frame
+                [m kg^(1/2), kg^(1/2)].
         """
         # Joint displacements of all bodies; the displacement of a mimic joint is linear in q of its leader.
         value = q @ self.ratios.mT + self.offset
@@ -117,14 +122,16 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the velocities of all bodies at the joint velocities qd, (..., n) [rad/s, m/s].
+        """Return velocities of bodies and point masses at joint velocities qd, (..., n) [rad/s, m/s].
 
         Returns:
-            velocities of the point masses times sqrt(mass), (..., 3, bodies, 4); twists of the bodies,
-            (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies) (Featherstone, 2.31).
+            velocities of the four point masses of each body times sqrt(mass), (..., 3, bodies, 4); twists
+            of the bodies, (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies)
+            (Featherstone, 2.31).
         """
         rates = qd @ self.ratios.mT
-        # The product with the Jacobian, and with the mask `carriers`, sums over the joints that carry a body.
+        # Sums over the joints that carry a body: the Jacobian is zero for other joints, and twists are
+        # multiplied by the mask `carriers`, (bodies, bodies).
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
@@ -135,8 +142,9 @@ class BodyChain(nn.Module):
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
         """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
 
-        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian``, which has one
-        row per joint, times the returned vector is the Coriolis, centrifugal and gravity torque.
+        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the
+        returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body. ``ratios``
+        transposed maps it to the n joints, to which mimic joints are coupled.
 
         Args:
             cache: configuration cache at q.
@@ -161,9 +169,10 @@ class BodyChain(nn.Module):
         velocity, _, turning = self.motion(cache, qd)
         # Angular momentum about the origin of the base, and linear momentum, of each point mass.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
-        # The derivative with respect to a joint's displacement is the scalar product of the momentum of all
-        # bodies that the joint carries and the time derivative of the joint's axis. The rotation of the
-        # points' velocities contributes nothing: (a x v) . v = 0.
+        # The derivative of the kinetic energy with respect to a joint's displacement is the scalar
+        # product of the momentum of all bodies that the joint carries and the time derivative of the
+        # joint's axis. A rotation about the axis a also rotates the velocity v of each point, which
+        # contributes nothing: (a x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 
@@ -207,8 +216,8 @@ def body_factor(parameters: Tensor) -> Tensor:
 def pseudo_inertia(link: Link) -> Tensor:
     """Return the pseudo-inertia [[S, m c], [(m c)^T, m]] of a link in the link's joint frame, (4, 4).
 
-    With the mass m [kg], the center of mass c [m] and the inertia tensor I about c [kg m^2],
-    S = tr(I)/2 1 - I + m c c^T is the matrix of the second moments of mass.
+    With the mass m [kg], the center of mass c [m], the inertia tensor I about c [kg m^2] and the identity
+    matrix E, S = tr(I)/2 E - I + m c c^T is the matrix of the second moments of mass.
     """
     xx, xy, xz, yy, yz, zz = link.inertia
     inertia = torch.tensor([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=torch.float64)
@@ -238,15 +247,15 @@ class InertialParameters(nn.Module):
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
-        # torch has only lower Cholesky factors. With rows and columns in reverse order, the lower factor of
-        # the reversed matrix becomes the upper factor.
+        # The upper triangular C with C C^T is needed; torch computes only L L^T, with lower L, and U^T U.
+        # C is the L of the matrix with rows and columns in reverse order, reversed again.
         self.factors = nn.Buffer(torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2))
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 
     def forward(self) -> Tensor:
         """Return four point masses for each body, (bodies, 4, 4), which have the body's pseudo-inertia.
 
-        They are the columns of the factor C T of the pseudo-inertia C T T^T C^T (see the class). A column is
-        (position, 1) * sqrt(mass), in the joint frame [m, kg].
+        They are the columns of the factor C T of the pseudo-inertia C T T^T C^T (see the class). A column
+        is (position, 1) * sqrt(mass), in the joint frame [m kg^(1/2), kg^(1/2)].
         """
         return self.factors @ body_factor(torch.unflatten(self.raw @ self.triangle, -1, (4, 4)))

@@ -100,12 +100,13 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    The result is positive definite for all q and all parameters. C denotes M at the nominal means of the
-    functions, without armature. If M - margin C is not positive definite, M is replaced by
-    M' = C + t (M - C). The factor t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin. The
-    norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is piecewise
-    constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the linear relations
-    between entries of M are valid for C, and therefore for M', too.
+    The result is M' = C + t (M - C), which is positive definite for all q and all parameters. C is
+    constant: ``entries`` with the nominal mean of each function (``Function.mean``) and the initial
+    constants, without armature. The factor t is 1, and M' equals M, if M - margin C is positive definite,
+    where ``margin`` is below 1. Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin
+    <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is
+    piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the
+    linear relations between entries of M are valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -121,15 +122,16 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is C, M at the nominal means of the functions, and `smallest` is margin C. `forward`
-        # corrects M if M - `smallest` is not positive definite.
+        # `center` is the constant matrix C of the class, `smallest` is `margin` times C. `forward`
+        # corrects M (t < 1) if M - `smallest` is not positive definite.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # The norm |X| of a matrix X is the Frobenius norm of D X D divided by the smallest eigenvalue of
-        # D C D, with D = diag(C)^(-1/2): an upper bound of the spectral norm of L^-1 X L^-T, C = L L^T.
-        # `unit`, (n, n), has the factors of the entries of X in |X| / (1 - margin).
+        # The norm |X| of the class is the Frobenius norm of D X D, with D = diag(C)^(-1/2), divided by
+        # the smallest eigenvalue of D C D. It is an upper bound of the spectral norm of L^-1 X L^-T, with
+        # C = L L^T. `unit`, (n, n), has all factors: the Frobenius norm of the elementwise product of
+        # `unit` and X is |X| / (1 - margin).
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -154,8 +156,9 @@ class DerivedMass(LinearMass):
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return the mass matrix M'(q), (..., n, n), and intermediate values for its derivatives.
 
-        encoded: encoding of q, (..., 2 n). layers: parameter cache. The intermediate values are the values of
-        the network's layers, and the factor t of M' = C + t (M - C), (...).
+        M' = C + t (M - C) is the corrected mass matrix, with the constant C and the factor t(q) of the
+        class. The intermediate values are the values of the network's layers, and t, (...). encoded:
+        encoding of q, (..., 2 n). layers: parameter cache.
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -165,28 +168,34 @@ class DerivedMass(LinearMass):
     def fraction(self, mass: Tensor) -> Tensor:
         """Return the factor t of M' = C + t (M - C), (...), for the matrices M in ``mass``, (..., n, n).
 
-        t is 1 if M - margin C is positive definite (see the class).
+        t is 1 if M - margin C is positive definite, otherwise 1/2, 1/4, ...; the class defines C and
+        margin.
         """
         # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
         # matrices are indefinite.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # `norm` is |M - C| / (1 - margin), see ``DerivedMass``; `unit` contains the divisor.
+        # `norm` is |M - C| / (1 - margin), with the norm of the class: t is the largest power of 1/2 with
+        # t `norm` <= 1, at most 1/2.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n).
 
-        M' = C + t (M - C) is the corrected mass matrix, see ``DerivedMass``.
+        M' is the corrected mass matrix (see the class). intermediates: second result of ``forward`` at q.
         """
         network, fraction = intermediates
-        # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T, since dM' = t dM;
-        # the network's outputs are the entries of M.
+        # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T: M' = C + t (M -
+        # C) has dM' = t dM, since t is piecewise constant. The network's outputs are the entries of M.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return dM'/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
+        """Return the time derivative of the corrected mass matrix M', (..., n, n) (see the class).
+
+        rate: time derivative of the encoding of q, (..., 2 n). intermediates: second result of
+        ``forward``.
+        """
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
         return rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -201,12 +210,12 @@ class DenseIntermediates(NamedTuple):
 
     network: Intermediates
     factor: Tensor  # U of `DenseMass` without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A of `DenseMass`, (..., 3 n, n)
-    scale: Tensor  # e of `DenseMass`, (..., 3 n)
+    moved: Tensor  # U^-1 A, with the constant A of `DenseMass`, (..., 3 n, n)
+    scale: Tensor  # e, the diagonal factor of `DenseMass`, (..., 3 n)
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return lower triangular C, (3 n, 3 n), with C C^T the inverse of a nominal large matrix.
+    """Return C of ``DenseMass``, (3 n, 3 n): Cholesky factor of the nominal inverse of the large matrix.
 
     The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
     axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
@@ -214,7 +223,8 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
     Args:
         joints: joints of the arm, whose nominal armature is added to M.
-        mean: lower triangle, by rows, of the nominal mean of M without armature [kg m^2, kg m, kg].
+        mean: lower triangle, by rows, of the mean of M over random positions, for the nominal bodies and
+            without armature [kg m^2, kg m, kg].
     """
     n = len(joints)
     mass = torch.zeros(n, n, dtype=torch.float64)
@@ -228,13 +238,14 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """A mass matrix M(q), (..., n, n), without structure: a block of a large matrix with 3 axes per joint.
+    """A mass matrix M(q), (..., n, n), without structure: a block of a matrix with three axes per joint.
 
-    The inverse of the large matrix, (..., 3 n, 3 n), is C U diag(e) U^T C^T. C is constant: the Cholesky
-    factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
+    The large matrix, (..., 3 n, 3 n), has a row and a column for the x, y and z axis of each joint, as in the
+    model of Duong et al. (IEEE T-RO 40:3695, 2024). Its inverse is C U diag(e) U^T C^T. C is constant: the
+    Cholesky factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
     triangular with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints
-    rotate about or move along their z axes only, so M is the block of the z axes:
-    (U^-1 A)^T diag(1 / e) U^-1 A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
+    rotate about or move along their z axes only, so M is the block of the z axes: (U^-1 A)^T diag(1 / e) U^-1
+    A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -244,7 +255,8 @@ class DenseMass(nn.Module):
         self.nominal = nn.Buffer(factor)
         self.moving = nn.Buffer(torch.linalg.inv(factor)[:, 2::3])
         row, column = torch.tril_indices(self.size, self.size, -1)
-        # Indices of the entries below the diagonal of the lower triangular matrix U, in row-major order.
+        # Indices of the entries below the diagonal of the lower triangular factor U (see the class), in
+        # row-major order.
         self.below = nn.Buffer(row * self.size + column)
         # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
@@ -252,11 +264,11 @@ class DenseMass(nn.Module):
         self.network = network
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of the network that gives U and softplus^-1(e)."""
+        """Return the parameter cache: layers of the network that gives U and e (see the class)."""
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return C U diag(e) U^T C^T, the inverse of the large matrix with 3 axes per joint, (..., 3 n, 3 n).
+        """Return the inverse of the large matrix of the class, C U diag(e) U^T C^T, (..., 3 n, 3 n).
 
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
@@ -293,19 +305,23 @@ class DenseMass(nn.Module):
         """
         raw, intermediates = self.network.forward(encoded, layers)
         factor, scale = self._factor(raw)
-        # U^-1 A is solved from a triangular system. An inversion of the larger matrix C U diag(e) U^T C^T
-        # would lose twice as many digits, since the condition number of the large matrix is squared.
+        # M is computed from U^-1 A, the solution of a triangular system (see the class). An inversion of
+        # C U diag(e) U^T C^T would lose twice as many digits: its condition number is the square of the
+        # condition number of C U diag(e)^(1/2).
         moved = self._unit_solved(factor, self.moving)
         mass = moved.mT @ (moved / scale.unsqueeze(-1))
         return mass, DenseIntermediates(intermediates, factor, moved, scale)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n)."""
+        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n).
+
+        The encoding is defined in ``JointEncoding``. intermediates: second result of ``forward`` at q.
+        """
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # For the kinetic energy T = 1/2 qd^T M qd, with w = U^-1 A qd and p = w / e: dT/dU = -U^-T p w^T
-        # and dT/de = -p^2 / 2.
+        # For the kinetic energy T = 1/2 qd^T M qd, with U, A and e of the class, w = U^-1 A qd and
+        # p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).

@@ -37,7 +37,8 @@ class FrictionConstants(NamedTuple):
     def viscosity(self, qd: Tensor) -> Tensor:
         """Return the viscous friction torque divided by the velocity qd, (..., n) [Nm s/rad, N s/m].
 
-        qd: velocities, (..., n) [rad/s, m/s].
+        It is viscous + saturation / sqrt(qd^2 + saturation_velocity^2). qd: velocities, (..., n) [rad/s,
+        m/s].
         """
         return self.viscous + self.saturation * turning(qd, self.saturation_velocity)
 
@@ -81,13 +82,18 @@ class FrictionConstants(NamedTuple):
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
         # Each bristle is a spring of stiffness coulomb * fraction / breakaway. The Stribeck and load
-        # terms of dry friction vary with velocity and load, and are counted as dissipation.
+        # terms of dry friction vary with velocity and load, and are counted as dissipation, which may
+        # therefore be slightly negative.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
 
 class FrictionLaws(nn.Module):
-    """Friction of all joints with trained constants; it dissipates energy for any values of the parameters.
+    """Friction of all joints with trained constants.
+
+    Without bristles, it dissipates energy for any values of the parameters. Bristles store energy and return
+    it. Their stiffness is proportional to dry friction, which depends on velocity and load: they can return
+    slightly more than they have stored if velocity or load have changed meanwhile.
 
     The friction torque of a joint with velocity qd is
 
@@ -95,25 +101,26 @@ class FrictionLaws(nn.Module):
         dry = coulomb + stribeck / (1 + (1 + r) v^2 / (v + r) / 8)^8 + load_dependence load,
 
     with v = |qd| / stribeck_velocity, r = stribeck_rounding, load = sqrt(gravity torque^2 + min_load^2) and
-    s(x, width) = x / sqrt(x^2 + width^2).
+    the smooth sign function s(x, width) = x / sqrt(x^2 + width^2). All other names except ``direction`` are
+    constants. ``saturation`` is the limit of a friction torque that rises with velocity.
 
-    The trained parameters are logarithms of the constants, and logits of the bristle fractions. The factor
-    ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over the bristles of the joint, which
-    may return elastic energy. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if the
-    bristle displacements z are unknown. For large r the
-    Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction, 1991);
-    for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982), but without a corner at rest.
-    Powers replace exponentials, so that a control loop takes a third of the time.
+    A joint has K bristles: elements that are elastic up to a break-away displacement and slide beyond it,
+    with displacements z, (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A
+    Generalized Maxwell-Slip Friction Model, 2003). They may return their elastic energy. Reversals within the
+    break-away displacement give closed hysteresis loops, so a joint that is held by stiction does not creep
+    under an oscillating load. The factor ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k
+    over the bristles of the joint. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or
+    if z is unknown.
 
-    A joint has K bristles: elements that are elastic up to a break-away displacement and slide beyond
-    it, with displacements z, (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and
-    Swevers, A Generalized Maxwell-Slip Friction Model, 2003). Reversals within the break-away
-    displacement give closed hysteresis loops, so a joint that is held by stiction does not creep under
-    an oscillating load.
+    The trained parameters are logarithms of the constants, and logits of the bristle fractions. For large r
+    the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction,
+    1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982), but without a corner at
+    rest. Powers replace exponentials, so that a control loop takes a third of the time.
     """
 
-    # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Initial
-    # values are in units of the joint's typical friction and typical speed. A parameter of zero gives them.
+    # (name, group, unit of the constant, initial value of the constant) of each trained parameter.
+    # Initial values are in units of the joint's typical friction and typical speed; a constant has its
+    # initial value if its parameter is zero.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -131,7 +138,8 @@ class FrictionLaws(nn.Module):
         """Create the friction of the joints, with all constants at their initial values.
 
         Args:
-            joints: joints with their typical friction and typical speed, the units of the initial values.
+            joints: joints with their typical friction and typical speed, to which initial values are relative
+                (see ``parameter_groups``).
             breakaway: for each joint type, break-away displacements of K bristles, (K,) [rad, m], shortest
                 first.
             stribeck_rounding: r of the Stribeck curve (see the class).
@@ -160,8 +168,8 @@ class FrictionLaws(nn.Module):
         # |gravity torque| has no derivative at zero: `load` smooths it below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        # At joints without bristles the smooth sign has a width of 0.1 % of the typical speed: a wider
-        # transition would be confounded with hysteresis.
+        # The smooth sign has a width of 0.1 % of the typical speed (`SlidingFriction` trains the width): a
+        # wider transition at joints without bristles would be confounded with hysteresis.
         rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
             [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]

@@ -36,7 +36,7 @@ class MotorInputs(nn.Module):
             nn.Buffer(is_trained * matrix),
         )
         self.passive = nn.Buffer(1.0 - matrix.any(dim=1).double())  # 1 for a joint without a motor, (n,)
-        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # row of G of each trained gain, (trained,)
+        self.gain_rows = nn.Buffer(is_trained.nonzero()[:, 0])  # joint of each gain, (trained,)
         raw = (
             nn.Parameter(torch.zeros(len(self.gain_rows), dtype=torch.float64))
             if len(self.gain_rows)
@@ -69,7 +69,7 @@ class MotorInputs(nn.Module):
 
 
 class ServoConstants(NamedTuple):
-    """Constants of all position servos, (n,): kp, kd and limit are positive, the dead zone is >= 0."""
+    """Constants of all position servos, (n,): kp, kd and torque limit are positive, the dead zone is >= 0."""
 
     kp: Tensor  # servo torque per position error [Nm/rad, N/m]
     kd: Tensor  # servo torque per velocity [Nm s/rad, N s/m]

@@ -54,7 +54,8 @@ class NetworkDynamics(PortHamiltonian):
     def prepare(self) -> dict[str, Parameters]:
         """Return the parameter caches of M, V and D, with the keys "mass", "potential" and "friction".
 
-        They depend on the trained parameters only, and are valid until a parameter changes.
+        M is the mass matrix, V the potential energy, D the dissipation matrix. The caches depend on the
+        trained parameters only, and are valid until a parameter changes.
         """
         # The offset of V is zero, since a constant in V has no effect on the motion. It is computed as
         # 0 * scale, which has the dtype and device of the model.
@@ -221,9 +222,10 @@ class JointFriction(NetworkFriction):
 class DenseFriction(NetworkFriction):
     """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
 
-    L is lower triangular with ``axes`` rows per joint, one per axis of the joint frame. A joint rotates about
-    or moves along its last axis only, so only the row of the last axis of each joint is computed: the result
-    is D, (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
+    L, (axes n, axes n), is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the
+    joint frame as in the model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves
+    along its last axis only, so only the row of the last axis of each joint is computed: the result is D,
+    (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
@@ -238,10 +240,10 @@ class DenseFriction(NetworkFriction):
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of a network whose outputs are the flattened rows of L.
+        """Return the parameter cache: layers of a network with the entries of L as outputs, row after row.
 
-        Only the rows of the joints' last axes are included: n rows of n * axes entries
-        [sqrt(Nm s/rad), sqrt(N s/m)].
+        The class defines L and ``axes``. Only the row of each joint's last axis is included: n rows of n
+        * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)

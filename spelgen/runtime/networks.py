@@ -90,8 +90,9 @@ def joint_masks(
     """Yield a mask for each layer of a network, (units, inputs): the factors of the layer's weights.
 
     A factor is 0 if the input depends on a joint that the unit must not depend on, so that each output of the
-    network depends on specified joints only. All other factors are 1 in hidden and output layers; in the
-    first layer, they are the scales of the inputs.
+    network depends on specified joints only. All other factors are 1 in hidden and output layers. In the
+    first layer, they are the scales of the inputs, which make inputs with a small influence on the outputs
+    small.
 
     Args:
         joints: joints of the arm.
@@ -100,7 +101,7 @@ def joint_masks(
         outputs: names of the joints that each output depends on.
         width: number of units of each hidden layer.
         depth: number of hidden layers.
-        min_units: smallest number of hidden units per group of outputs that depend on the same joints.
+        min_units: smallest number of units of a hidden layer for each group of outputs with equal joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]
@@ -122,12 +123,12 @@ class MaskedNetwork(nn.Module):
     Args:
         generator: random generator of the initial weights; the weights of the last layer are zero.
         joints: joints of the arm.
-        scales: rows (n,) with the scales of the inputs of each joint: cos q or the scaled q (see
-            ``JointEncoding``), sin q, and any others, such as qd.
+        scales: one row (n,) per input of a joint, with its scale for each joint. The inputs are cos q or
+            the scaled q (see ``JointEncoding``), sin q, and any others, such as qd.
         outputs: names of the joints that each output depends on; masks set the weights of all paths from
             other joints to zero.
         width, depth: number of units of a hidden layer, and number of hidden layers.
-        min_units: smallest number of hidden units per group of outputs that depend on the same joints.
+        min_units: smallest number of units of a hidden layer for each group of outputs with equal joints.
     """
 
     points = 0  # number of Gaussians in the function of an edge (input to unit); 0: the edge is one weight
@@ -150,9 +151,9 @@ class MaskedNetwork(nn.Module):
         min_units: int = 1,
     ) -> None:
         super().__init__()
-        # The initial weights of an edge are one random number times `slopes`: 1 for a single weight, or
-        # numbers that increase linearly over the grid of Gaussians, so that the edge's function is nearly
-        # linear.
+        # The initial weights of an edge (input to unit) are one random number times `slopes`: 1 for a
+        # single weight. An edge with a sum of Gaussians has weights that increase linearly over the
+        # Gaussians' grid, so that the sum is a nearly linear function of the input.
         slopes = torch.ones((), dtype=torch.float64)
         if self.points:
             slopes = torch.linspace(-1, 1, self.points, dtype=torch.float64)
@@ -223,7 +224,7 @@ class MaskedMLP(MaskedNetwork):
 
 
 class Bumps(NamedTuple):
-    """Arguments and values of the Gaussians of a layer of ``MaskedKAN``, (..., inputs, GRID) each."""
+    """Arguments and values of the GRID Gaussians per input of a ``MaskedKAN`` layer, (..., inputs, GRID)."""
 
     distance: Tensor  # argument of the Gaussian: input minus grid point (signed), in grid spacings
     height: Tensor

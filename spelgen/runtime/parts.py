@@ -8,7 +8,7 @@ from torch import Tensor
 
 Row = Sequence[float]
 Rows = Sequence[Sequence[float]]
-Entries = Callable[..., Tensor]  # returns M, (..., n, n), from its functions of q and constants, (...) each
+Entries = Callable[..., Tensor]  # (functions of q and constants, (...) each) -> M, (..., n, n)
 Layers = tuple[tuple[Tensor, Tensor], ...]  # (masked weights, biases) of each layer of a network
 # The four types below are Any, because each class of models defines its own named tuples for them.
 Intermediates = Any  # intermediate values of a network's evaluation, for its derivatives
@@ -33,10 +33,16 @@ class Mass(Protocol):
         """
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding, (..., 2 n); qd: (..., n)."""
+        """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding of q, (..., 2 n).
+
+        qd: velocities, (..., n). intermediates: second result of ``forward`` at q.
+        """
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+
+        intermediates: second result of ``forward`` at q.
+        """
 
 
 class Inputs(Protocol):

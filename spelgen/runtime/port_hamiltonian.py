@@ -75,7 +75,7 @@ class PortHamiltonian(nn.Module):
                 checked.
             prepared: parameter cache that ``prepare`` returned; None: the method calls ``prepare``.
         """
-        # A configuration cache is a named tuple. The call that created it has checked q.
+        # A tuple is a configuration cache. It needs no check: the call that created it has checked q.
         if isinstance(q, tuple):
             return q
         dtype = self.get_buffer("friction.nominal").dtype

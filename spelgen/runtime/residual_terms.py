@@ -1,7 +1,7 @@
 """Residual terms: corrections that are added to M(q), V(q) and friction of a rigid-body model.
 
-Torque and friction terms depend on the position of one joint each (splines and harmonics); the terms of M(q),
-and one of V(q), are networks that depend on the positions of several joints.
+Splines and harmonics of one joint's position add torques to dV/dq and change friction. Networks that depend
+on the positions of several joints add terms to M(q) and V(q).
 """
 
 import math
@@ -20,8 +20,8 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of cubic B-splines over the range of a joint, for its torque term and its friction factor.
 SPLINES = 34
-# Number of harmonics of the joint's revolution in the torque ripple. For a gear ratio above this number, the
-# first two harmonics of the motor's revolution are added, which represent gear teeth and motor poles.
+# Number of harmonics of the joint's revolution in the torque ripple. For a gear ratio above this number,
+# the first two harmonics of the motor's revolution are added, which represent errors of gear and motor.
 HARMONICS = 64
 # Largest magnitude of the logarithm of the friction factor, so that the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
@@ -31,9 +31,9 @@ class ResidualParameters(NamedTuple):
     """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
     splines: Tensor  # spline coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
-    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 HARMONICS + 4)
+    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 (HARMONICS + 2))
     constant: Tensor  # constant part of the residual R of M, flattened, (n n,)
-    functions: Tensor  # matrices by which R's network outputs (after tanh) are multiplied, (functions, n n)
+    functions: Tensor  # flattened matrices dR / d tanh(output) of R's network, (functions, n n)
     mass: Layers | None
     potential: Layers | None
 
@@ -46,7 +46,7 @@ class ResidualConfiguration(NamedTuple):
     torque: Tensor  # dV/dq of splines and harmonics, each of one joint, (..., n) [Nm, N]
     friction: Tensor  # factor by which the friction of each joint is multiplied, (..., n)
     mass: Tensor  # R(q), the residual term of M, (..., n, n)
-    slope: Tensor | None  # d tanh(y) / dy for the outputs y of R's network, (..., functions)
+    slope: Tensor | None  # d tanh(y) / dy for the outputs y of the network of R, (..., functions)
     intermediates: Intermediates  # intermediate values of R's network, for derivatives
     parameters: ResidualParameters
 
@@ -62,9 +62,10 @@ class ResidualTerms(nn.Module):
     sum of splines in the joint's position. The splines fall to zero within three knot spacings beyond the
     range.
 
-    Mass: R is ``entries(*functions, *constants)``, with ``entries`` a function in the emitted module. A
-    function is a bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a
-    trained parameter. The ``bounds`` make armature + R positive definite for all q and all parameters.
+    Mass: R is linear in learned functions of q and in trained constants: ``entries(*functions, *constants)``,
+    where ``entries`` places them in the matrix according to the structure of the arm's M. A function is a
+    bound times the tanh of an output of ``network``; a constant is a bound times the tanh of a trained
+    parameter. The ``bounds`` make armature + R positive definite for all q and all parameters.
 
     Potential: ``potential_scale`` [J] times the output of the network ``potential`` is added to V.
 
@@ -102,7 +103,8 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(center + spacing * knots)
         self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
-        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2).
+        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2); the
+        # last two are of the motor if ``gear`` exceeds HARMONICS.
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
         for index, joint in enumerate(joints):
             if joint.gear > HARMONICS:
@@ -115,16 +117,18 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # `inverse`: 1 / |coefficient| of each function and constant in each entry of M, (functions +
-        # constants, n, n). It is 1e30 for a zero coefficient, so that the minimum in `bounds` ignores it.
+        # R is linear in its functions and constants. `inverse`, (functions + constants, n, n): 1 /
+        # |coefficient| of each function and constant in each entry of R, of which `bounds` computes the
+        # minimum. 1e30 for a zero coefficient has no influence on the minimum.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. `part` is the share of each function and constant: 0.9
-        # divided by the largest number of functions and constants in one row of M.
+        # R may reduce the armature by at most 90 %. The terms in a row of R (function or constant, times
+        # its coefficient) have equal parts of this: `part` is 0.9 divided by the largest number of terms
+        # in a row.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the contribution to R of each function and constant of R, (functions + constants, n, n).
+        """Return the parts of R, a term of M, due to its functions and constants, (their number, n, n).
 
         sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
         """
@@ -134,11 +138,15 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). If no function
-        or constant exceeds its bound, A + R is positive definite: it is the sum of A - diag(d) and
-        diag(d) + R, with d = 1 / (row sums of |A^-1|). By diagonal dominance, the first matrix is positive
-        semi-definite, and the second is positive definite if all row sums of |R| / sqrt(d d^T) are less
-        than one.
+        R is the residual term of M, linear in its functions and constants (see the class). A + R is
+        positive definite if no function or constant exceeds its bound: ``part`` (0.9 / largest number of
+        terms in a row of R) times the minimum of sqrt(d_i d_j) / |coefficient in R_ij| over the entries
+        of R, with d = 1 / (row sums of |A^-1|).
+
+        Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
+        dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
+        sqrt(d_i d_j) are less than one. The second matrix, scaled to a unit diagonal, is therefore strictly
+        diagonally dominant.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.
@@ -154,7 +162,8 @@ class ResidualTerms(nn.Module):
     def prepare(self, armature: Tensor) -> ResidualParameters:
         """Return the parameter cache: quantities that depend on trained parameters only.
 
-        armature: rotor inertia on the joint side, (n, n), from which the ``bounds`` are computed.
+        armature: rotor inertia on the joint side, (n, n), for the ``bounds`` of functions and constants
+        in R.
         """
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
@@ -193,9 +202,10 @@ class ResidualTerms(nn.Module):
         return ResidualConfiguration(q, encoded, torque, friction, mass, slope, intermediates, parameters)
 
     def energy(self, cache: ResidualConfiguration) -> Tensor:
-        """Return the sum of the residual terms of V, (...) [J]; cache: configuration cache at q.
+        """Return the sum of the residual terms of the potential energy V, (...) [J].
 
-        The energy of a B-spline is the integral of its torque from the middle of the spline to q.
+        cache: configuration cache at q. The energy of a B-spline is the integral of its torque from the
+        middle of the spline to q.
         """
         distance = self._distances(cache.q)
         size = distance.abs()
@@ -229,7 +239,8 @@ class ResidualTerms(nn.Module):
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
 
-        It is dR/dt qd - ``gradient`` [Nm, N]. cache: configuration cache at q. qd: velocities, (..., n).
+        It is dR/dt qd - ``gradient`` [Nm, N], with the residual term R of M. cache: configuration cache
+        at q. qd: velocities, (..., n).
         """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)
@@ -247,7 +258,9 @@ class ResidualTerms(nn.Module):
     def waves(self, q: Tensor) -> Tensor:
         """Return cos(f q) for all ripple frequencies f of each joint, then sin(f q).
 
-        The shape is (..., n, 2 HARMONICS + 4). A sum of these functions is the torque ripple of a joint.
+        The shape is (..., n, 2 HARMONICS + 4). f is the number of periods per revolution of the joint: 1, 2,
+        ..., HARMONICS + 2. If the gear ratio exceeds HARMONICS, the last two are the gear ratio and twice the
+        gear ratio. A weighted sum of these functions is the torque ripple of a joint.
         """
         phase = q.unsqueeze(-1) * self.frequencies
         return torch.cat([phase.cos(), phase.sin()], dim=-1)

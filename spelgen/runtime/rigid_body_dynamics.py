@@ -17,7 +17,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """Parameter cache of ``RigidBodyDynamics``: quantities that depend on trained parameters only."""
 
-    points: Tensor  # point masses of the bodies in body frames, block diagonal, (4 bodies, 4 bodies)
+    points: Tensor  # point masses: block diagonal matrix of Q of ``BodyChain``, (4 bodies, 4 bodies)
     armature: Tensor  # rotor inertia on the joint side, added to M, (n, n)
     friction: FrictionConstants
     residual: Parameters = None  # parameter cache of the residual terms
@@ -82,8 +82,8 @@ class RigidBodyDynamics(PortHamiltonian):
         self.raw_armature = nn.Parameter(torch.zeros_like(self.actuated))
         # `raw_offset`: offset of the measured torque, in units of typical friction, (n,).
         self.raw_offset = nn.Parameter(torch.zeros_like(self.actuated))
-        # Friction compensation of the drives, in units of typical friction / typical speed. It is a buffer,
-        # not a parameter: training must not change it; a fit to torques sets it.
+        # Coefficient of the drives' friction compensation, in units of typical friction / typical speed.
+        # It is a buffer, not a parameter: training must not change it; a fit to torques sets it.
         self.raw_friction_compensation = nn.Buffer(torch.zeros_like(self.actuated))
         motors = None if motor_speeds is None else torch.stack([vector(row) for row in motor_speeds])
         # `motors` is C, (n, n), which maps joint speeds to motor speeds. `loads` is C^-1, whose transpose
@@ -129,11 +129,11 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Coefficient k of a torque k qd that drives add to the measured torque, (n,) [Nm s/rad, N s/m]."""
+        """Coefficient k, (n,) [Nm s/rad, N s/m]: drives add the torque k qd to the measured torque."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
-        """Return the parameter cache: point masses, armature and friction constants.
+        """Return the parameter cache: point masses (see ``BodyChain``), armature and friction constants.
 
         It depends on the trained parameters only, and is valid until a parameter changes.
         """

@@ -62,8 +62,8 @@ class Link(NamedTuple):
     inertia: Tensor6  # inertia tensor about the center of mass, in the joint frame [kg m^2]
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
-    offset: float = 0.0  # displacement of the link at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # motion of the link; None: type of `joint`
+    offset: float = 0.0  # displacement about or along the joint axis at q = 0 [rad, m]
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of `joint`
 
 
 class Function(NamedTuple):

@@ -49,10 +49,11 @@ UNLESS = {
 
 
 class GaussianPrior(Group):
-    """Standard deviations of the Gaussian prior of rigid-body and friction parameters, about their initial values.
+    """Standard deviations of the Gaussian prior of rigid-body and friction parameters about their initial values.
 
-    The parameters are logarithms or fractions without unit. The fit estimates the standard deviations of bodies,
-    armature and offset; the values here are their initial values.
+    The parameters are logarithms or fractions without unit. Typical friction is 2 % of a joint's effort limit, and the
+    typical speed is the velocity limit, if the URDF has these limits. The fit estimates the standard deviations of
+    bodies, armature and offset; the values here are their initial values.
 
     Attributes:
         bodies: Log-Cholesky parameters of the inertias; 0.1 is about 10 % of the mass and of the radii of gyration.
@@ -62,16 +63,17 @@ class GaussianPrior(Group):
         sizes: Logarithm of the friction coefficients, per joint.
         velocities: Logarithm of the velocity scales of friction, per joint.
         fractions: Logits of the bristle fractions, per joint: the shares of a joint's dry friction that bristles carry.
-        shared_armature: Common factor of the armatures of all joints.
-        shared_sizes: Common factor of one friction effect of all joints.
-        shared_velocities: Common factor of one velocity scale of all joints.
-        shared_fractions: Common factor of one bristle fraction of all joints.
-        shared_friction: Common factor of all friction of all joints.
+        shared_armature: Logarithm of a factor on the armatures of all joints.
+        shared_sizes: Logarithm of a factor on one friction effect, such as viscous friction, of all joints.
+        shared_velocities: Logarithm of a factor on one velocity scale of friction of all joints.
+        shared_fractions: Part of the logit of one bristle fraction that is equal for all joints.
+        shared_friction: Logarithm of a factor on all friction of all joints.
         friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
             logs show any.
-        degrees_of_freedom: Weight of the initial value of an estimated standard deviation, as a number of parameters.
-            The standard deviation of each single body is estimated with the same weight, so that the prior of a body is
-            a Student-t distribution with these degrees of freedom.
+        degrees_of_freedom: No standard deviation, but the weight of the initial value in the estimate of a standard
+            deviation, as a number of parameters. The standard deviation of each single body is estimated with the same
+            weight, so that the prior of its parameters is a Student-t distribution with this number of degrees of
+            freedom.
     """
 
     bodies: Positive = 0.75
@@ -238,8 +240,9 @@ class MomentumFit(OnWindows):
 class Rollout(OnWindows):
     """Fit that minimizes the difference between simulated and measured states in windows of logs.
 
-    The method is Algorithm 1 of SPEL without the PD penalty. There are up to three stages: a torque fit of rigid
-    bodies (see `TorqueFit`), a momentum fit (see `MomentumFit`), and the fit of rollouts, which are simulated windows.
+    The method is Algorithm 1 of SPEL (Wang, Chen and Ding, Sci. Rep. 15:33179, 2025), without its penalty for mass
+    matrices that are not positive definite. There are up to three stages: a torque fit of rigid bodies (see
+    `TorqueFit`), a momentum fit (see `MomentumFit`), and the fit of rollouts, which are simulated windows.
 
     Attributes:
         torque_first: Whether the torque fit is made.
@@ -294,8 +297,8 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        # An option of the caller overrides a setting with which it would not apply: `batch` overrides
-        # `optimizer: lbfgs`.
+        # If an option of the caller has no effect with a setting of the robot, the setting is ignored: with the option
+        # `batch`, `optimizer: lbfgs` is ignored.
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

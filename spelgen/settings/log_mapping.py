@@ -120,15 +120,16 @@ class LogUnits(JointUnits):
 
 
 class JointWords(Group):
-    """Periods or sign bits of the logged values of one joint, in logged units; default: values are plain numbers.
+    """Periods, or sign bits, of the logged signals of one joint, in logged units; default: values are plain numbers.
 
-    A period is the interval after which logged values wrap around.
+    A period is the interval after which logged values wrap around. A sign bit s marks negative numbers in values of
+    sign and magnitude: s + x means -x.
 
     Attributes:
-        q: Position.
-        qd: Velocity.
-        tau: Torque.
-        u: Commanded position.
+        q: Period or sign bit of positions.
+        qd: Period or sign bit of velocities.
+        tau: Period or sign bit of torques.
+        u: Period or sign bit of commanded positions.
     """
 
     q: Positive | None = None
@@ -141,9 +142,9 @@ class JointDelays(Group):
     """Delays of the logged values of one joint relative to the other signals [s]; negative for early values.
 
     Attributes:
-        q: Position.
-        qd: Velocity.
-        tau: Torque, in addition to `torque_delay`.
+        q: Delay of positions.
+        qd: Delay of velocities.
+        tau: Delay of torques, in addition to `torque_delay`.
     """
 
     q: Delay = 0.0
@@ -293,7 +294,11 @@ class LogMapping(Group):
         return self.model_copy(update={"columns": LogColumns(**named)})
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
-        """Return the mapping with other names of columns. columns: {joint: {quantity: name of the column}}."""
+        """Return the mapping with other names of columns.
+
+        columns: {joint: {quantity: name of the column}}; for None, the joint has the column of the mapping's attribute
+        `columns`.
+        """
         joints = dict(self.joints)
         for joint, names in columns.items():
             logged = self.joint(joint)
@@ -308,7 +313,8 @@ class LogMapping(Group):
         changed = dict(self.joints)
         for joint in joints:
             logged = self.joint(joint)
-            # A period that the mapping contains may be longer than a turn: the range of a register with several turns.
+            # A period that the mapping contains is kept, because it may be longer than a turn: the range of a register
+            # that counts several turns.
             unstated = [x for x in ("q", "u") if not self.word("period", x, joint)]
             turns = {x: 2 * pi / abs(self.scale(x, joint)) for x in unstated}
             period = logged.period.model_copy(update=turns)
@@ -318,18 +324,20 @@ class LogMapping(Group):
     def in_si(self) -> LogMapping:
         """Return the mapping for the same signals in a file with SI units and default names of columns.
 
-        `input` and `accept` are unchanged. The positions of a joint with a period have the period of one turn.
+        `input` and `accept` are unchanged. For joints whose logged positions wrap around after a period, the period of
+        positions becomes one turn, 2 pi rad.
         """
-        # A file that spelgen writes may also contain positions that wrap around after one turn. Joints with a period of
-        # positions therefore have a period in the new mapping.
+        # If the positions of a joint wrap around in the log, the positions in a file that spelgen writes may wrap
+        # around after one turn. For each joint with a period of positions, the new mapping therefore has a period of
+        # one turn.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
     def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
         """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
 
-        At a period logged values wrap. Both are in the unit of the log. key: name of the setting. quantity: "q", "qd",
-        "tau" or "u".
+        The result is in the unit of the log. key: name of the setting; a period is the interval after which logged
+        values wrap around. quantity: "q", "qd", "tau" or "u".
         """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size

@@ -107,7 +107,8 @@ class Unusable:
 
     def __getattr__(self, name: str) -> NoReturn:
         # Attributes with double underscores raise AttributeError, because copy and pickle search for some of them. The
-        # attributes `__pydantic...` raise the errors of the group, because pydantic reads the values through them.
+        # attributes `__pydantic...` are exceptions: pydantic reads the values of a group through these, so that the
+        # errors of the group must be raised.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)
@@ -160,7 +161,8 @@ class Settings(Group):
         # `tip` and `moving_joints` both determine the last joint, and could contradict each other.
         if self.tip is not None and self.moving_joints is not None:
             raise ValueError("'tip' or 'moving_joints', not both")
-        # Motor torques and couplings are settings of logged torques, and logs of position servos have no torques.
+        # `torque: motor` and couplings describe logged torques. Logs of position servos have none, so that one of the
+        # settings must be wrong.
         if self.input == "position" and (self.torque == "motor" or self.couplings):
             raise ValueError("'input: position' or 'torque: motor' and couplings, not both")
         # A joint in two couplings would be driven by two different sets of motors.
@@ -174,7 +176,7 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Warnings: one per error in a group of keys that only one step uses, such as `training`."""
+        """Warnings, and not errors: one per error in a group of keys that only one step uses, such as `training`."""
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)
@@ -192,8 +194,9 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
         joints: Names of all joints in the URDF; settings of any other joint are errors. None: names are not checked.
 
     Raises:
-        SettingsError, SpelgenErrors: One or several errors, with file, line and key. The errors of a group in
-            ``OF_A_STEP`` are raised when an attribute of the group is read.
+        SettingsError, SpelgenErrors: One or several errors, with file, line and key. The errors of a group that only
+            one step uses (``OF_A_STEP``), such as `training`, are raised when an attribute of the group is read, so
+            that other steps can run.
     """
     path = Path(urdf_path).with_suffix(".yaml")
     if not path.exists():
@@ -213,8 +216,8 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             break
         except SpelgenError as error:
             errors = error.errors if isinstance(error, SpelgenErrors) else (error,)
-        # If only one step uses a group of keys that has errors, a placeholder replaces the group, so that other steps
-        # can run.
+        # If only one step, such as training, uses a group of keys that has errors, a placeholder replaces the group, so
+        # that other steps can run.
         for each in errors:
             group = (each.element or "").partition(".")[0]
             if group not in OF_A_STEP:

@@ -83,7 +83,7 @@ class TrackingSettings(Group):
         control: "pid": one independent controller per joint; "computed-torque": with the dynamics of the arm, for arms
             that PID control cannot support.
         bandwidths: Bandwidths of the controllers of successive trajectories, repeated cyclically [Hz].
-        control_rate: Rate of the controllers, of which `simulation.sample_rate` is a multiple [Hz].
+        control_rate: Rate of the controllers; `simulation.sample_rate` must be an integer multiple of this rate [Hz].
         resolution: Resolution of the encoders [rad, m].
         cutoff: Cutoff frequency of the zero-phase low-pass filter on the measured positions [Hz].
     """

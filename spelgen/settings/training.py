@@ -65,7 +65,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the settings that are not None and are options of a fit with any objective."""
+        """{name: value} of the settings that are not None and are options of a fit, of at least one objective."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property
@@ -80,9 +80,10 @@ class PublishedFigures(Group):
     Attributes:
         parameters: Number of trained parameters.
         step_seconds: Duration of a training step on the authors' machine [s].
-        train_loss: Squared error of predicted training windows, summed over the joints.
-        test_loss: Squared error of predicted test windows, summed over the joints.
-        prediction_loss: Squared error of long predictions, summed over the joints.
+        train_loss: Mean squared errors of q and of qd in predicted training windows, summed over the joints, in rad, m
+            and s.
+        test_loss: Error as in `train_loss`, for predicted test windows.
+        prediction_loss: Error as in `train_loss`, for predictions over 1 s.
         velocity: Mean squared error of the velocity over 1 s, summed over the joints.
         position: Mean squared error of the position over 1 s, summed over the joints.
     """
@@ -108,7 +109,7 @@ class ComparisonSettings(Group):
         seeds: Number of runs of each preset.
         width: Units per hidden layer.
         depth: Number of hidden layers.
-        published: Published figures, by preset.
+        published: Errors and sizes of the presets in a publication about this robot, by name of the preset.
     """
 
     first: Positive | None = None

@@ -66,7 +66,7 @@ class YamlDocument:
 
 
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
-    """Return two nodes of an entry of a YAML mapping or list: the node whose line errors report, and its value.
+    """Return two nodes of an entry of a YAML mapping or list: the node whose line is reported in errors, and its value.
 
     The first node is the key of an entry of a mapping; an item of a list is returned twice. The result is None if the
     entry does not exist. key: key in a mapping, or index in a list.

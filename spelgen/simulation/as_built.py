@@ -38,13 +38,13 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    # The dynamics are computed only to raise the error for links without inertials: here it names the user's URDF, and
-    # no file is written.
+    # The dynamics are computed only to raise the error for links without inertials: at this point, the error names the
+    # user's URDF, and no file has been written.
     arm_dynamics(arm.chain, arm.settings)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
-    # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the
-    # arm is first written and read without drives.
+    # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the arm
+    # is written and read twice: first without drives, for these scales, then with drives.
     bodies = _with_settings(path, settings, arm)
     settings["joints"] = _drives(arm, bodies, np.random.default_rng([seed, 1]))
     return _with_settings(path, settings, arm)
@@ -53,7 +53,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
     """Write `settings` next to the URDF `path`; return the arm that is loaded from both files.
 
-    Angles of the URDF are rounded with the same tolerance as the angles of ``arm``.
+    As for ``arm``, angles of the URDF within its angle tolerance of a multiple of pi/2 are rounded to the multiple.
     """
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
@@ -69,8 +69,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Arms with position servos or passive joints cannot be simulated along prescribed paths, as all other arms are.
-    # They keep the protocol of their settings.
+    # Arms with position servos or passive joints cannot be simulated along prescribed paths, and keep the protocol of
+    # their settings. All other arms are simulated along prescribed paths.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings
@@ -95,8 +95,9 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
 def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[str, object]]:
     """Return {name of a joint: settings} with random friction and armature.
 
-    Coulomb friction is a random fraction of the typical rigid-body torque of the joint or, if this is smaller, of half
-    the effort limit. Armature is a random fraction of the mean of the joint's diagonal entry of M.
+    Coulomb friction is a random fraction of the smaller one of two torques: the typical rigid-body torque of the joint,
+    and half of the joint's effort limit. Armature is a random fraction of the joint's diagonal entry of M, averaged
+    over positions.
 
     Args:
         arm: Nominal arm, whose gear ratios and servo gains are kept.
@@ -160,8 +161,7 @@ def urdf_without(robot: Path, *tags: str) -> etree._Element:
     """Return the root element of a URDF or xacro file, without comments and without the elements named in `tags`."""
     root = read_document(robot).root
     etree.strip_tags(root, etree.Comment)
-    for element in list(root.iter(*tags)):
-        element.getparent().remove(element)
+    etree.strip_elements(root, *tags)
     return root
 
 

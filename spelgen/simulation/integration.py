@@ -37,29 +37,27 @@ def rollout(
         tolerance_factor: Factor of the default relative and absolute tolerances.
     """
     n = tau.shape[1]
-    tolerances = {"rtol": TUNING.rtol * tolerance_factor, "atol": TUNING.atol * tolerance_factor}
+
+    def derivative(_: float, state: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the derivative of the state (q, qd), (2 n,), under a constant torque (n,) [Nm, N]."""
+        qd = state[n:]
+        return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque)])
+
+    rtol, atol = TUNING.rtol * tolerance_factor, TUNING.atol * tolerance_factor
+    options = {"rtol": rtol, "atol": atol, "tfirst": True, "mxstep": TUNING.most_steps}
     states = np.empty((t.size, 2 * n))
     states[0] = initial
     # LSODA is a multistep method: it extrapolates from past derivatives, which are invalid after a jump of tau.
     # Therefore LSODA is restarted at each jump.
     changes = np.flatnonzero((tau[1:-1] != tau[:-2]).any(axis=1)) + 1
     for first, last in pairwise([0, *changes.tolist(), t.size - 1]):
-        torque = tau[first]
-
-        def derivative(_: float, state: np.ndarray, torque: np.ndarray = torque) -> np.ndarray:
-            """Return the derivative of the state (q, qd), (2 n,), under a constant torque (n,) [Nm, N]."""
-            qd = state[n:]
-            return np.concatenate([qd, dynamics.forward_dynamics(state[:n], qd, torque)])
-
-        if not np.isfinite(derivative(0.0, states[first])).all():
+        if not np.isfinite(derivative(0.0, states[first], tau[first])).all():
             raise _stuck(t[first], "an acceleration is not finite")
         span = slice(first, last + 1)
         with warnings.catch_warnings():
             warnings.simplefilter("error", ODEintWarning)
             try:
-                states[span] = odeint(
-                    derivative, states[first], t[span], tfirst=True, mxstep=TUNING.most_steps, **tolerances
-                )
+                states[span] = odeint(derivative, states[first], t[span], (tau[first],), **options)
             except ODEintWarning as warning:
                 raise _stuck(t[first], str(warning).split(" (")[0].lower()) from warning
         if not np.isfinite(states[last]).all():
@@ -68,6 +66,6 @@ def rollout(
 
 
 def _stuck(t: float, failure: str) -> RunError:
-    """Return the error for an integration that failed at time t [s]."""
+    """Return the error for an integration that failed at time t [s]. failure: reason of the failure."""
     cure = "check the inertials; make simulation.duration smaller or simulation.coulomb_smoothing_velocity larger"
     return RunError(f"the motion cannot be integrated beyond t = {t:g} s: {failure}", do=cure)

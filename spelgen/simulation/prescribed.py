@@ -131,4 +131,4 @@ def friction_along(friction: DriveFriction, arm: Chain, motion: Motion, preslidi
     breakaway = scale[:, None] * elements
     # deflection: (T, n, K) [rad, m] of the K elements of each joint
     deflection = bristles_along(motion.q, BristleReach(breakaway, friction.speeds))
-    return friction.torque(motion.qd, (deflection / breakaway).mean(axis=-1))
+    return friction(motion.qd, (deflection / breakaway).mean(axis=-1))

@@ -101,18 +101,17 @@ def paths(arm: Chain, settings: Settings, t: np.ndarray) -> list[Motion]:
     low, high = initial_range(arm, settings)
     if settings.tracking.paths == "excitation":
         # The motion uses only the middle part of each range and a moderate speed, as one does with an unknown arm.
-        middle, half = (low + high) / 2, SIMULATION.used_range * (high - low) / 2
         speeds = [
             min(SIMULATION.used_range * (x.velocity or np.inf), SPEEDS[x.joint_type]) for x in arm.coordinates
         ]
-        bounds = MotionBounds(middle - half, middle + half, np.array(speeds))
+        bounds = MotionBounds(low, high, np.array(speeds)).narrowed(SIMULATION.used_range)
         motions = ExcitationTrajectory(float(t[-1]), EXCITATION.min_harmonics, bounds)
         return [motions.motion(random.standard_normal(motions.size), t) for random in randoms]
     middle, amplitude = (low + high) / 2, _amplitude(arm, settings, low, high)
     drawn = [random.uniform(0, 2 * np.pi, len(middle)) for random in randoms]
     if settings.tracking.paths == "same":
-        # The phases of all joints differ by a constant from the phases of the first trajectory, so all trajectories
-        # follow the same path from different starting points.
+        # All joints have the same frequency. A constant that is added to the phases of all joints is therefore a shift
+        # in time: all trajectories follow the same path from different starting points.
         drawn = [drawn[0] + 2 * np.pi * number / count for number in range(count)]
     return [sines(middle, amplitude, settings.tracking.frequency, phase, t) for phase in drawn]
 

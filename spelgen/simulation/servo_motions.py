@@ -77,8 +77,9 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
-    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). The
-    # half with the velocity after the step is unknown: it is added to the mass matrix.
+    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). For
+    # the damping D and a step of length h, its term with the unknown change dv of the velocity is h D dv / 2, so that h
+    # D / 2 is added to the mass matrix.
     damping = np.diag(h / 2 * (kd + friction.viscous))
     impulses = -h * np.stack([friction.forward, friction.backward])
     q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)

@@ -46,10 +46,12 @@ def track(
 ) -> SimulatedLogs:
     """Return logs of the arm under feedback control along paths.
 
-    Each recording has its own gains, and its own phases or initial position. The last `test_fraction` of each recording
-    is for testing. A log contains encoder positions after a zero-phase low-pass filter, velocities by central
-    differences of the filtered positions, and motor torques. Raises ArmError without inertials, SettingsError for a
-    joint without a range, and RunError if the motion cannot be integrated.
+    Each recording has the controller gains for the next bandwidth in `tracking.bandwidths`. Depending on
+    `tracking.paths`, each recording has its own random path, its own phases of the sines, or its own first point on a
+    common path. The last `test_fraction` of each recording is for testing. A log contains encoder positions after a
+    zero-phase low-pass filter, velocities by central differences of the filtered positions, and motor torques. Raises
+    ArmError without inertials, SettingsError for a joint without a range, and RunError if the motion cannot be
+    integrated.
 
     Args:
         arm: The arm.
@@ -97,8 +99,9 @@ def record(
 
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
-    with the position error e = q* - q. At a joint with viscous > M_jj omega, where friction would slow the decay of e
-    down, the torque viscous omega e is added.
+    with the position error e = q* - q, and h: Coriolis, centrifugal and gravity torques. Friction is compensated at the
+    desired velocity only, so the viscous friction D e' of a joint remains as additional damping. If D > M_jj omega, it
+    would dominate and slow the decay of e down: the torque D omega e is added, which gives the time constant 1 / omega.
 
     Args:
         dynamics: The arm, with friction.

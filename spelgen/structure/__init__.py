@@ -1,1 +1,1 @@
-"""Structure of an arm, derived exactly: zero, constant and varying entries of M, joints of V, minimal form of M."""
+"""Structure of an arm, derived exactly: zero, constant, varying entries of M, its minimal form, joints affecting V."""

@@ -45,7 +45,7 @@ class BaseParameter:
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
     """Return the number of base parameters, which is the rank of the energy regressor over random positions."""
-    points = 7  # Seven random positions determine the rank for most arms of at most seven joints.
+    points = 7  # Enough random positions for most arms of at most seven joints; the loop doubles them.
     while True:
         rows = regressor_rows(arm, points + 2)
         rank = field.rank(rows)
@@ -107,8 +107,8 @@ def _reduced_rows(arm: Chain, order: list[int]) -> list[list[fmpq]]:
 def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
     """Return the energy regressor at a random configuration: (n(n+1)/2 + 1, 10 B) for n joints and B bodies.
 
-    A row has the coefficients of the inertial parameters in an entry of M; the last row, in V. The elements are
-    rational numbers of FLINT (fmpq).
+    A row has the coefficients of the inertial parameters in an entry of M; the last row, in the potential energy V. The
+    elements are rational numbers of FLINT (fmpq).
     """
     parameters = 10 * len(arm.bodies)
     positions = []

@@ -1,11 +1,14 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-A_k and B_j are constant matrices, c_k constants and f_j functions of q. U is the span of all changes M(q) - M(q'), and
-W the span of all M(q). A linear functional of M is a weighted sum of the entries of M. It depends only on the joints in
-a set J if and only if it vanishes on all changes of M caused by joints outside J. The functions f_j are functionals
-of M. They are selected greedily: sets of joints close to the tip first, small sets before large ones, single entries of
-M before sums of entries. The sets of linearly independent functionals form a matroid, for which the greedy selection is
-optimal.
+A_k and B_j are constant matrices, c_k constants and f_j functions of q. Each f_j is a linear functional of M: a
+weighted sum of the entries of M. A functional depends only on the joints in a set J if and only if it vanishes on all
+changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
+all changes.
+
+The f_j are selected greedily. The sets J are sorted in two steps. The first criterion is their joint closest to the
+root: sets with only joints at the tip are tried first. The second criterion is their size, small sets first. For each
+set, single entries of M are tried before sums of entries. The sets of functionals that are linearly independent on U
+form a matroid, for which the greedy selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -65,7 +68,7 @@ class _Functional(NamedTuple):
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     """Return the minimal exact form of M: its varying terms f_j(q) B_j (outputs), and its constant terms c_k A_k.
 
-    spans: samples of M and of its changes.
+    The symbols are defined in the docstring of the module. spans: samples of M and of its changes with q.
     """
     functionals = list(_functionals(spans))
     entries = len(spans.keys)
@@ -73,7 +76,7 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     values = np.array([r.values for r in functionals]).reshape(-1, entries)
     # The rows of R, (m, entries), are the coefficients of the functionals f_j; the rows of U, (m, entries), are a basis
     # of the changes of M. The matrices B_j are the rows of B = (U R^T)^-1 U. Then R B^T is the identity: the functional
-    # f_j has the value 1 for B_j, and 0 for all other matrices.
+    # f_j has the value 1 for B_j, and 0 for each B_i with i other than j.
     basis = field.product(field.inverse(field.product(spans.varying, weights.T)), spans.varying)
     changes = spans.float_changes(frozenset(range(spans.n)))
     basis_values = _solved(changes @ values.T, changes)
@@ -81,12 +84,13 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` and
-    # `constant_values`, (S, entries), are samples of this difference.
+    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` (prime
+    # field) and `constant_values` (double precision), (S, entries), are samples of this difference.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
-    # The entry of M at each pivot of the row reduction defines a constant c_k. Row reduction places pivots in the first
-    # possible columns, so the entries of M are sorted: entries that depend on the smallest number of joints are first.
+    # Row reduction of these samples gives the A_k; the entry of M at the pivot of row k defines the constant c_k.
+    # Entries that depend on few joints give short formulas for c_k. Such entries are sorted first, since row reduction
+    # places pivots in the first possible columns.
     order = sorted(range(entries), key=lambda index: (len(spans.entry_joints[index]), -index))
     echelon = field.row_basis(constant[:, order])
     bound = [order[pivot] for pivot in field.pivots(echelon)]
@@ -95,8 +99,8 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     solutions = _solved(constant_values[:, bound], constant_values)
     constants = []
     for pivot, row, row_values in zip(bound, rows, solutions, strict=True):
-        # The constant c_k is the entry of M at the pivot minus the contribution of the varying terms f_j B_j to this
-        # entry.
+        # At the pivot of row k, A_k has the entry 1 and all other A are zero: c_k is the entry of M at the pivot minus
+        # the contribution of the varying terms f_j B_j.
         exact, approximate = _single(spans, pivot)
         for j, output in enumerate(functionals):
             coefficient = int(basis[j, pivot])
@@ -110,22 +114,26 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield the functions f_j: linearly independent functionals of M that together determine every change of M."""
+    """Yield the functions f_j of the module, as independent functionals of M that determine every change of M with q.
+
+    spans: samples of M and the spans of its changes.
+    """
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
     tried: set[int] = set()
     for joints in _joint_sets(spans):
         outside = spans.outside(joints)
         kernel = field.null_space(outside)[:, np.argsort(spans.order)]
         bound = [spans.order[pivot] for pivot in field.pivots(outside)]
-        # `missing`: number of functionals that depend on `joints` only and are independent of the chosen functionals.
+        # `missing`: number of functionals still to be chosen for the set `joints`: functionals that depend on these
+        # joints only and are independent of the chosen ones.
         on_changes = field.product(kernel, spans.varying.T)
         missing = field.rank(np.concatenate([chosen, on_changes])) - len(chosen)
         candidates = _candidates(spans, joints, kernel, bound, tried)
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # Each row of `rows` is a functional, represented by its values for a basis of U, the span of all changes of
-            # M. Functionals that differ by a constant have equal rows.
+            # Each row of `rows` is a functional, represented by its values for the basis `spans.varying` of all changes
+            # of M. Functionals whose difference does not depend on q have equal rows.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transpose of `rows` are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -162,9 +170,10 @@ def _candidates(
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the functionals may depend on.
-        kernel: basis of the m functionals that vanish on all changes of M caused by other joints, (m, entries).
-        bound: indices of the entries of M at the pivots of an echelon basis of these changes. Outside of `bound`, a row
-            of `kernel` has a single nonzero element, which is 1.
+        kernel: (m, entries), coefficients of a basis of the functionals that vanish on all changes of M caused by other
+            joints. Each row has the coefficient 1 for one entry of M that is not in `bound`; its other nonzero
+            coefficients belong to entries in `bound`.
+        bound: indices of the entries of M that are pivots of an echelon basis of these changes.
         tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """
@@ -179,7 +188,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # `entry` is the only entry of M outside `bound` at which the row of `kernel` is not zero; it is 1 there.
+        # The functional `row` is M at `entry`, the only entry outside `bound`, minus a combination of the entries in
+        # `bound`, which changes like M at `entry` if joints outside `joints` move. `coefficients` are the coefficients
+        # of this combination in double precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -191,7 +202,7 @@ def _candidates(
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
 
-    They are elements of the prime field, and the same in double precision.
+    The first array has elements of the prime field, the second one the same numbers in double precision.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1
@@ -208,9 +219,10 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a lower triangle, with their rows and columns, as rational numbers.
+    """Return the nonzero elements of a symmetric matrix's lower triangle, with row and column, as rational numbers.
 
-    exact, values: the elements of the lower triangle, (entries,), in the prime field and in double precision.
+    spans: its `keys` are the rows and columns of the elements. exact, values: the elements, (entries,), in the prime
+    field and in double precision.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
@@ -235,8 +247,8 @@ def _fraction(element: int, value: float) -> Fraction:
     numerator, denominator = current
     if denominator and gcd(numerator, denominator) == 1:
         candidate = Fraction(numerator, denominator)
-        # Such a fraction exists for any element modulo PRIME. It is the represented number only if it is also close to
-        # `value`; otherwise the number has no short fraction.
+        # For any element, the algorithm finds a fraction that equals the element modulo PRIME. The fraction is the
+        # represented number only if it is also close to `value`; otherwise the number has no short fraction.
         if abs(candidate - Fraction(value)) <= 1e-8 * max(1.0, abs(value)):
             return candidate
     return Fraction(value)

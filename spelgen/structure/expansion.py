@@ -1,10 +1,10 @@
 """Entries of M, and V, as exact polynomials in the sines, cosines and positions of the joints.
 
-The recursion of ``structure.recursion`` for M and V runs once and records its operations (lazy evaluation). The
-operations of an entry are then executed with one inertial parameter set to 1 and all others to 0: the result is the
-polynomial that is the coefficient of this inertial parameter in the entry. Only requested entries are expanded, memory
-is limited to the polynomials of one inertial parameter, and an expansion is stopped before it exceeds its budget of
-multiplications.
+The recursion of ``structure.recursion`` for M and V runs once and records its additions and multiplications, without
+executing them: each entry of M, and V, becomes a tree of operations. M and V are linear in the inertial parameters. If
+the tree of an entry is executed with one inertial parameter set to 1 and all others to 0, the result is therefore the
+coefficient of this parameter in the entry: a polynomial. Only requested entries are expanded, memory is limited to the
+polynomials of one inertial parameter, and an expansion is stopped before it exceeds its budget of multiplications.
 """
 
 from __future__ import annotations
@@ -63,13 +63,14 @@ class Deferred:
 
 
 class TooLarge(Exception):
-    """Error: the polynomial of an entry needs more multiplications of polynomial terms than the budget allows."""
+    """Error: the polynomial of V or of an entry of M needs more multiplications of terms than `Expansion` permits."""
 
 
 class Expansion:
     """M and V of ``arm`` as recorded operations, from which polynomials in s1, c1, q1, s2, ... are computed.
 
-    s, c and q with a number are sine, cosine and position of the coordinate with this number, from 1 (``Position``).
+    M is the mass matrix, V the potential energy; an operation is recorded as a `Deferred`. s, c and q with a number are
+    sine, cosine and position of the coordinate with this number, from 1 (``Position``).
 
     Args:
         arm: the arm.
@@ -98,12 +99,12 @@ class Expansion:
         )
 
     def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
-        """Return the coefficient of an inertial parameter in an entry of M or in V, as a polynomial.
+        """Return the coefficient of an inertial parameter in an entry of M or the potential energy V, as a polynomial.
 
         The variables of the polynomial are cosines, sines and lengths that depend on the joint positions.
 
         Args:
-            element: the entry as a tree of recorded operations, from ``energies``.
+            element: the entry as a tree of recorded operations, from ``energies``, or the integer 0 for a zero entry.
             parameter: index of the inertial parameter, 10 body + i.
 
         Raises:
@@ -135,8 +136,8 @@ class Expansion:
         if action == "add":
             return x + y
         # The cost of a multiplication is the number of products of two polynomial terms: FLINT computes all of them
-        # before it collects like terms. A factor that is an integer is the value of an inertial parameter, 0 or 1: a
-        # product with 0 costs nothing.
+        # before it collects like terms. A product with 0 costs nothing; all inertial parameters except for one have the
+        # value 0.
         cost = 1
         for factor in (x, y):
             if isinstance(factor, fmpq_mpoly):

@@ -68,7 +68,7 @@ def random_residues(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndar
 
 
 def random_circle_points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random field elements c and s, (count,) each, with c^2 + s^2 = 1: cosines and sines of random angles."""
+    """Return random elements c, s of the prime field, (count,) each, with c^2 + s^2 = 1, as cosines and sines."""
     cosines, sines = [], []
     for t in random_residues(rng, (count,)).tolist():
         # t is the tangent of half the angle. 1 + t^2 is never 0: -1 has no square root modulo a prime of the form

@@ -5,8 +5,8 @@ a model, not its structure. If the inertials of a URDF are absent or physically 
 used.
 
 The ten inertial parameters of a body are mass m, first moment h and inertia I. They are physically consistent, that is,
-belong to a distribution of mass, if and only if the pseudo-inertia J = [[S, h], [h^T, m]] with S = tr(I)/2 1 - I is
-positive definite (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
+belong to a distribution of mass, if and only if the pseudo-inertia J = [[S, h], [h^T, m]] is positive definite. S =
+tr(I)/2 E - I, with the identity matrix E (Wensing, Kim and Slotine, IEEE RA-L 3:60, 2018).
 """
 
 from collections.abc import Sequence
@@ -30,15 +30,16 @@ class Nominal:
     rounded to six digits for reproducibility across machines.
 
     Attributes:
-        output_means: mean of each varying term of M (output of the structure).
-        output_scales: standard deviation of each varying term, with a lower bound.
-        constants: value of each constant of M.
+        output_means: mean of the function f_j(q) of each varying term of M (see `structure.basis`).
+        output_scales: standard deviation of each f_j(q), with a lower bound.
+        constants: value of each constant c_k of M.
         constant_scales: magnitude of each constant, with a lower bound.
         potential_scale: standard deviation of V [J].
         joint_torque: typical torque of each coordinate [Nm, N]: sqrt(g^2 + a^2) with the root mean squares g of the
             gravity torque and a of the torque for unit acceleration.
-        mass_sensitivities: change of M with each coordinate, divided by the largest such change of all coordinates.
-        potential_sensitivities: change of V with each coordinate, divided by the largest such change.
+        mass_sensitivities: root mean square change of M if only this coordinate changes (`_mass_changes`), divided by
+            the largest value of all coordinates; at least 0.02.
+        potential_sensitivities: root mean square of dV/dq, normalised in the same way.
     """
 
     output_means: tuple[float, ...]
@@ -56,7 +57,7 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return typical values of M, V and torques of ``arm``, for the terms of M in its ``structure``."""
+    """Return typical values of the terms of M in the ``structure`` of ``arm``, of its potential energy and torques."""
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -98,7 +99,7 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return the coefficients with which the functions of m terms are computed from M, (m, n(n+1)/2).
+    """Return the coefficients of m terms' functions f as linear functionals of M (`Term.functional`), (m, n(n+1)/2).
 
     The columns are the entries of the lower triangle of M, row after row.
     """
@@ -119,12 +120,15 @@ def _gives_usable_mass(arm: Chain, q: np.ndarray) -> bool:
 
 
 def nominal_inertias(arm: Chain, from_urdf: bool) -> list[list[float]]:
-    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body."""
+    """Return the result of `exact_inertias` as floats: the ten inertial parameters of each body.
+
+    from_urdf: True: values of the URDF; False: default bodies of 1 kg.
+    """
     return [list(map(float, ten)) for ten in exact_inertias(arm, from_urdf)]
 
 
 def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | float]]:
-    """Return the ten inertial parameters (m, h, I) of each body about the origin of its joint frame.
+    """Return the mass, first moment and inertia (10 numbers) of each body, about the origin of its joint frame.
 
     from_urdf: True: exact values of the URDF; False: default bodies of 1 kg.
     """
@@ -134,10 +138,11 @@ def exact_inertias(arm: Chain, from_urdf: bool) -> Sequence[Sequence[Fraction | 
 
 
 def _default_inertia(arm: Chain, index: int) -> list[float]:
-    """Return the ten inertial parameters (m, h, I) of a default body: a sphere of 1 kg, with 0.1 m radius of gyration.
+    """Return the inertial parameters of a default body: a sphere of 1 kg, with 0.1 m radius of gyration.
 
-    They are about the origin of the body's joint frame. The centre of the sphere is half-way to the next joint. For the
-    last body, or if the next joint is closer than 0.2 m, the centre is at (0.1, 0, 0.1) m in the joint frame.
+    They are mass, first moment and inertia about the origin of the joint frame of body ``index``. The centre of the
+    sphere is half-way to the next joint. For the last body, or if the next joint is closer than 0.2 m, the centre is at
+    (0.1, 0, 0.1) m in the joint frame.
     """
     gyration = 0.1  # [m] radius of gyration of a default body
     center = np.zeros(3)
@@ -171,7 +176,8 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
     """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
-    # [rad, m] Step of the central differences for dV/dq. Its relative error of 1e-8 is small enough for scales.
+    # [rad, m] Step of the central differences for dV/dq. The derivative has a relative error of 1e-8, which is small
+    # enough for scales.
     step = 1e-4
     shifts = step * np.eye(q.shape[1])[:, None]
     _, forward = float_energies(arm, q + shifts, inertias)
@@ -185,8 +191,9 @@ def _mass_changes(
 ) -> np.ndarray:
     """Return, for each coordinate, the root mean square change of M if only this coordinate changes, (n,).
 
-    In each sample, the coordinate is replaced by its value in the preceding sample. The change of an entry of M is
-    divided by the typical magnitude of the entry, so that it has no unit. The mean is over samples and entries.
+    The coordinate changes from one random value to another: to its value in the preceding sample. The change of an
+    entry of M is divided by the typical magnitude of the entry, so that it has no unit. The mean is over samples and
+    entries.
 
     Args:
         arm: the arm.
@@ -204,7 +211,7 @@ def _mass_changes(
 
 
 def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
-    """Return the magnitudes of all coordinates, (n,), divided by the largest magnitude, and at least 0.02.
+    """Return the magnitudes of the effects of all coordinates on M or V, (n,), divided by the largest, at least 0.02.
 
     The results are factors of the inputs of networks; with the lower bound, every joint is an input.
     """
@@ -239,7 +246,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     rows, columns = np.triu_indices(3)
     tensor[..., rows, columns] = tensor[..., columns, rows] = values[..., 4:]
     pseudo = np.zeros((*values.shape[:-1], 4, 4))
-    # The inertia tensor is I = tr(S) 1 - S for second moments of mass S. Solved for S, this is S = tr(I)/2 1 - I.
+    # The inertia tensor is I = tr(S) E - S for second moments of mass S and the identity E: hence S = tr(I)/2 E - I.
     pseudo[..., :3, :3] = _trace(tensor) / 2 * np.eye(3) - tensor
     pseudo[..., :3, 3] = pseudo[..., 3, :3] = values[..., 1:4]
     pseudo[..., 3, 3] = values[..., 0]
@@ -274,9 +281,9 @@ def reference_factor(parameters: np.ndarray) -> tuple[np.ndarray, bool]:
     """
     pseudo = pseudo_inertia(parameters)
     values, vectors = np.linalg.eigh(pseudo)
-    # [1] `fraction` is the smallest eigenvalue of an inconsistent J after its correction, divided by the largest one.
-    # The test of consistency has the lower bound fraction^2, because a slender body has a small eigenvalue and is
-    # consistent.
+    # [1] An inconsistent pseudo-inertia J is corrected: its smallest eigenvalue becomes `fraction` times the largest
+    # one. J counts as inconsistent only if the ratio of these eigenvalues is below fraction^2: the ratio of a slender
+    # body may be below `fraction`, although the body is consistent.
     fraction = 1e-4
     min_eigenvalue = fraction * values[-1]
     is_consistent = bool(values[0] > min_eigenvalue * fraction)

@@ -90,7 +90,7 @@ def energies(
     Args:
         arm: the arm.
         positions: position of each coordinate.
-        inertias: ten inertial parameters (m, h, I) of each body, in the order of ``Body.inertia``.
+        inertias: mass, first moment and inertia (10 numbers) of each body, in the order of ``Body.inertia``.
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
     """
     transforms = _joint_transforms(arm, positions, number)
@@ -129,10 +129,11 @@ def energies(
 def coefficients(
     arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
-    """Return rows of coefficients of the 10 B inertial parameters of B bodies: in each entry of M, and last in V.
+    """Return the coefficients of the 10 B inertial parameters of B bodies in each entry of M, and in V.
 
-    The recursion computes with vectors of 10 B numbers in place of numbers: since M and V are linear in the inertial
-    parameters, an entry for unit vectors as inertial parameters is its row of coefficients.
+    M is the mass matrix, V the potential energy. The recursion computes with vectors of 10 B numbers in place of
+    numbers: since M and V are linear in the inertial parameters, each entry becomes the row of its coefficients if unit
+    vector k replaces the inertial parameter k.
 
     Args:
         arm: the arm.
@@ -173,7 +174,8 @@ def _joint_transforms(arm: Chain, positions: Sequence[Position], number: Number)
 
 def circle_point(angle: float) -> tuple[Fraction, Fraction]:
     """Return rational cosine and sine of an angle [rad] with cos^2 + sin^2 = 1 exactly and an error of 1e-13."""
-    # At multiples of a right angle, cosine and sine are rounded to -1, 0 or 1: tan(angle / 2) has a pole at pi.
+    # tan(angle / 2) has a pole at pi. Cosine and sine of all multiples of a right angle are therefore rounded, to -1, 0
+    # or 1.
     if abs(cos(angle)) < 1e-12 or abs(sin(angle)) < 1e-12:
         return Fraction(round(cos(angle))), Fraction(round(sin(angle)))
     t = Fraction(tan(angle / 2)).limit_denominator(10**7)
@@ -227,9 +229,10 @@ def _column(
         inertia: composite inertia of the body and all its descendants.
     """
     body = arm.bodies[index]
-    # `wrench` (force, moment) gives the composite body a unit acceleration about or along the z axis of its joint:
-    # (z x h, I z) if revolute, (m z, h x z) if prismatic. The component of the wrench along the joint axis of an
-    # ancestor is the entry of M (Featherstone, table 6.2).
+    # The composite body has the mass m, first moment h and inertia tensor I about the joint's origin. `wrench` (force,
+    # moment) gives it a unit acceleration about or along the joint axis z: (z x h, I z) if revolute, (m z, h x z) if
+    # prismatic. The component of the wrench along the joint axis of an ancestor is the entry of M (Featherstone, table
+    # 6.2).
     (hx, hy, _), tensor = inertia.moment, inertia.tensor
     wrench = (-hy, hx, 0), (tensor[2], tensor[4], tensor[5])
     if body.joint_type == "prismatic":
@@ -255,7 +258,8 @@ def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
     from the moving frame to the frame at q = 0.
     """
     s, c, _ = transform.rotation[1]
-    # The rotation of a prismatic joint is the identity, which consists of integers.
+    # An integer c indicates a prismatic joint: its rotation is the identity, with integers, so no rotation is needed.
+    # The cosine of a revolute joint is never an integer, but a number or polynomial.
     if isinstance(c, int):
         return _translated(transform.translation, inertia)
     hx, hy, hz = inertia.moment

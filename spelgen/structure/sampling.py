@@ -23,8 +23,8 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    Index 0 of the first axis has random positions; the positions of index 1 + k differ from index 0 in coordinate k
-    only (see the module's docstring).
+    M is the mass matrix, V the potential energy. Index 0 of the first axis has random positions; the positions of index
+    1 + k differ from index 0 in coordinate k only (see the module's docstring).
 
     Args:
         arm: the arm, with n coordinates.
@@ -36,8 +36,9 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Revolute joints use the cosine and sine of q, prismatic joints the value of q. The value is an independent
-        # random number, since a cosine and a sine in the prime field have no angle.
+        # Revolute joints use the cosine and sine of q, prismatic joints the value of q; each `Position` has all three.
+        # The value is an independent random number, since it cannot be computed from elements of the prime field as an
+        # angle.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
@@ -83,8 +84,8 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
 def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
     """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2).
 
-    The first axis and the arguments arm, assume and samples are as for ``field_samples``. seed: seed of the random
-    positions and inertial parameters.
+    On the first axis, index 0 has random positions, and the positions of index 1 + k differ in coordinate k only. arm,
+    assume and samples are as for ``field_samples``. seed: seed of the random positions and inertial parameters.
     """
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
@@ -140,8 +141,8 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 class Spans:
     """Linear spans of M and of its changes, in the prime field, from which the structure of an arm is derived.
 
-    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_k the span
-    of the changes of M if only coordinate k moves, and U the sum of all T_k. A basis has a row per dimension.
+    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_i the span
+    of the changes of M if only coordinate i moves, and U the sum of all T_i. A basis has a row per dimension.
 
     Attributes:
         n: Number of coordinates.
@@ -150,10 +151,10 @@ class Spans:
         potential_changes: Whether V depends on each coordinate.
         entry_joints: Set of the joints on which an entry of M depends, for each entry.
         order: Order in which entries of M are eliminated: entries that depend on many joints first.
-        change_bases: Echelon basis of each T_k, (dim T_k, entries), with the entries in the order ``order``.
+        change_bases: Echelon basis of each T_i, (dim T_i, entries), with the entries in the order ``order``.
         varying: Basis of U, (dim U, entries).
-        floats: Samples of M in double precision, (1 + n, 2 S, entries). They determine the values of nonzero
-            coefficients; zeros and ranks are determined in the prime field.
+        floats: Samples of M in double precision, (1 + n, 2 S, entries), in 1 + n blocks (see the module). They
+            determine the values of nonzero coefficients; zeros and ranks are determined in the prime field.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -173,15 +174,16 @@ class Spans:
         self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]
         self.varying = field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
         self.floats = float_samples(arm, assume, 2 * count)
-        # For each joint, echelon bases of the changes of M caused by joints nearer the root, and nearer the tip, are
-        # stored, since `outside` needs them for many sets of joints.
+        # For each joint, echelon bases of the sum of the T_i of all joints nearer the root, and of all joints nearer
+        # the tip, are stored, since `outside` needs them for many sets of joints.
         self._nearer_root = _sums(self.change_bases)
         self._nearer_tip = _sums(self.change_bases[::-1])[::-1]
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        Joints are in increasing order; each has as many samples as ``floats`` has positions, 2 S.
+        Joints are in increasing order. Each joint has 2 S samples: the changes of M if only this joint moves from the
+        positions of block 0 of ``floats``.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
@@ -189,7 +191,8 @@ class Spans:
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return an echelon basis of the changes of M caused by all joints except ``joints``, (dimension, entries).
 
-        The columns are the entries of M in the order of the attribute ``order``.
+        It is a basis, in the prime field, of the sum of the spans T_i of all joints i except ``joints``. The columns
+        are the entries of M in the order of the attribute ``order``.
         """
         first, last = min(joints), max(joints)
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
@@ -197,7 +200,7 @@ class Spans:
 
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return echelon bases of cumulative sums of spaces, (dimension, entries) each: element k for ``bases[:k]``."""
+    """Return echelon bases, (dimension, entries) each: element k is a basis of the row space of ``bases[:k]``."""
 
     def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
         return field.row_basis(np.concatenate([rows, basis]))

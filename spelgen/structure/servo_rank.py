@@ -2,8 +2,9 @@
 
 For each joint with a position servo, kp (u - q) = kd qd + armature qdd + dry sgn(qd) + Y(q, qd, qdd) pi, with logged
 position q and command u, dry friction torque `dry`, torque regressor Y and inertial parameters pi. The equations are
-linear and homogeneous in kp, kd, armature, dry and pi: logs determine these parameters up to the null space of the
-system of equations. The ratio of a parameter to kp is identifiable if both change by the same factor in the null space.
+linear and homogeneous in kp, kd, armature, dry and pi: logs determine these parameters up to an added vector of the
+null space of the equations. The ratio of a parameter to kp is identifiable if adding any such vector multiplies the
+parameter and kp by the same factor.
 """
 
 from typing import NamedTuple
@@ -32,9 +33,10 @@ class ServoRank(NamedTuple):
 
 
 def servo_rank(arm: Chain) -> ServoRank:
-    """Return the identifiable ratios of servo parameters of an arm whose joints all have position servos.
+    """Return the ratios of servo parameters that logs can identify, for an arm whose joints all have position servos.
 
-    They are computed from the null space of the equations at random states, for random true parameters.
+    They are computed from the null space of the equations (see the module) at random states, for random true
+    parameters.
     """
     random, n = np.random.default_rng(0), len(arm.coordinates)
     # There are about twice as many equations as unknowns, so that the number of samples does not limit the rank.
@@ -49,7 +51,7 @@ def servo_rank(arm: Chain) -> ServoRank:
     torque = drives.sum(axis=-1) + bodies.sum(axis=-1).reshape(samples, n)
     rows = np.zeros((samples, n, n, len(PARAMETERS)))
     for joint in range(n):
-        # The coefficient of kp is the command error u - q. With kp = 1, it is the torque of all other terms.
+        # The coefficient of kp in kp (u - q) = torque is the command error u - q, which equals the torque for kp = 1.
         rows[:, joint, joint, 0] = -torque[:, joint]
         rows[:, joint, joint, 1:] = drives[:, joint]
     system = np.concatenate([rows.reshape(samples * n, -1), bodies], axis=1)
@@ -58,14 +60,15 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Two relative changes of parameters count as equal if they differ by less than `equal`. Null vectors have
-    # rounding errors about a thousand times larger than the matrix.
+    # [1] Two relative changes of parameters along a null vector, at most 1, count as equal if they differ by less than
+    # `equal`. It is far above the rounding errors of null vectors, about 1e-13: a thousand times the rounding errors of
+    # the system matrix.
     equal, kp = 1e-6, changes[:, :1]
     # `same`, (n, n): True for two joints whose kp change by the same factor in the whole null space.
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
-    # `differs`, (n, parameters of a joint): False for a parameter that changes by the same factor as kp of its joint in
-    # the whole null space.
+    # `differs`, (n, parameters of a joint): False for a parameter that changes by the same factor as kp of its joint
+    # along all null vectors of `system`.
     differs = np.abs(changes - kp).max(axis=-1) > equal
     undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
     return ServoRank(tuple(groups), tuple(undetermined))
@@ -91,12 +94,13 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
     triangles, potential = float_energies(arm, shifted, [list(ten) for ten in inertias])
-    # `mass`: M per unit inertial parameter at the shifted positions, (S, n + 1, 10 B, n, n).
+    # `mass`: M per unit inertial parameter at positions shifted in each of the n + 1 directions, (S, n + 1, 10 B, n,
+    # n).
     mass = np.zeros((*potential.shape, n, n), dtype=complex)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. In time `step`, q changes by step qd (the last direction) and qd
-    # changes by step qdd, so the imaginary part of `momentum` is step d/dt (M qd).
+    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. Complex step: in the time `step`, q changes by step qd (the last
+    # of `directions`) and qd by step qdd, so the imaginary part of M qd, `momentum`, is step d/dt (M qd).
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)

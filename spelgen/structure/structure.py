@@ -1,11 +1,12 @@
 """Structure of an arm: zero, constant and varying entries of M, the joints that M and V depend on, minimal form of M.
 
-The minimal form is M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions f_j and constant matrices A_k
-and B_j. Let T_k be the span of the changes M(q) - M(q') when only joint k moves, U the sum of all T_k, and W the span
-of M. The minimal number of functions f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear
-functional of M depends only on the joints in a set J if and only if it vanishes on T_k for every k outside J; this test
-selects the functionals that define the f_j. All tests are ranks or zeros of samples in a prime field (``field``): exact
-with an error probability of about 1e-16, without tolerances.
+V is the potential energy. The minimal form is M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions
+f_j and constant matrices A_k and B_j. Let T_i be the span of the changes M(q) - M(q') when only joint i moves, U the
+sum of all T_i, and W the span of M(q), for all q and all assumed inertial parameters. The minimal number of functions
+f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only on the
+joints in a set J if and only if it vanishes on T_i for every i outside J; this test selects the functionals that define
+the f_j. All tests are ranks or zeros of samples in a prime field (``field``): exact with an error probability of about
+1e-16, without tolerances.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from spelgen.urdf.robot import Assume
 
 
 class MassEntry(NamedTuple):
-    """An entry of the mass matrix: row and column (from 0), kind, and the coordinates that it depends on (from 0)."""
+    """An entry of M: row and column, kind (zero, constant or varying), and its joints (0-based indices)."""
 
     row: int
     column: int
@@ -67,10 +68,11 @@ class Structure:
 
 @lru_cache(maxsize=16)  # The structure is cached, because an arm is used with several settings or logs.
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
-    """Return the structure of M and V of ``arm``: zero, constant and varying entries, minimal form of M, joints of V.
+    """Return the structure of the mass matrix M and the potential energy V of ``arm``.
 
-    assume: ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for
-    the values in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
+    It has the zero, constant and varying entries of M, the minimal form of M, and the joints that V depends on. assume:
+    ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for the values
+    in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
     """
     if assume == "inertials" and not arm.inertials_complete:
         raise ArmError(
@@ -78,7 +80,8 @@ def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
             expected="an <inertial> on every moving body",
             do="use --assume kinematics, which needs none",
         )
-    # Entries and terms of M are derived from ranks and zeros of the samples in `spans`.
+    # An entry of M is zero if all its samples in `spans` are zero, and varying if it changes with a coordinate. The
+    # ranks of the samples determine the terms of M.
     spans = Spans(arm, assume)
     outputs, constants = smallest_form(spans)
     return Structure(

@@ -75,7 +75,8 @@ def link_shapes(
         urdf: Path of the URDF; its folder and all parent folders are searched for meshes.
         element: Elements to read, "visual" or "collision".
         links: Names of the links whose shapes are returned.
-        faces: Largest number of triangles of all meshes together; meshes with more triangles are simplified.
+        faces: Largest number of triangles of all meshes together; a mesh is simplified to this number divided by the
+            number of meshes.
     """
     shapes: list[LinkShape] = []
     unread: dict[str, tuple[str, ...]] = {}
@@ -151,7 +152,8 @@ def _shape(link: str, element: etree._Element) -> LinkShape:
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:
     """Return {(file, scale): mesh} of the shapes that are meshes; a mesh that cannot be read is omitted.
 
-    faces: limit of the number of triangles of all meshes together; meshes above their share are simplified.
+    faces: limit of the number of triangles of all meshes together; a mesh of more than `faces` divided by the number of
+    shapes is simplified.
     """
     paths: dict[tuple[str, tuple[float, ...]], str] = {}
     for shape in shapes:

@@ -11,7 +11,7 @@ from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
 # [1] An inertia tensor is reported if its smallest principal moment is negative, or if the moments violate the triangle
 # inequality, by more than this fraction of the largest moment: printed tensors are rounded.
 _ROUNDING = 1e-6
-# [kg m2] Smaller principal moments are rounding errors of 0: the moments of a milligram of 1 mm are 1e-12.
+# [kg m2] Smaller principal moments count as rounding errors. The moments of a body of 1 mg and 1 mm are larger: 1e-12.
 _SMALLEST_INERTIA = 1e-15
 
 _LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm

@@ -85,7 +85,7 @@ def _read(path: Path, scale: list[float], faces: int) -> Trimesh:
     mesh.apply_scale(scale)
     # The area of the mesh is tested too, because it overflows for vertices that are too far away.
     is_finite = np.isfinite(mesh.vertices).all() and mesh.area < np.inf
-    # The number of triangles of a mesh is bounded, because an archive may expand to any size.
+    # The number of triangles is bounded, because a small mesh file in a compressed format may expand to any size.
     if not is_finite or not 0 < len(mesh.faces) <= 2_000_000:
         raise ValueError(f"{path}: no triangles, too many triangles, or corners that are no numbers")
     if len(mesh.faces) > faces:

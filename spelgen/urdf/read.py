@@ -113,7 +113,7 @@ def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
 
 
 def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJoint]) -> None:
-    """Report joints with unknown links, and links that are the child of two joints."""
+    """Add errors to ``notes`` about joints with unknown links, and about links that are the child of two joints."""
     names = {link.name: None for link in links}
     above: dict[str, UrdfJoint] = {}
     for joint in joints:
@@ -132,7 +132,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
 
 
 def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
-    """Report mimic joints whose leader does not exist or does not move, and cycles of mimic joints."""
+    """Add errors to ``notes`` about mimic joints whose leader is absent or does not move, and cycles of such joints."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         if joint.mimic is None:

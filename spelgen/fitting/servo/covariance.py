@@ -15,12 +15,17 @@ from spelgen.identification.intervals import QUANTILE
 def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
     """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
 
-    The covariance of the k fitted parameters is converted to the K parameters, and scaled such that 1.96 standard
-    deviations are half the 95 % interval of Student's t. Two covariances are added: the errors of kd, armature and
-    friction due to an inexact form of the friction model (`ServoTuning.model_deviation`), and the prior covariance of
-    the directions of the body parameters that the fit does not change. If no kp is known, the standard deviation of a
-    common factor of all torques is at least the prior standard deviation of masses: effort limits may determine this
-    factor in the logs, but the limits in URDFs often differ from the limits of the motors.
+    The fit determines the covariance of k parameters. The derivatives of the K parameters of the model with respect to
+    these k parameters give the covariance (K, K). Users of the result multiply standard deviations by 1.96. The
+    covariance is therefore scaled such that this product is half the 95 % interval of Student's t.
+
+    Two covariances are added to it: the variance of kd, armature and friction due to errors of the friction model
+    (`ServoTuning.model_deviation`), and the prior covariance of the body parameters orthogonal to the directions that
+    the fit changes (`ParameterMap.directions`).
+
+    If no kp is known, the logs determine the common factor of all torques only by effort limits, and the limits in
+    URDFs often differ from the limits of the motors. The variance of the logarithm of this factor is therefore raised
+    to at least the prior variance of the logarithm of a mass.
 
     The result also has the standard deviation of the delay, `delay_std` [s].
     """

@@ -1,8 +1,8 @@
 """Selection of the joints that have a dead zone: fits with and without a dead zone are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
-joint's negative log posterior by more than significance^2 / 2. Load, delay and likelihood are fixed at their values in
-the preceding fit, so that the joints are independent.
+joint's negative log posterior by more than significance^2 / 2. Load, delay and the weights of the errors are fixed at
+the preceding fit in both fits, so that the joints are independent.
 
 A single linearized fit does not suffice at joints without gravity load. There, a dead zone and dry friction both cause
 a static position error, and the derivatives of the errors with respect to both are proportional. Only the motion at
@@ -25,8 +25,8 @@ from spelgen.runtime.friction_laws import FrictionLaws
 def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
     """Fit each joint with and without a dead zone from x; return the better parameters of each joint.
 
-    A dead zone is kept only if it lowers the joint's cost, its negative log posterior, by more than significance^2 / 2
-    (`ServoTuning.significance`).
+    x: parameters of the preceding fit, without dead zones. A dead zone is kept only if it lowers the joint's cost, its
+    negative log posterior, by more than significance^2 / 2 (`ServoTuning.significance`).
     """
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
@@ -39,9 +39,10 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters x, in which dead zones below `TUNING.min_dead_zone` are set to zero and no longer fitted.
+    """Return parameters x, in which small dead zones are set to zero and no longer fitted.
 
-    The resolution of encoders is similar to this bound, so that smaller dead zones cannot be measured.
+    A dead zone is small if its parameter, half its width [rad, m], is below `TUNING.min_dead_zone`. The resolution of
+    encoders is similar to this bound, so that smaller dead zones cannot be measured.
     """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
@@ -85,7 +86,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
     """Return parameters x with a dead zone at every joint, as the initial guess of a fit of dead zones.
 
-    All parameters are marked as fitted (`active`). The static position error is (dry friction) / kp + half the dead
+    The model of the problem gets the parameters x. All parameters of the result are marked as fitted (`active`). The
+    static position error is (dry friction) / kp + half the dead
     zone. Half the dead zone is set to ``fraction`` times (dry friction) / kp, and Coulomb friction is reduced by the
     same fraction. The static error then remains about the same, or exactly the same if Coulomb friction is the only dry
     friction.

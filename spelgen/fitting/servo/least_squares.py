@@ -72,10 +72,11 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, dry friction divided by its magnitude
-            (-1 to 1), torque of the bodies, and 1.
+            (-1 to 1), torque of the bodies except for the inertial torque of the joint's own acceleration
+            (`BodyLoad.bias`), and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5)
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5), joint first
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
@@ -95,11 +96,14 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     q, qd = windows.q.numpy(), windows.qd.numpy()
     measured, dt = q[:, 1:], float(windows.dt.mean())
 
-    # The mean commands for a delay are cached: most evaluations of the residual have the same delay, since finite
-    # differences change one of the four unknowns at a time.
+    # The commands, averaged over each interval, are cached per delay: most evaluations of the residual have the same
+    # delay, since finite differences change one of the four unknowns x at a time.
     @lru_cache(maxsize=8)
     def commands(delay: float) -> np.ndarray:
-        """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m]."""
+        """Return the mean command of each interval of W windows of K samples, (W, K-1, n) [rad, m].
+
+        delay: delay of the commands [s].
+        """
         return windows.commands(delay).mean(dim=2).numpy()
 
     def delayed_error(delay: float) -> float:
@@ -119,7 +123,7 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
         def residual(x: np.ndarray, column: slice = column) -> np.ndarray:
             """Return the position errors [rad, m] of one joint after the burn-in, as a vector over all windows.
 
-            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo.
+            x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo. column: slice of the joint.
             """
             u = commands(x[2])[..., column] + x[3]
             predicted = linear_response(

@@ -2,8 +2,9 @@
 
 The initial guess is the least-squares solution for the command error (`least_squares`). Three outer iterations then
 minimize the error of predicted windows (`problem`). At its start, each iteration fixes the scale of the errors, and the
-load of the bodies along a motion: the measured motion in the first iteration, the predicted motion in the others. Dead
-zones are selected after the first outer iteration (`laws`). The last outer iteration uses all windows.
+load of the bodies. The load is computed along the measured motion in the first iteration, and along the predicted
+motion in the others. Dead zones are selected after the first outer iteration (`laws`). The last outer iteration uses
+all windows.
 """
 
 import copy
@@ -45,7 +46,7 @@ class ServoObjective(Objective):
     """Objective of a servo fit. The fit uses all logs, without validation, and can be resumed at each outer iteration.
 
     A checkpoint contains the initial weights of the model, and the fitted parameters at the start of each outer
-    iteration. The load of the bodies and the scale of the position errors are recomputed from these parameters.
+    iteration. The torque of the rigid bodies and the scale of the position errors are recomputed from these parameters.
     """
 
     name: ClassVar[str] = "servo"
@@ -124,7 +125,7 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Reduce the integration error by one solver step with half the integration step size; record the results."""
+        """Reduce the integration error by a Gauss-Newton step with half the integration step; record the results."""
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)

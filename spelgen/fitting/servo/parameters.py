@@ -107,7 +107,7 @@ class ParameterMap:
 
         The tensors are (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint.
         """
-        # columns: (P, 1, n, K) for each parameter
+        # columns: one tensor (P, 1, n, K) per name, for K values per joint
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
@@ -123,17 +123,20 @@ class ParameterMap:
             self._model.servo.delay.fill_(x.delay)
 
     def precision(self, x: ServoParameters) -> Tensor:
-        """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior."""
+        """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior.
+
+        They depend on ``x.active``: a parameter that is not fitted has a variance of practically zero.
+        """
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
         return torch.cat([joints.flatten(), shared]) ** -2
 
     def inertial(self, bodies: Tensor) -> Tensor:
-        """Return the inertial parameters of B bodies, (10 B,), at coordinates (r,) along the r `directions`."""
+        """Return the inertial parameters of B bodies, (10 B,), for the coordinates `ServoParameters.bodies`, (r,)."""
         return self._inertial(self._log_cholesky(bodies)).flatten()
 
     def _log_cholesky(self, bodies: Tensor) -> Tensor:
-        """Return the log-Cholesky parameters of B bodies, (B, 10), at coordinates (r,) along the r `directions`."""
+        """Return the log-Cholesky parameters of B bodies, (B, 10): prior mean plus `directions` times `bodies` (r,)."""
         return self._mean_bodies + (self.directions @ bodies).view_as(self._mean_bodies)
 
     def _inertial(self, log_cholesky: Tensor) -> Tensor:
@@ -147,7 +150,8 @@ class ParameterMap:
         """Return the r directions of log-Cholesky parameters with the largest effect on gravity, (10 B, r).
 
         The directions are right singular vectors of the derivative of the gravity torques at q (M, n) with respect to
-        the log-Cholesky parameters, times the prior standard deviation.
+        the log-Cholesky parameters of B bodies, times the prior standard deviation; r is at most
+        `ServoTuning.body_directions`.
         """
         zero = torch.zeros_like(q)
         # torch.func is not used, since its Jacobians import torch's compiler, which takes more than a second.

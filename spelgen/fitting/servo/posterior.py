@@ -57,7 +57,7 @@ class ServoPosterior(Posterior):
 
     @property
     def base_units(self) -> str:
-        """Units of the base parameters for the title of a table; for ratios to a kp, with the name of its joint."""
+        """Units of the base parameters for the title of a table, with "; ratios to kp of <joint>" if no kp is known."""
         units = super().base_units
         return units if self.scale_joint is None else f"{units}; ratios to kp of {self.scale_joint}"
 
@@ -74,7 +74,8 @@ class ServoPosterior(Posterior):
             for total, term, second_term in zip(
                 self.drives[name], self.drives[first], second_terms, strict=True
             ):
-                # If the sum has the smallest error, the errors of its terms are correlated by less than -1/2.
+                # A sum has a smaller error than both terms only if their errors have a correlation below -1/2: the logs
+                # then determine the sum, but not the terms.
                 if second_term is not None and total.std < min(term.std, second_term.std):
                     pairs.append(f"{first} and {second} of {total.name}")
         common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
@@ -83,7 +84,9 @@ class ServoPosterior(Posterior):
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
         """Return the quantities of the servos that have intervals, and the function that returns their values.
 
-        The quantities are the keys of `SERVO_UNITS`. The function returns (8, n) for a model.
+        The quantities are kp, kd/kp, lag (kd/kp plus the delay), armature/kp, coulomb/kp, dead zone (half its width),
+        static error (coulomb/kp plus half the dead zone) and offset/kp, with the units `SERVO_UNITS`. The function
+        returns (8, n) for a model.
         """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
@@ -91,7 +94,7 @@ class ServoPosterior(Posterior):
         ]
 
         def ratios(model: ArmModel) -> Tensor:
-            """Return the quantities of the servos, (8, n), in the order of `SERVO_UNITS`."""
+            """Return the values of the quantities in `SERVO_UNITS`, (8, n), in this order."""
             servo, kp = model.servo, model.servo.kp()
             damping, dry = servo.kd() / kp, line(model)[1] / kp
             return torch.stack([

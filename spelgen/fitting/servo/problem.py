@@ -5,9 +5,10 @@ The cost is the negative log posterior of x, except for a constant,
     sum over joints and samples of 2 log(1 + (error / scale)^2 / 4) / samples_per_error + (x - m)^T P (x - m) / 2.
 
 The first term is a Student-t likelihood with three degrees of freedom, which bounds the influence of windows in which
-the arm is blocked, for example by a table. Each joint has one scale. Errors of neighbouring samples are correlated:
-samples_per_error samples count as one independent error. The second term is a Gaussian prior with mean m and precision
-P.
+the arm is blocked, for example by a table. Each joint has one scale, the standard deviation of the Gaussian that
+approximates the likelihood for small errors: sqrt(3) / 2 times the scale in the standard form of the t distribution.
+Errors of neighbouring samples are correlated: samples_per_error samples count as one independent error. The second term
+is a Gaussian prior with mean m and precision P.
 """
 
 from __future__ import annotations
@@ -60,15 +61,15 @@ class Likelihood:
     def costs(self, errors: Tensor) -> Tensor:
         """Return the negative log likelihood of each joint's position errors, (n,), up to a constant.
 
-        errors: (W, K', n) [rad, m].
+        errors: (W, K', n) [rad, m], at K' samples of W windows.
         """
         costs = 2 * torch.log1p((errors / self.scale).square() / 4) / self.samples_per_error
         return costs.sum(dim=(0, 1))
 
     def weights(self, errors: Tensor) -> Tensor:
-        """Return the weights w (W, K', n) for which the cost w error^2 / 2 has the same gradient as `costs`.
+        """Return weights w (W, K', n) of iteratively reweighted least squares: w error^2/2 has the gradient of `costs`.
 
-        The gradient is with respect to the errors (W, K', n) [rad, m], with constant w.
+        The gradient is with respect to the errors (W, K', n) [rad, m] at K' samples of W windows, with constant w.
         """
         robust = 1 / (1 + (errors / self.scale).square() / 4)
         return robust / self.scale**2 / self.samples_per_error
@@ -91,7 +92,7 @@ class ServoProblem:
     def of(cls, rollouts: ServoRollouts, noise: Tensor, errors: Tensor) -> ServoProblem:
         """Return the problem whose residual is computed by `rollouts`, with a likelihood estimated from `errors`.
 
-        noise: (n,) [rad, m], see the class. errors: (W, K', n), position errors [rad, m].
+        noise: (n,) [rad, m], see the class. errors: (W, K', n), position errors at K' samples of W windows [rad, m].
         """
         max_samples = max(1, round(TUNING.correlation_time * rollouts.windows.rate))
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
@@ -123,13 +124,14 @@ class ServoProblem:
         """Return the negative log posterior of each joint, (n,), as a function of the joint's p parameters in x.
 
         It is the negative log likelihood of the joint's errors plus the negative log prior of the p parameters. The
-        prior of shared parameters is not included. errors: position errors at x, (W, K', n) [rad, m].
+        prior of shared parameters is not included. errors: position errors at x, at K' samples of W windows after the
+        burn-in, (W, K', n) [rad, m].
         """
         prior = self._prior(x)[: x.joints.numel()].view_as(x.joints)
         return self.likelihood.costs(errors) + prior.sum(dim=0)
 
     def cost(self, x: ServoParameters, errors: Tensor) -> float:
-        """Return the negative log posterior at x for errors (W, K', n) [rad, m]; infinite if a rollout diverged."""
+        """Return the negative log posterior at x; infinite if a rollout diverged. errors: position errors at x."""
         if not errors.isfinite().all():
             return float("inf")
         return float(self.likelihood.costs(errors).sum() + self._prior(x).sum())
@@ -139,7 +141,7 @@ class ServoProblem:
         return self.parameters.precision(x) * (x.flat - self.parameters.prior_mean.flat).square() / 2
 
     def candidates(self, x: ServoParameters, step: Tensor) -> Iterable[ServoParameters]:
-        """Return the only candidate: the parameters after a step (k,) with components within +-`TUNING.max_step`."""
+        """Return the only candidate: parameters after a step (k,) with components clipped to +-`TUNING.max_step`."""
         return [x.after(step.clamp(-TUNING.max_step, TUNING.max_step))]
 
     def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
@@ -169,8 +171,9 @@ class ServoProblem:
         curvature = torch.zeros(count, p * n + r, p * n + r).double()
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
-            # The errors of a joint depend only on its p parameters and on the r parameters that all joints share.
-            # `jacobian` has the derivatives of its K' errors in each window, (W, p + r, K').
+            # The errors of a joint depend only on p parameters of the joint and on r parameters that all joints share:
+            # body parameters and delay. `jacobian`, (W, p + r, K'), has the derivatives of the joint's K' errors in
+            # each window with respect to these p + r parameters.
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]

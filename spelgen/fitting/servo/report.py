@@ -62,11 +62,12 @@ class FitSummary:
 class ServoSolution:
     """Normal equations and covariance of the k parameters at the end of a fit.
 
-    The dead zones of all joints are free parameters here.
+    The dead zones of all joints are free parameters here, unlike in the fit, where only joints with a dead zone have
+    one.
 
     Attributes:
         blocks: normal equations of B blocks of windows, (B, k, k) and (B, k); a block is a log or a segment of a log.
-        precision: (k,), precision of the prior.
+        precision: (k,), inverse prior variance of each parameter.
         covariance: (k, k), jackknife covariance of the parameters.
     """
 
@@ -104,8 +105,8 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The last solver step estimates the integration error of x. It counts as an error of one standard deviation, so its
-    # outer product is added to the covariance.
+    # The last solver step, with shorter integration steps than the fit, estimates the integration error of x. It counts
+    # as an error of one standard deviation, so its outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 
@@ -127,7 +128,7 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
     Args:
         blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).
-        precision: (k,), precision of the prior.
+        precision: (k,), inverse prior variance of each parameter.
         indices: (m,), indices of the m parameters.
     """
     curvature = blocks.curvature.sum(dim=0)
@@ -139,10 +140,12 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
     """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
 
+    Dry friction depends on velocity and gravity torque, and is averaged over samples (`sliding_friction`).
+
     Args:
         model: model with position servos.
-        qd: velocities, (..., n) [rad/s, m/s].
-        gravity: gravity torques, (..., n) [Nm, N].
+        qd: velocities of the samples, (..., n) [rad/s, m/s].
+        gravity: gravity torques of the samples, (..., n) [Nm, N].
     """
     servo, kp = model.servo, model.servo.kp()
     dry = sliding_friction(model.friction, qd, gravity) / kp
@@ -159,7 +162,7 @@ def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
 def ratios_with_deviations(
     problem: ServoProblem, solution: ServoSolution
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return {key of `RATIOS`: (ratios, deviations)}, (n,) each, for the current parameters of the model.
+    """Return {key of `RATIOS`: (ratios to kp, deviations)}, (n,) each, for the current parameters of the model.
 
     The deviations are the standard deviations of the logarithms of the ratios, from the covariance of ``solution``.
     """
@@ -168,8 +171,8 @@ def ratios_with_deviations(
     qd, gravity = rollouts.motion.qd, rollouts.load.gravity
     values = evaluate_with(rollouts.model, tensors, lambda model: ratios(model, qd, gravity))
     p, n = parameters.prior_mean.joints.shape
-    # `blocks` (p + 1, p + 1, n): for each joint, the covariance of its p parameters and the delay, the last parameter
-    # of all.
+    # `blocks` (p + 1, p + 1, n): for each joint, the covariance of the joint's p parameters and the common delay, which
+    # is the last of the k parameters.
     index = torch.cat([torch.arange(p * n).view(p, n), torch.full((1, n), len(solution.covariance) - 1)])
     blocks = solution.covariance[index.unsqueeze(1), index.unsqueeze(0)]
     result = {}
@@ -189,9 +192,10 @@ def ratios_with_deviations(
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
     """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
 
-    The ratios are kd / kp, armature / kp and friction / kp, each with its 95 % interval. The key
-    "determined" of a ratio is True if the upper end of its interval is below `ServoTuning.max_factor` times the ratio.
-    For dry friction and the dead zone, the logs must also distinguish one from the other (see `identifiable`).
+    The ratios are the keys of `RATIOS`, each with its 95 % interval. The key "determined" of a ratio is True if the
+    upper end of its interval is below `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the
+    logs must also distinguish one from the other (see `identifiable`). x: fitted parameters. steps: number of
+    Levenberg-Marquardt steps of the fit.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},
@@ -211,7 +215,7 @@ def _joint_records(problem: ServoProblem, solution: ServoSolution) -> list[Conte
         record: Content = {"joint": name, "kp": {"value": kp[joint], "known": not trained[joint]}}
         for ratio, (of_joints, deviations) in values.items():
             value = float(of_joints[joint])
-            # A dead zone of zero was not selected at this joint, so it has no interval.
+            # If no dead zone was selected at this joint, it is zero and has no interval.
             if ratio == "dead_zone" and not value:
                 continue
             half = solution.quantile * math.hypot(TUNING.model_deviation, float(deviations[joint]))
@@ -249,10 +253,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
                 cells.append(f"{number(interval['value'])} +- {width:.2g} %")
             else:
                 cells.append("open")
-                # The dead zone is not in the list of undetermined ratios, since dry friction of the same joint is then
-                # undetermined and in the list.
-                if column != "dead_zone":
-                    undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
+                undetermined.setdefault(RATIOS[column][0], []).append(joint["joint"])
         rows.append((joint["joint"], number(joint["kp"]["value"]), *cells))
     head = ("joint", "kp [Nm/rad]", *("{} [{}]".format(*RATIOS[column]) for column in columns))
     end = "All ratios are determined"

@@ -20,8 +20,9 @@ class ServoRollouts:
     """Rollouts of windows, in which each joint is integrated independently of the other joints.
 
     The joints are coupled only by the load of the bodies (gravity, inertia, Coriolis forces). Here, this load is
-    computed along a fixed motion instead of the predicted motion: once for parameters x0, and for other parameters x
-    with the term regressor (phi(x) - phi(x0)), where phi(x) (10 B,) are the inertial parameters of B bodies.
+    computed along a fixed motion instead of the predicted motion, once for parameters x0. For other parameters x, the
+    term Y (phi(x) - phi(x0)) is added to this load: phi(x) (10 B,) are the inertial parameters of B bodies, and Y is
+    the torque regressor along the fixed motion.
 
     Since the joints are independent, one rollout with a parameter changed at all joints gives the derivatives of all
     joints. A parameter that joints share (body parameters, delay) needs a rollout of its own. All these rollouts form
@@ -55,7 +56,10 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts with ``motion`` as the fixed motion and x as x0; the model's parameters are set to x."""
+        """Return the rollouts with the load recomputed along another fixed motion, ``motion``, for parameters x.
+
+        x replaces x0 (see the class); the model's parameters are set to x.
+        """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
@@ -65,27 +69,29 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions, and velocities and accelerations from the rollouts with parameters x.
+        """Return measured positions, and velocities and accelerations from rollouts with the parameters x.
 
-        The velocities and accelerations are the predicted ones, plus smoothed derivatives of measured minus predicted
-        positions (see `ServoWindows.motion`).
+        Velocities and accelerations are sums of the derivatives of the predicted positions and the smoothed derivatives
+        of the measured minus the predicted positions. Smoothed derivatives of the measured positions would attenuate
+        fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
 
     def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return the derivatives of the `residual` (W, K', n) at x with respect to joint and to shared parameters.
+        """Return derivatives of the `residual` (W, K', n) of W windows with respect to joint and shared parameters.
 
         Returns:
-            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that no joint fits.
+            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that are fitted at
+                no joint.
             (r + 1, W, K', n), with respect to the r coordinates of the body parameters and to the delay, which all
                 joints share.
         """
         # rows: indices of the parameters that are fitted at one joint or more
         rows = x.active.any(dim=1).nonzero().squeeze(-1)
         p, r, step = len(rows), len(x.bodies), self.difference_step
-        # The batch has p + r + 2 rollouts: one at x, and one with each of p joint parameters, r body coordinates and
-        # the delay changed.
+        # The batch has p + r + 2 rollouts: one at x, and one per changed parameter: p joint parameters, each of which
+        # is changed at all joints together, r body coordinates and the delay.
         joints = x.joints.expand(p + r + 2, -1, -1).clone()
         joints[torch.arange(p) + 1, rows] += step
         bodies = x.bodies.expand(p + r + 2, -1).clone()
@@ -108,7 +114,7 @@ class ServoRollouts:
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return the predicted positions [rad, m] and velocities [rad/s, m/s] for x, (1, W, K, n) each."""
+        """Return positions [rad, m] and velocities [rad/s, m/s] of W windows predicted for x, (1, W, K, n) each."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
@@ -133,7 +139,7 @@ class ServoRollouts:
     def _integrate(
         self, drives: ServoDrives, armature: Tensor, added: Tensor, commands: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Integrate all joints of W windows for P sets of parameters; return q and qd, (P, W, K, n) each.
+        """Integrate all joints of W windows of K samples for P sets of parameters; return q and qd, (P, W, K, n) each.
 
         Args:
             drives: servos and friction of the P sets.

@@ -35,8 +35,8 @@ class ServoTuning:
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
-    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along a direction; 0.3 is about 30 % of
-    # a mass.
+    # [1] Prior standard deviation of the log-Cholesky parameters of the bodies, along each unit direction that is
+    # fitted; 0.3 is about 30 % of a mass.
     bodies: float = 0.3
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
@@ -49,7 +49,8 @@ class ServoTuning:
 
     # Constants of the cost of a fit and of its derivatives (`servo.problem`, `servo.rollouts`).
 
-    # [s] Largest correlation time of the position errors; most measured correlation times are above 0.2 s.
+    # [s] Upper bound of the estimated correlation time of the position errors. Most measured correlation times are
+    # above 0.2 s, so the bound must be larger.
     correlation_time: float = 0.5
     # [1] Finite-difference step of the parameters. The step must be far above the rounding errors of rollouts, which
     # lose about half the digits of double precision.
@@ -57,7 +58,8 @@ class ServoTuning:
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
     max_step: float = 1.0
-    # [1] Number of samples from which the directions of the body parameters are computed.
+    # [1] Number of samples at whose positions the effect of body parameters on gravity is computed, which determines
+    # the fitted directions (`body_directions`).
     gravity_samples: int = 2000
 
     # Constants of the outer iterations and their convergence (`servo.objective`).
@@ -75,7 +77,7 @@ class ServoTuning:
     # `min_decrease` is too small for the high costs of a model whose form is wrong.
     min_relative_decrease: float = 1e-4
     # [1] Levenberg-Marquardt damping of the first step of the second and third outer iteration. With 1e-3, the few
-    # steps would end with an error of kd of 0.3 %.
+    # steps of these iterations would end with an error of kd of 0.3 %.
     later_damping: float = 1e-5
     # [1] Finite-difference step of the derivatives from which the covariance is computed. With a shorter step, the
     # derivatives of a joint that is about to slip would be too large and its intervals too narrow.
@@ -83,7 +85,7 @@ class ServoTuning:
 
     # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
-    # [1] Half the initial dead zone, as a fraction of the static error.
+    # [1] Half the initial dead zone, as a fraction of the static error, dry friction / kp plus half the dead zone.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
     # with a dead zone and the fit without.
@@ -103,9 +105,9 @@ class ServoTuning:
     # [1] Variance inflation factor above which a parameter is not distinguished from others; on SO-101 arms, the factor
     # is below 30 or above 90.
     variance_inflation: float = 50.0
-    # [1] Standard deviation of the logarithms of the ratios to kp that is due to errors of the friction model, measured
-    # by `benchmarks/servo_recovery.py`. This deviation is added to the standard deviation of the fit (root of the sum
-    # of squares).
+    # [1] Standard deviation of log(kd/kp), log(armature/kp) and log(friction/kp) due to errors of the friction model,
+    # measured by `benchmarks/servo_recovery.py`. This deviation is added to the standard deviation of the fit (root of
+    # the sum of squares).
     model_deviation: float = 0.015
     # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
     # not determined.
@@ -116,11 +118,12 @@ class ServoTuning:
     # [1] Smallest t value of the coefficient of gravity, 1 / kp, for which kp is computed from this coefficient. The
     # threshold is large, since neighbouring windows are correlated.
     kp_significance: float = 8.0
-    # [1] Largest ratio between the initial and the nominal kp, or between the nominal and the initial kp, for which kp
-    # is computed from the coefficient of gravity.
+    # [1] The initial kp is computed from the coefficient of gravity only if it differs from the nominal kp by less than
+    # this factor; otherwise kp / nominal kp is the median of the other joints.
     kp_range: float = 20.0
-    # [1] Smallest initial dry friction, as a fraction of nominal friction. The square and the cube of this number are
-    # the smallest initial kd/kp [s] and armature/kp [s^2]. All three are positive, since their logarithms are fitted.
+    # [1] Smallest initial dry friction, as a fraction m of nominal friction. The smallest initial kd/kp is m^2 s, 5 %
+    # of 0.05 s (`ModelTuning.servo_lag`). The smallest initial armature/kp is m^3 s^2, 5 % of 0.0025 s^2 = 1 / (20
+    # rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
     min_friction: float = 0.05
     # [s] Largest delay of linear servos.
     max_delay: float = 0.4

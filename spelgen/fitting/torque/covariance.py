@@ -62,14 +62,15 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     noise = problem.noise / problem.jacobian.logged_scale(x)
     blocks = contiguous_blocks(problem.jacobian.samples)
     products = torch.stack([_products(TorqueJacobian(model, block), x) for block in blocks])
-    weighted = (products / noise.square()[:, None, None]).sum(dim=1)  # weighted: (blocks, K + 1, K + 1)
+    weighted = (products / noise.square()[:, None, None]).sum(dim=1)  # Gram matrices, (blocks, K + 1, K + 1)
     curvature = (change.mT @ weighted[:, :-1, :-1] @ change)[:, free][:, :, free]
     descent, prior = (weighted[:, :-1, -1] @ change)[:, free], problem.prior.precision[free][:, free]
     covariance = torch.linalg.inv(curvature.sum(dim=0) + prior)
     steps, of_blocks = jackknife_covariance(curvature, descent, prior)
     if len(blocks) > 1:
-        # Of the posterior and the jackknife covariance, the larger one is used, since each is too small in some
-        # directions: few blocks may agree by chance, and the posterior covariance neglects differences between motions.
+        # In each direction, the larger one of the posterior and the jackknife covariance is used, since each is too
+        # small in some directions: few blocks may agree by chance, and the posterior covariance neglects differences
+        # between motions.
         covariance = larger_covariance(of_blocks, covariance) * student_scale(len(blocks)) ** 2
     without_block = torch.zeros(len(blocks), len(x)).double().masked_scatter(free, steps) @ change.mT
     # The residual after a step is [J, residual] @ [-step, 1]; its square is computed from the Gram matrices of [J,

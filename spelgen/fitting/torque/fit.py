@@ -1,6 +1,7 @@
 """Fit of a model of rigid bodies to torques, stage by stage.
 
-initial fit -> choice of the friction state -> choice of friction effects -> residual terms -> final fit
+initial fit -> choice of friction with or without bristle states -> choice of friction effects (Stribeck, saturation,
+    load dependence) -> residual terms -> final fit
     -> comparison with ridge regression on held-out blocks of samples -> another fit if the regression is better
     -> comparison with the model before the fit, which is kept if the fit is not better
 
@@ -49,12 +50,12 @@ class FitComparison(NamedTuple):
 
     Attributes:
         fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
-            joints.
+            joints, of the returned model and of the regression.
         behind: True if the regression is significantly better than the fit.
-        replaced: the error of the first fit, whose initial guess was the URDF, if it was replaced by a fit whose
-            initial guess is the regression; otherwise None.
-        discarded: the error of the fit, if the logs do not support a fit and the model before the fit has no larger
-            error; otherwise None. `fit` is then the error of the model before the fit, which is the result.
+        replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
+            regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
+        discarded: None if the returned model is a fit. Otherwise it is the model before the fit, since the logs do not
+            support a fit, and `discarded` is the error of the fit, which is not smaller than `fit`.
     """
 
     fit: float
@@ -96,7 +97,7 @@ class TorqueSolution:
 
 
 class _StagedFit(NamedTuple):
-    """Result of one run of all stages of a torque fit: estimate, its jackknife, and the selected residual terms.
+    """Result of one run of all stages of a torque fit: estimate, result of `jackknife`, and selected residual terms.
 
     held_out: (blocks,), sum over joints of the squared held-out residual divided by the variance of the torque.
     parameters: state_dict of the fitted model.
@@ -115,7 +116,7 @@ def fit_torque(
     prior: GaussianPrior | None = None,
     adapt: Adaptation | None = None,
 ) -> TorqueSolution:
-    """Set the parameters of a model of rigid bodies to their MAP estimate; return the estimate with its errors.
+    """Set the parameters of a model of rigid bodies to their MAP estimate; return it with covariance and torque errors.
 
     Args:
         model: model whose current parameters are the prior mean. Before a fit of all parameters, the nominal friction
@@ -123,7 +124,7 @@ def fit_torque(
         samples: samples with torques as logged, (T, n) [Nm, N].
         prior: initial standard deviations of the prior; None: default.
         adapt: group of parameters to estimate (see `TorqueFit`); None: all parameters. If it is given, residual terms
-            are not changed; for "load", the prior widths are not estimated.
+            are not changed; for "load", the standard deviations of the prior are not updated either.
     """
     if not isinstance(samples, TorqueSamples):
         samples = TorqueSamples.of(samples, TUNING.decimation)
@@ -134,7 +135,7 @@ def fit_torque(
         # With `adapt`, motor gains and friction of the model are results of an earlier fit and not nominal values, so
         # they are not changed.
         subset = samples.subsampled(TUNING.initial_samples)
-        set_initial_gains(model, subset, prior.gains)
+        prior = prior.model_copy(update={"gains": set_initial_gains(model, subset, prior.gains)})
         limit_friction(model, subset.columns)
         fitted, comparison = _compared_fit(model, samples, prior)
     else:
@@ -142,7 +143,7 @@ def fit_torque(
     estimate, state = fitted.estimate, fitted.estimate.state
     jacobian, estimator = estimate.problem.jacobian, estimate.problem.noise_estimator
     scale = jacobian.logged_scale(state.x)
-    # mean squared held-out error, (n,) [Nm^2, N^2]
+    # mean squared held-out error, (n,) [(Nm)^2, N^2]
     error = fitted.jackknife.held_out.sum(dim=0) / samples.count
     return TorqueSolution(
         rms_residual=((state.residual / samples.count).sqrt() / scale).numpy(),
@@ -168,7 +169,8 @@ def _staged_fit(
 ) -> _StagedFit:
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
-    max_error: (n,), see `TorqueProblem`.
+    adapt, max_error: purpose of the fit, and upper bound of the root mean square torque error, (n,) [Nm, N] (see
+    `TorqueProblem`). prior: standard deviations of the prior.
     """
     jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
     estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)
@@ -187,8 +189,9 @@ def _compared_fit(
 
     The second fit bounds the torque noise by the held-out error of the regression. If the regression is still better, a
     third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
-    returned. If its error is above `TUNING.unsupported`, and not below the error of the model before the fit, the model
-    before the fit is returned. The returned parameters are written to the model.
+    returned. If its nMSE (error divided by the variance of the torque) is above `TUNING.unsupported`, and its error is
+    not below the error of the model before the fit, the model before the fit is returned. The returned parameters are
+    written to the model.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
@@ -200,7 +203,7 @@ def _compared_fit(
     other = squares.sum(dim=1) + negligible
 
     def behind(fit: _StagedFit) -> bool:
-        """Return True if the regression has a significantly smaller held-out error than `fit`.
+        """Return True if ridge regression has a significantly smaller held-out error than `fit`.
 
         The errors of the blocks are compared by a t test (p = 0.01).
         """
@@ -229,7 +232,8 @@ def _compared_fit(
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < best.held_out.sum():
             best, replaced = restarted, nmse(best.held_out)
-    # A fit that is supported by its data is kept even if the URDF is exact: it has the smaller intervals.
+    # A fit whose nMSE is below the threshold is kept even if the model before the fit (URDF) is exact and predicts
+    # better: the intervals of the fit are smaller.
     if nmse(best.held_out) > TUNING.unsupported:
         model.load_state_dict(initial)
         unfitted = _unfitted(model, samples, prior, blocks)

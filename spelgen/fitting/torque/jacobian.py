@@ -67,11 +67,13 @@ class TorqueJacobian:
 
     x contains the K parameters of bodies, drives and friction (`ParameterVector`). The modelled joint torque is
 
-        Y(q, qd, qdd) pi + C^T (friction(C qd) + armature C qdd) + torque of the residual terms,
+        Y(q, qd, qdd) pi + C^T (f friction + armature C qdd) + torque of the residual terms,
 
-    with the regressor Y, the inertial parameters pi of B bodies, and the matrix C from joint speeds to drive speeds.
-    The measured joint torque is G (tau - offset) plus friction compensation, where G maps logged torques to joint
-    torques. The torque residual is the measured minus the modelled joint torque.
+    with the regressor Y, the inertial parameters pi of B bodies, the matrix C from joint speeds to drive speeds, and
+    the factor f by which residual terms multiply friction. The friction of a drive depends on its speed, an entry of C
+    qd, on the gravity torque that loads it, and on the bristle displacements. The measured joint torque is G (tau -
+    offset) plus friction compensation, where G maps logged torques to joint torques. The torque residual is the
+    measured minus the modelled joint torque.
 
     The residual terms of the model are evaluated once, when this object is created. `terms` are additional linear
     terms, which are eliminated by variable projection. theta (K,) is x with pi in place of the log-Cholesky parameters
@@ -96,7 +98,7 @@ class TorqueJacobian:
 
     @cached_property
     def torque_std(self) -> torch.Tensor:
-        """Standard deviation of the measured joint torque, (n,) [Nm, N]."""
+        """Standard deviation of the measured joint torque over the samples, (n,) [Nm, N]."""
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
@@ -126,8 +128,8 @@ class TorqueJacobian:
     def _logged_scale(self, parameters: NamedTensors) -> torch.Tensor:
         """Return the initial divided by the current motor gain of each joint, (..., n) [1]; 1 for fixed gains.
 
-        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`:
-        {name: values}, or values of a batch (...) of sets.
+        Unlike `logged_scale`, the result can be differentiated by autograd with respect to the gains in `parameters`.
+        parameters: {name: values} of one set of parameters, or of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
         # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
@@ -139,7 +141,8 @@ class TorqueJacobian:
     def normal_equations(self, x: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the Gauss-Newton Hessian J^T W J (K, K) and the negative gradient J^T W r (K,) at x (K,).
 
-        J is the Jacobian of the modelled torque, r the torque residual, W = 1 / noise^2. noise: (n,) [Nm, N].
+        r is the torque residual at the initial motor gains (see `squared_residual`), J is minus its Jacobian, and W =
+        1 / noise^2. noise: (n,) [Nm, N].
         """
         rows: Iterable[JointRows] = self.joint_rows(x)
         if self.terms:
@@ -155,8 +158,8 @@ class TorqueJacobian:
         """Yield the torque Jacobian of each joint and each block of samples with respect to theta (K,), at x (K,).
 
         theta is x with inertial parameters in place of the bodies' log-Cholesky parameters. The Jacobian with respect
-        to inertial parameters is the regressor, so no derivatives are computed for them. `theta_jacobian` converts from
-        theta to x.
+        to inertial parameters is the regressor, plus the derivative of load-dependent friction times the regressor of
+        the gravity torque. `theta_jacobian` converts from theta to x.
         """
         parameters, scale = self.rigid.unflatten(x), self.logged_scale(x)
         body_columns = self._of_bodies.nonzero()[:, 0]
@@ -235,16 +238,19 @@ class TorqueJacobian:
         return RigidProjection(tuple(of_joint.jacobian for of_joint in rows), tuple(gains))
 
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return the parameters (K,) after a step (K,) from x, along a curved line: a candidate of the solver.
+        """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The line is straight in the inertial parameters and in the friction coefficients, since the torque is linear in
-        them. `step_in_inertial_parameters` updates the inertial parameters. x contains the logarithm of each friction
-        coefficient c: a step s > 0 changes c to c (1 + s), a negative step to c exp(s), so that c remains positive.
+        The torque is linear in inertial parameters, armatures and friction coefficients, so a straight line in these
+        quantities is better than one in x. x contains log-Cholesky parameters of bodies, which are moved along such a
+        line (see `step_in_inertial_parameters`), and the logarithms of armatures and friction coefficients c. A step
+        s > 0 of log c changes c to c (1 + s), on such a line, too. A step s < 0 changes c to c exp(s), as x + step
+        does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # For s > 0: log(c (1 + s)) = log c + log1p(s), which equals log c + s to first order.
+            # A step s > 0 of log c becomes log(c (1 + s)) - log c = log1p(s), which equals s to first order; s < 0 is
+            # unchanged, since 1 + s could be negative.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -298,7 +304,8 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return measured minus modelled joint torque, and the friction torque of the drives, both (T, n) [Nm, N].
 
-        load: gravity torque on the drives, (T, n); None: it is computed from the parameters.
+        block: T samples with their regressors. load: gravity torque on the drives, (T, n); None: it is computed from
+        the parameters.
         """
         samples = block.samples
 
@@ -318,12 +325,17 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        Graph colouring (Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974): joints that share no drive may
-        have the same colour. A drive then acts on at most one joint of a colour, so that each parameter of a drive, and
-        each gravity torque on a drive, affects at most one joint of a colour. Therefore the gradient of the sum of the
-        torques of one colour contains the Jacobian rows of all joints of this colour. One reverse pass per colour (most
-        arms have one colour) replaces n passes. Each sample has its own copy of the parameters, so that a pass computes
-        the gradients of all samples.
+        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. Its
+        rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
+        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
+        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
+        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
+        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
+        pass gives the derivatives of all samples.
+
+        Args:
+            parameters: {name: values}, the parameters at which the derivatives are computed.
+            block: T samples with their regressors.
 
         Returns:
             The scaled residual, (T, n) [Nm, N].

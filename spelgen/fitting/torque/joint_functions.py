@@ -36,23 +36,25 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 
 @dataclass(frozen=True, eq=False)
 class JointFunction:
-    """A residual term of one joint, as a linear model of P = L + W weights on T samples.
+    """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries for the joint, for example spline coefficients; the parameter in the model is the entries
-    divided by `scale`. The last W weights of the linear model are changes of single entries. The first L weights are
-    coefficients of trends: the mean and the slope of all spline coefficients.
+    The term has W entries, for example the spline coefficients of the joint. For the weights w (P,), the entries are
+    trends @ w[:L] + w[L:]. The L trends, for example mean and slope of the spline coefficients, change all entries
+    together.
 
+    scale: the parameter of the model is entries / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
-    features: (T, P) columns after orthogonalization; equal to the columns if the term is a friction factor.
+    features: (T, P) columns after orthogonalization, without the part of the columns that rigid bodies and friction
+        would absorb. For a friction factor they are the columns, since the factor is applied to the whole friction.
     direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
     friction: (T,) friction torque with the current factor, if the term is a friction factor; None: the term is a
         torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized change
         of the friction torque.
-    visit_length: mean number of samples of a visit. A visit of a position is a run of samples in which the joint moves
-        by the knot spacing of the splines.
+    visit_length: mean number of samples of a visit, which count as one independent error. A visit of a position is a
+        run of samples in which the joint moves by the knot spacing of the splines.
     """
 
     parameter: str
@@ -70,7 +72,7 @@ class JointFunction:
     def read(self, terms: ResidualTerms) -> torch.Tensor:
         """Return the weights (P,) of the `JointFunction` that represent the term's current parameter in `terms`.
 
-        The weights of trends are zero: the weights of single entries suffice.
+        The weights of the L trends (see the class) are zero: the W weights of single entries suffice.
         """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
@@ -81,7 +83,8 @@ class JointFunction:
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
         """Set the term's parameter in `terms` to the values that weights (P,) of the `JointFunction` represent."""
         count = self.trends.shape[1]
-        # Trends have a separate prior in the fit but no parameter in the model, so they are added to the entries.
+        # Trends (see the class) have a separate prior in the fit but no parameter in the model, so their part is added
+        # to the entries of the term.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
             # The model bounds the logarithm of a friction factor by a tanh, which is inverted here.
@@ -98,8 +101,8 @@ class JointFunction:
         if self.friction is None:
             return features @ weights
         friction = self.friction[rows]
-        # The columns of a friction factor are splines times friction, so they are divided by friction to compute the
-        # log factor. At zero friction, 0 / 0 is replaced by zero.
+        # The `features` of a friction factor are splines times friction. Divided by friction, their product with the
+        # weights is the logarithm of the factor. At zero friction, 0 / 0 is replaced by zero.
         log_factor = (features @ weights.clamp(-LOG_FACTOR_LIMIT, LOG_FACTOR_LIMIT)) / friction
         return friction * log_factor.nan_to_num().expm1()
 
@@ -124,7 +127,8 @@ class JointFunction:
         is larger: while the joint remains near a position, the error of a function of position remains constant.
         """
         samples = append_target(self.features[rows], target[rows])
-        # The error of a function of position is constant during a visit of a position, however long the visit lasts.
+        # The error of a function of position is constant during a visit of a position: the samples of a visit count as
+        # one error, however long the visit lasts.
         length = max(correlation_length, self.visit_length)
         return bayesian_ridge(samples.mT @ samples, len(samples), self.groups, length)
 
@@ -160,13 +164,14 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    Friction factors are written to the model. Position-dependent torques are returned as linear terms with the fitted
-    penalty, whose weights the next fit of the rigid-body parameters eliminates; in the model, these torques are set to
-    zero.
+    A term is fitted to the residual with its features, orthogonalized columns, which gives the weights of a joint fit
+    of the term and the rigid bodies (theorem of Frisch, Waugh and Lovell). Friction factors are written to the model.
+    Position-dependent torques are returned as linear terms with the fitted penalty. The next fit of the rigid-body
+    parameters eliminates their weights; in the model, these torques are set to zero.
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model, whose current residual terms are included.
+        samples: samples with the torque residual of the model with its current residual terms.
         projection: projection onto the rigid-body and friction model.
         selected: (parameter, joint) of the terms to refit.
         correlation_length: (n,) number of samples per independent error.
@@ -189,8 +194,8 @@ def refit_terms(
                 columns = torch.cat([terms[joint].features, columns], dim=1)
                 penalty = torch.cat([terms[joint].penalty, penalty])
             terms[joint] = LinearTerms(columns, penalty)
-            # The weights of a position-dependent torque will be eliminated. The torque in the model is set to zero, or
-            # it would count twice.
+            # The next fit will eliminate the weights of a position-dependent torque by variable projection. The torque
+            # in the model is set to zero, or it would count twice.
             weights = torch.zeros_like(weights)
         candidate.write(model.residuals, weights)
     return ProjectedTerms(terms, tuple(torques))
@@ -206,16 +211,19 @@ def joint_functions(
 
     The spline coefficients of a smooth torque or of a friction factor have one common prior precision. A smooth torque
     also has the mean and the slope of its coefficients with precisions of their own, since, unlike splines, a line
-    extrapolates to positions without samples (torque of a spring). Ripple has one precision per frequency, and only
-    frequencies of which the samples contain two periods: slower ones fit a trend, and are wrong at other positions.
+    extrapolates to positions without samples (torque of a spring). Ripple is a sum of sines and cosines of the
+    position, with one precision per frequency. Frequencies with less than two periods within the samples are omitted:
+    they would fit a trend, and be wrong at other positions.
 
-    selected: (parameter, joint) of the terms to yield; None: all.
+    projection: projection onto the rigid-body and friction model. selected: (parameter, joint) of the terms to yield;
+    None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
-    # The number of visits of a joint is 1 + path length / knot spacing of the splines.
+    # The number of visits of positions (see `JointFunction.visit_length`) is 1 + path length of the joint / knot
+    # spacing.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     # Ripple of a frequency needs a range of positions of at least two periods: width >= 2 * 2 pi / frequency.

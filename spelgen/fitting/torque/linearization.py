@@ -105,8 +105,8 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # Eigenvalues of 1 - H, with the hat matrix H, are near zero if the segment determines many parameters: the
-            # lower bound limits the correction.
+            # If a segment determines many parameters, eigenvalues of 1 - H are near zero, and (1 - H)^(-1/2) would be
+            # too large: the eigenvalues have the lower bound 1 / size.
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
@@ -226,7 +226,7 @@ def bayesian_ridge(
     gram, moment, square = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
     member = F.one_hot(groups.long()).double()  # member: (P, G), 1 if the weight is in the group, otherwise 0
     excited = gram.diagonal() > 0
-    # `size` is the number k of weights of each group, `variance` is 1 / alpha.
+    # `size` is the number k of weights of each group, `variance` is the variance of the noise, 1 / alpha.
     size, variance = member.sum(dim=0), square / count
     feature_square = (member.mT @ gram.diagonal() / count / size).clamp(min=1e-300)
     # Weights of zero would be a fixed point of the iteration. Therefore the initial precision of each group is the one

@@ -99,7 +99,9 @@ def adapt_networks(
 def select_networks(
     model: ArmModel, samples: ResidualSamples, correlation_length: float
 ) -> Iterator[SelectedTerm]:
-    """Fit the network of the potential, then the network of the mass matrix; yield the accepted ones.
+    """Fit the network of the potential, then the network of the mass matrix; yield the networks that are accepted.
+
+    A network is accepted if it significantly lowers the error on held-out samples (see `_fit_network`).
 
     Args:
         model: model with residual terms; weights of accepted networks are written to it.
@@ -136,7 +138,8 @@ def _fit_network(
 
     The network is fitted to the first half of the samples, and accepted if it significantly lowers the error on the
     last half. An accepted network is refitted to all samples; a rejected one has its initial weights. samples: samples
-    whose torque residual is the target for the sum of all residual terms.
+    whose torque residual is the target for the sum of all residual terms; the other terms are fixed.
+    correlation_length: number of samples per independent error.
     """
     initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
     noise = rms_per_joint(residual)
@@ -169,6 +172,9 @@ def _fit_network(
 
 
 def _remaining_residual(model: ArmModel, samples: ResidualSamples) -> torch.Tensor:
-    """Return the torque residual (T, n) [Nm, N] minus the torques of all residual terms of the model."""
+    """Return the torque residual of `samples` minus the torque of the model's residual terms, (T, n) [Nm, N].
+
+    samples: samples with the torque residual of the model without residual terms.
+    """
     with torch.no_grad():
         return samples.torque_residual - residual_torque(model, *samples[:3])

@@ -181,7 +181,10 @@ def torque_samples(model: ArmModel, data: TrainingData) -> TorqueSamples | None:
 def fit_torques(
     model: ArmModel, samples: TorqueSamples, config: TorqueFit, regularizer: UrdfRegularizer | None = None
 ) -> tuple[list[Diagnostic], TorqueSolution | None]:
-    """Fit a model to samples; return diagnostics, and the solution if the model consists of rigid bodies."""
+    """Fit a model to samples; return diagnostics, and the solution if the model consists of rigid bodies.
+
+    config: options of the fit. regularizer: for models of networks, penalty for differences from the URDF; None: none.
+    """
     notes: list[Diagnostic] = []
     solution = None
     if isinstance(model, RigidBodyDynamics):

@@ -93,7 +93,7 @@ class ParameterVector:
 
         Args:
             adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
-                vary from day to day (`DAY_GROUPS`); None or "unit": all groups.
+                vary from day to day (`DAY_GROUPS`); None or "unit" (another arm of the same type): all groups.
             compensated: (n,) joints whose friction compensation is free; it is fixed at all other joints.
         """
         if adapt == "load":
@@ -112,22 +112,31 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
     return torque
 
 
-def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> None:
-    """Correct initial values of trained motor gains that are wrong by a large factor.
+def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> float:
+    """Correct initial values of trained motor gains that are wrong by a large factor; return their prior width.
 
     Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
     measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
     together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
     without a significant coefficient have the median coefficient of the others.
 
-    deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the logarithm of the
-    coefficient exceeds three standard deviations.
+    A corrected gain has the same relative error as the masses in the URDF that load the joint. The prior of the gains
+    is then wide, so that the prior of all bodies determines the common scale of gains and masses.
+
+    Args:
+        model: model whose motor gains are corrected.
+        samples: samples with torques as logged, (T, n) [Nm, N].
+        deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the magnitude of the
+            coefficient's logarithm exceeds three of these standard deviations.
+
+    Returns:
+        `deviation` if no gain was changed, otherwise the upper bound of prior standard deviations.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
-        return
+        return deviation
     with torch.no_grad():
-        # The inverse dynamics are logged torques, here converted to joint torques by the initial gains.
+        # `inverse_dynamics` returns torques as logged. They are converted to joint torques by the initial gains.
         joint = model.inverse_dynamics(q, qd, qdd) @ model.input_matrix(q[:1])[0].mT
         rigid = joint - model.friction_torque(q, qd)
         # columns: (joints, T, 4), the regressor of each joint whose gain is trained: rigid-body torque, velocity, sign
@@ -143,9 +152,11 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
         slope = weights[:, 0, 0]
         known = slope > TUNING.min_significance * (correlated * variance).sqrt()
         if not known.any():
-            return
+            return deviation
         factors = -torch.where(known, slope, slope[known].median()).log()
-        inputs.raw_gains.add_(torch.where(factors.abs() > 3 * deviation, factors, 0.0))
+        wrong = factors.abs() > 3 * deviation
+        inputs.raw_gains.add_(torch.where(wrong, factors, 0.0))
+        return TUNING.max_width if wrong.any() else deviation
 
 
 def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
@@ -198,8 +209,8 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
     factor, factor_change = perturbed.real, perturbed.imag / epsilon
     relative = torch.linalg.solve_triangular(factor, factor_change, upper=True)
     added = relative + relative.mT
-    # After an overflow, the fraction cannot be computed. The whole step is returned; the solver rejects it because of
-    # its cost.
+    # If the change of S = T T^T has overflowed, the fraction that keeps S positive definite cannot be computed. The
+    # whole step is returned; the solver rejects it because of its cost.
     if not added.isfinite().all():
         return raw + step
     min_eigenvalue = torch.linalg.eigvalsh(added)[:, 0]
@@ -246,10 +257,11 @@ class ParameterPrior:
 
     Attributes:
         rigid: `ParameterVector` of the parameters x.
-        widths: current standard deviation of each group; for bodies, the scale of the t distribution.
-        hyperprior: the initial standard deviations, about which the estimates have a hyperprior.
+        widths: current standard deviation of each group of parameters; for bodies, the scale of the t distribution.
+        hyperprior: initial standard deviation of each group, the center of the hyperprior of its width (see
+            `update_widths`).
         mean: prior mean of x, (K,).
-        body_widths: current standard deviation of each body, (B,).
+        body_widths: current standard deviation of the Gaussian of each body, (B,).
     """
 
     rigid: ParameterVector
@@ -266,9 +278,10 @@ class ParameterPrior:
 
     @property
     def plausible(self) -> bool:
-        """Whether the masses of the URDF agree with the fit up to a factor of `TUNING.wrong_urdf`.
+        """Whether the masses of the URDF differ from the fitted masses by at most a factor of `TUNING.wrong_urdf`.
 
-        The factor is exp(root mean square of `body_widths`), since the logarithm of a mass is a parameter.
+        Their ratio is estimated as exp(root mean square of `body_widths`), since the logarithm of a mass is a
+        parameter.
         """
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 
@@ -288,7 +301,7 @@ def prior_covariance(
     """Return the prior covariance (K, K) of the flattened parameters.
 
     parameters: {name: values}, K values in total. groups: {name: parameter group}. widths: prior standard deviations of
-    the groups, and of the factors common to all joints.
+    the groups, and of factors common to all joints, such as one factor of all armatures (see `SHARED`).
     """
     count = sum(x.numel() for x in parameters.values())
     matrix, friction, first = torch.zeros(count, count).double(), torch.zeros(count).double(), 0
@@ -313,17 +326,17 @@ def prior_covariance(
 def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tensor) -> ParameterPrior:
     """Return the prior after one fixed-point step of evidence maximization for the widths of three groups.
 
-    The groups are bodies, armatures and torque offsets. The width s of a group is its prior standard deviation. In
-    Laplace's approximation, the marginal likelihood has its maximum at the fixed point of s^2 = |x - mean|^2 / gamma,
-    where gamma = k - tr(covariance) / s^2 is the effective number of the group's k parameters (MacKay, Bayesian
-    Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled inverse chi-squared hyperprior with c
-    degrees of freedom about its initial value s0^2, so that the fixed point is s^2 = (|x - mean|^2 + c s0^2) / (gamma +
-    c). The width has an upper bound.
+    The groups are bodies, armatures and torque offsets. The width s of a group is the prior standard deviation of its k
+    parameters, and d is the vector of their offsets x - prior mean. In Laplace's approximation, the marginal likelihood
+    has its maximum at the fixed point of s^2 = |d|^2 / gamma, where gamma = k - tr(covariance) / s^2 is the effective
+    number of parameters (MacKay, Bayesian Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled
+    inverse chi-squared hyperprior with c = `degrees_of_freedom` degrees of freedom, whose scale is the square of the
+    initial width s0. The fixed point is then s^2 = (|d|^2 + c s0^2) / (gamma + c). The width has an upper bound.
 
-    The width of a single body has a hyperprior of the same form about the common width s of all bodies. Integrated over
-    the width of the body, its prior is a t distribution with c degrees of freedom and scale s. In the fixed point for
-    s, the squared parameters of a body have the weight s^2 / (width of the body)^2 (Lange, Little and Taylor, J. Am.
-    Stat. Assoc. 84:881, 1989).
+    Each body also has a width b of its own. Its hyperprior has the same form, with the width s of all bodies in place
+    of s0. Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale
+    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2 with
+    its current width b (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
 
     Args:
         prior: current prior.
@@ -334,20 +347,21 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return sqrt((squares + c center^2) / (gamma + c)), limited by the upper bound of the group's width.
+        """Return the updated width, sqrt((squares + c center^2) / (gamma + c)), limited by the group's upper bound.
 
-        c is the number of degrees of freedom of the hyperprior.
+        c is the number of degrees of freedom of the hyperprior (see `update_widths`).
 
         Args:
-            center: width about which the hyperprior is.
-            squares: sum of squared offsets from the prior mean.
+            group: name of the group, for the upper bound.
+            center: scale of the hyperprior: the initial width s0, or for a single body the width s of all bodies.
+            squares: sum of squares of x - prior mean.
             gamma: effective number of parameters, same shape as squares.
         """
         square = (squares + freedom * center**2) / (gamma.clamp(min=0.0) + freedom)
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), sum per body
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |d|^2 of each body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}
@@ -358,7 +372,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         centring = torch.eye(count).double()
         if group in SHARED and count:
             # The common factor of all joints has a separate width. The width of single joints is therefore estimated
-            # from offsets minus their mean over the joints.
+            # from x - prior mean, minus the mean of this difference over the joints.
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = centring.trace() - spread.trace() / current[group] ** 2

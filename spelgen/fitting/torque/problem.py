@@ -5,10 +5,11 @@ each joint. The cost is the negative log posterior of x,
 
     1/2 sum over joints j of |r_j(x)|^2 / s_j^2 + 1/2 (x - m)^T P (x - m),
 
-with the torque residual r_j (T,) of joint j, its noise s_j, and a Gaussian prior of mean m and precision P (see
-`ParameterPrior`). If motor gains are trained, r is the residual of the logged torque (see
-`TorqueJacobian.squared_residual`). Noise and prior widths are estimated from the logs: outer iterations alternate
-Levenberg-Marquardt steps with updates of noise and prior widths.
+with the torque residual r_j (T,) of joint j, its noise s_j, and a Gaussian prior of mean m and precision P. The prior
+of each body is Student's t, represented by a Gaussian whose width is estimated (see `ParameterPrior`). If motor gains
+are trained, r and s refer to the joint torque at the initial gains (see `TorqueJacobian.squared_residual`): the
+residual at the current gains would vanish with the gains. Noise and prior widths are estimated from the logs: outer
+iterations alternate Levenberg-Marquardt steps with updates of noise and prior widths.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ class NoiseEstimator:
 
     s^2 is the mean squared residual times the correlation length. The sum over all samples of residual^2 / s^2 is then
     the number of independent errors instead of the number of samples. correlation_length: (n,), number of correlated
-    samples that count as one independent error. torque_std: (n,) [Nm, N], standard deviation of the torque. max_error:
-    (n,) [Nm, N], largest root mean square torque error.
+    samples that count as one independent error. The root mean square residual is limited: below by a fraction of
+    torque_std (n,) [Nm, N], the standard deviation of the torque, and above by max_error (n,) [Nm, N].
     """
 
     count: int
@@ -63,7 +64,10 @@ class NoiseEstimator:
     def of(
         cls, jacobian: TorqueJacobian, correlation_time: torch.Tensor, max_error: torch.Tensor = UNBOUNDED
     ) -> NoiseEstimator:
-        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors."""
+        """Return the estimator for the samples of a Jacobian and the correlation times (n,) [s] of their errors.
+
+        max_error: upper bound of the root mean square residual, (n,) [Nm, N].
+        """
         correlation_length = (correlation_time / jacobian.samples.interval).clamp(min=1.0)
         # The standard deviation of the torque has a lower bound, which avoids divisions by zero at joints of constant
         # torque.
@@ -76,13 +80,16 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the largest noise (n,) [Nm, N], at most the noise of a model that predicts a constant torque."""
+        """Return the largest noise (n,) [Nm, N]: for the RMS residual `max_error`, or `torque_std` if smaller."""
         return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for a squared residual, between a fraction of `torque_std` and `max_error`.
+        """Return the noise (n,) [Nm, N] for a squared residual.
+
+        The root mean square residual is at most `max_error`, and at least a fraction of `torque_std`, also if that
+        fraction exceeds `max_error`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
@@ -96,7 +103,7 @@ class NoiseEstimator:
         return torch.maximum(rms, TUNING.min_noise * self.torque_std) * self.correlation_length.sqrt()
 
     def annealed(self, squared_residual: torch.Tensor) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for an iteration of noise annealing.
+        """Return the noise (n,) [Nm, N] for an iteration of noise annealing, a sequence of fits with falling noise.
 
         This noise is `annealing_fraction` times the noise that is estimated from the residual.
 
@@ -110,9 +117,12 @@ class TorqueProblem:
     """Negative log posterior of K parameters x (K,) for a given noise and prior: a `LeastSquaresProblem`.
 
     Attributes:
+        jacobian: torque residual and its derivatives with respect to x, on T samples.
         noise: (n,) [Nm, N], scaled such that the errors of all samples can be treated as independent (see
             `NoiseEstimator`).
-        adapt: group of parameters to estimate, "load", "friction" or "unit"; None: all parameters.
+        prior: prior of x.
+        adapt: purpose of the fit, which determines the estimated parameters: "load" (last body), "friction" (friction
+            and torque offsets), "unit" (all, for another arm of the same type) or None (all).
         compensated: (n,), True for joints whose drives compensate friction (see `stages.find_compensation`).
         correlation_time: (n,) [s], correlation time of the torque errors.
         max_error: (n,) [Nm, N], upper bound of the root mean square torque error, for example the held-out error of
@@ -138,7 +148,8 @@ class TorqueProblem:
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
-        widths: initial standard deviations of the prior. The initial noise is the upper bound of the noise.
+        widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
+        root mean square torque error (see the class). The initial noise is `NoiseEstimator.upper_bound`.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -166,9 +177,9 @@ class TorqueProblem:
         """Return the problem with the noise that is estimated from the residual of unconstrained least squares.
 
         The torque is linearized at x (K,) and fitted by least squares in the inertial, drive and friction parameters,
-        without a prior and without physical consistency of the bodies. If friction were linear in its parameters, no x
-        could have a smaller residual, so this noise is a lower bound. Noise estimated from the residual of a poor
-        initial guess would be too large, and the fit would stop early.
+        without a prior and without physical consistency of the bodies. The torque is linear in these parameters except
+        for some of friction, so that no x has a much smaller residual: this noise is approximately a lower bound. Noise
+        estimated from the residual of a poor initial guess would be too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
@@ -192,9 +203,14 @@ class TorqueProblem:
         return float(((residual / self.noise.square()).sum() + penalty) / 2)
 
     def normal_equations(self, x: torch.Tensor, residual: torch.Tensor) -> NormalEquations:
-        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters."""
-        # The prior of common factors couples free and fixed parameters. Therefore the Hessian of all parameters is
-        # computed first, and the rows and columns of the free ones are selected afterwards.
+        """Return the Gauss-Newton Hessian (k, k) and negative gradient (k,) of the cost at x, for k free parameters.
+
+        residual: squared residual per joint, (n,) [Nm^2, N^2], which is not used: the residual of each sample is
+        computed here.
+        """
+        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters.
+        # Therefore the Hessian of all parameters is computed first, and the rows and columns of the free ones are
+        # selected afterwards.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -203,11 +219,11 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
 
-        step: (k,), step of the k free parameters.
+        step: (k,), step of the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
-        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the curved step
-        # may have a lower cost.
+        # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate
+        # along a curve (`curved_step`) may have a lower cost.
         yield x + change
         yield self.jacobian.curved_step(x, change)
 
@@ -269,7 +285,7 @@ class TorqueEstimate:
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
 
-        The squared residual is recomputed with the model's current choice of the friction state per joint.
+        The squared residual is recomputed with the current friction model of each joint: with or without bristles.
         """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
@@ -291,8 +307,9 @@ class TorqueEstimate:
         )
         segments = self.with_current_covariance().with_jacobian(jacobian)
         length = segments.problem.correlation_length
-        # noise^2 / (correlation length) is the mean squared residual (see `NoiseEstimator`), which does not depend on
-        # the sample interval.
+        # noise^2 is the mean squared residual times the correlation length, in samples (see `NoiseEstimator`). Only the
+        # length depends on the sample interval, so the noise is multiplied by the square root of the ratio of the
+        # lengths.
         noise = self.problem.noise * (length / self.problem.correlation_length).sqrt()
         return replace(segments, problem=replace(segments.problem, noise=noise))
 
@@ -300,8 +317,8 @@ class TorqueEstimate:
         """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
         The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
-        posterior covariance of the parameters must be current (see `with_current_covariance`): with the covariance for
-        a larger noise, this part would be too large.
+        posterior covariance of the parameters must be current (see `with_current_covariance`): the absorbed part is
+        proportional to it, and a covariance for a larger noise would be too large.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -311,7 +328,8 @@ class TorqueEstimate:
 def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
     """Alternate Levenberg-Marquardt steps with updates of noise and prior; return the MAP estimate.
 
-    The iterations end when the noise has converged.
+    The iterations end when an update lowers the noise of no joint by more than a few per cent, and after
+    `TUNING.iterations` at the latest. A noise that rises counts as converged, since the next residual is not larger.
 
     Args:
         problem: problem with initial noise and prior.
@@ -331,7 +349,10 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
 def refine(
     estimate: TorqueEstimate, samples: TorqueSamples, terms: Mapping[int, LinearTerms] = NO_TERMS
 ) -> TorqueEstimate:
-    """Return the estimate for other samples or linear terms, refitted with ``estimate`` as the warm start."""
+    """Return the estimate for other samples, or with residual terms, refitted with ``estimate`` as the warm start.
+
+    terms: {joint: residual terms whose weights are linear and are eliminated from the fit}.
+    """
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     # The noise of ``estimate`` is not used, since it was estimated from other samples or with other linear terms.
     noise = estimate.problem.noise_estimator.estimate(estimate.state.residual)
@@ -355,8 +376,9 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     interval, size = segments.problem.jacobian.samples.interval, samples.segment_length(TUNING.segment)
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
-    # `weight` is the weight of the estimated correlation time, if the weight of its prior mean is 1: a ratio of numbers
-    # of independent errors.
+    # A weighted mean is formed. The weight of the prior mean is 1. The weight of the estimated correlation time is the
+    # number of independent errors in the samples divided by `correlation_weight`, the number to which the prior mean is
+    # equivalent.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()

@@ -1,4 +1,4 @@
-"""Ridge regression of the torque on the samples of a fit, a simple method to which the fit is compared."""
+"""Ridge regression of the torque on the regressors of bodies and friction, a simple method compared with the fit."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -94,7 +94,7 @@ def _regression(
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the sum of the squared residual of each block after a fit to all other blocks, (blocks, n)."""
+        """Return the squared residual of each block, summed, (blocks, n), after a ridge fit to all other blocks."""
         weights = solution(total - grams.sum(axis=1), penalty)[:, None, :, None]
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
@@ -115,7 +115,8 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
     with torch.no_grad():
         body = pseudo_inertia(torch.tensor([DEFAULT_BODY]).double())
         # The pseudo-inertia of a body is C S C^T with the constant factor C, and its log-Cholesky parameters are the
-        # Cholesky factor of S. Here, `relative` becomes C^-1 body, then S = C^-1 body C^-T.
+        # Cholesky factor of S. `body` is the pseudo-inertia P of `DEFAULT_BODY`. The first line computes C^-1 P, the
+        # second line S = C^-1 P C^-T.
         relative = torch.linalg.solve(model.bodies.factors, body)
         relative = torch.linalg.solve(model.bodies.factors, relative.mT)
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))

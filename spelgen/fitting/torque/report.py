@@ -96,13 +96,15 @@ def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
 
 
 def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray:
-    """Return the nMSE of held-out blocks, (n,), corrected such that too small and too large values are as likely.
+    """Return a median-unbiased nMSE of held-out blocks, (n,): it is too small or too large with equal probability.
 
-    The mean of few squared errors is more often too small than too large. The sum of the squared errors of S seconds is
-    assumed to be chi-squared with S degrees of freedom, so the nMSE is multiplied by S / median of this distribution.
+    The mean of few squared errors is more often too small than too large. The sum of all squared errors is assumed to
+    be chi-squared with one degree of freedom per `TUNING.segment`, one second, since errors of models are correlated
+    over such times. The nMSE is multiplied by (degrees of freedom) / (median of this distribution).
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # The correction of the nMSE is a factor of 1.27 for three seconds of motion, and of 1.06 for twelve seconds.
+    # The correction is important only for short logs: the factor is 1.27 for three seconds of motion, and 1.06 for
+    # twelve.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 
@@ -112,11 +114,12 @@ def _few_data(
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
-    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`.
+    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`. names: (n,), names of the joints. comparison: its nMSE of
+    ridge regression is part of the text; None: no comparison.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
-    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion, up to a
-    # minute, which is enough for the recorded arms. After a minute, the cause is not the duration.
+    # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion. It is at
+    # most a minute, which is enough for the recorded arms. After a minute, the cause is not the duration.
     enough = min(math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported), 60)
     advice = f"record about {enough} s in which all joints move"
     if enough <= seconds:

@@ -2,17 +2,17 @@
 
 Several recordings are held out one at a time, or in groups if there are more than ten. A single recording is divided
 into ten contiguous blocks, which are held out one at a time, with a gap on both sides, since successive errors are
-correlated. A candidate must pass three tests:
+correlated. Every sample is held out once and then has a held-out error. A candidate must pass three tests:
 
-- The mean relative error reduction over ten blocks is significant (one-sided t test, 1 %, or 0.1 % for one or two
-  recordings).
+- The relative reduction of the held-out squared error is significant (one-sided t test over ten contiguous blocks of
+  all samples, 1 %, or 0.1 % for one or two recordings).
 - Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
   repeats errors that another motion does not have.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).
 
-If no candidate of a joint passes, the first two tests use only the held-out samples whose positions are within the
-range of the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the
-largest error reduction is selected.
+If no candidate of a joint passes, the tests are repeated without the samples whose positions are outside the range of
+the fitted samples, since splines do not extrapolate. Of the accepted candidates of a joint, the one with the largest
+error reduction is selected.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -53,13 +53,13 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if `count` samples are enough for two halves with a gap that is shorter than the first half."""
+    """Return True if `count` samples suffice: the gap between `split_halves` is at most as long as the first slice."""
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return two slices of `count` samples: the first half, shortened by a gap at its end, and the last half."""
+    """Return two slices of `count` samples: the first half, shortened by `_gap` samples, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -93,7 +93,7 @@ def select_functions(
 
     Args:
         model: model with residual terms.
-        samples: samples with the torque residual of the model, whose current residual terms are included.
+        samples: samples with the torque residual of the model with its current residual terms.
         projection: projection onto the rigid-body and friction model.
         selected: (parameter, joint) of the terms that were selected before; they are no candidates.
         correlation_length: (n,) number of samples per independent error.
@@ -105,8 +105,9 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # With two recordings, each of two fits predicts half of the ten blocks, so the errors of the blocks are not
-    # independent. The stricter test is then used, as for a single recording.
+    # With two recordings, only two fits predict the ten blocks, so the errors of the blocks are not independent. As for
+    # a single recording, a candidate must then pass the stricter test with `standard_errors_of_one`, and its torque is
+    # bounded by `max_torques`.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -118,8 +119,9 @@ def select_functions(
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
     """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
 
-    The bounds apply to terms that are selected on one or two recordings. The bound of a smooth torque is zero for
-    joints without gravity load, since springs and gas cylinders balance a load.
+    The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
+    torque splines is zero for joints without gravity load: the splines represent springs, which are built in to balance
+    a load.
 
     Args:
         model: fitted model.
@@ -148,11 +150,11 @@ def _best(
         noise: (n,) standard deviations of the torque noise [Nm, N].
         correlation_length: number of samples per independent error.
         recordings: (T,), index of the recording of each sample.
-        limits: result of `max_torques` for one or two recordings; None: no bounds.
+        limits: bounds of the term's torque, see `max_torques`, for one or two recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
-    # The second test of a candidate, a fit to the first half and its error on the last half, uses halves, since of all
-    # divisions they have the largest distance in time between fitted and held-out samples.
+    # In the second test, a candidate is fitted to the first half, and its error is computed on the last half: fitted
+    # and held-out samples have a larger distance in time than in the folds of the first test.
     first, last = split_halves(len(torque_residual), correlation_length)
     best: list[SelectedTerm | None] = [None, None]
     for candidate in candidates:
@@ -177,8 +179,9 @@ def _best(
                 best[index] = _better(
                     best[index], SelectedTerm(candidate.parameter, candidate.joint, reduction)
                 )
-    # A candidate that passes the tests on all held-out samples is preferred, since it also predicts the torque at
-    # positions outside the fitted range.
+    # `best` has two elements: the best candidate in tests on all held-out samples, and in tests on held-out samples
+    # within the fitted range of positions. The first is preferred, since it also predicts the torque outside this
+    # range.
     return best[0] or best[1]
 
 
@@ -203,8 +206,9 @@ def _blocks(count: int) -> list[slice]:
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield two masks (T,) per fold: the held-out samples, and the fitted samples.
 
-    Several recordings are held out whole. A single recording is divided into blocks, and the `gap` samples before and
-    after a held-out block are in neither mask. recordings: (T,), index of the recording of each sample.
+    Of several recordings, each fold holds out one or more, whole. A single recording is divided into blocks, and the
+    `gap` samples before and after a held-out block are in neither mask. recordings: (T,), index of the recording of
+    each sample.
     """
     # Whole recordings are held out if possible: they differ in day, load and motion, so their errors differ more than
     # the errors of blocks of one recording.
@@ -226,8 +230,9 @@ def _cross_validate(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the cross-validation error (T,) [Nm, N], and a mask (T,) of the samples without extrapolation.
 
-    The error at a sample is the error of the fit to the other folds. The mask is True if the position of the sample is
-    within the range of positions of this fit.
+    The candidate is fitted to ``target``, (T,) [Nm, N]; for the other arguments see `_best`. The error at a sample is
+    the error of the fit to the other folds. The mask is True if the position of the sample is within the range of
+    positions of this fit.
     """
     position = candidate.position
     error, within = torch.zeros_like(target), torch.zeros_like(target, dtype=torch.bool)
@@ -259,8 +264,8 @@ def significant_reduction(
         standard_errors: value of t that the mean of g over the blocks must exceed.
     """
     negligible = 2 * SELECTION.min_reduction * before.mean()
-    # If a term halves the squared error of one block and doubles the squared error of another, the relative reductions
-    # g of these blocks add up to zero.
+    # g = (before - after) / (before + after) is used because it is symmetric: if a term halves the squared error of one
+    # block and doubles the squared error of another, their values of g add up to zero.
     g = (before - after) / (before + after + negligible)
     standard_error = g.std() / len(g) ** 0.5
     if not g.isfinite().all() or g.mean() <= standard_errors * standard_error:

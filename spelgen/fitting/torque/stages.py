@@ -57,8 +57,9 @@ def _annealed_fit(problem: TorqueProblem, steps: int) -> tuple[TorqueProblem, St
     """Fit from the prior mean by noise annealing; return the problem and the last state of the solver.
 
     With the small noise of least squares, the cost far from the optimum is a narrow curved valley, along which steps
-    are small. Larger noise widens the valley and allows larger steps. Therefore the noise is a fraction of the current
-    torque residual until this is below the least-squares noise. steps: number of solver steps before this fit.
+    are small. Larger noise widens the valley and allows larger steps. Therefore the noise of each iteration is a
+    fraction of the current torque residual, but at least the least-squares noise. steps: number of solver steps before
+    this fit.
     """
     estimator, mean = problem.noise_estimator, problem.prior.mean
     problem = problem.with_least_squares_noise(mean)
@@ -85,14 +86,14 @@ def _least_squares_noise_fit(problem: TorqueProblem, state: State) -> tuple[Torq
 def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     """Return a mask (n,), True if the residual at x shows a friction compensation of the joint that is not modelled.
 
-    A drive may add a torque that compensates friction after the torque was measured. The residual then decreases with
-    velocity, which friction cannot explain. Criteria for a joint:
+    A drive may compensate friction with a torque that the measured torque does not contain. The residual then decreases
+    with velocity, which friction cannot explain. Criteria for a joint:
 
-    - The residual is regressed on velocity. The slope is negative and significant.
-    - Before this, residual and velocity are regressed on position: in a motion that does not return to its first
-      position, the torque of a spring is correlated with velocity.
-    - The torque of the regression line is a visible part of the measured torque: a delay of some milliseconds between
-      torque and motion causes a smaller negative slope.
+    - The slope of a regression of the residual on velocity is negative and significant. Linear functions of position
+      are first removed from both: in a motion that does not return to its first position, the torque of a spring is
+      correlated with velocity.
+    - The torque of the regression line exceeds a fraction of the measured torque (`TUNING.min_compensation`): a delay
+      of some milliseconds between torque and motion causes a smaller negative slope.
 
     The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
     standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
@@ -108,7 +109,8 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     # `explained` is the coefficient of determination: the fraction of the squared residual that the regression line
     # explains.
     explained = slope * products / residual.square().sum(dim=0).clamp(min=1e-300)
-    # `deviations` is the t statistic of the slope: the slope divided by its standard deviation.
+    # `deviations` is |slope| divided by the standard deviation of the slope: the t statistic of the regression on
+    # velocity.
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
     decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
     if not first:
@@ -129,9 +131,10 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of the fits with and without bristles decide (see `_rejected`). If their ratio over all joints favours
-    bristles, a joint has rate-only friction only if its torque residual is also smaller without bristles in most parts
-    of the log: the likelihood ratio of a single joint is unreliable, since the errors of a motion are correlated.
+    likelihoods of the fits with and without bristles decide (see `_rejected`), with one exception. If the likelihoods
+    of all joints together favour bristles, a joint has rate-only friction only if its torque residual on ten blocks of
+    the log is also significantly smaller without bristles (t test). The reason is that the likelihood ratio of a single
+    joint is unreliable, since the errors of a motion are correlated.
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
@@ -271,7 +274,10 @@ def fit_residual_terms(
 def _refit(
     estimate: TorqueEstimate, samples: TorqueSamples, selected: Sequence[SelectedTerm]
 ) -> TorqueEstimate:
-    """Refit friction factors, then rigid-body parameters and position-dependent torques; return the new estimate."""
+    """Refit the selected residual terms and the rigid-body parameters; return the new estimate.
+
+    Factors of friction over position are fitted first, then position-dependent torques together with rigid bodies.
+    """
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
     estimate = refine(estimate, samples, projected.terms)

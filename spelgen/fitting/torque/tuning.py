@@ -21,8 +21,8 @@ DAY_TO_DAY = {
 class TorqueTuning:
     """Constants of fits of rigid-body models to torques (`fitting.torque`)."""
 
-    # [1] Only every second sample is used. After the low-pass filter at 8 Hz, 50 of 100 samples per second contain all
-    # information.
+    # [1] Only every second sample is used. Samples have a common rate of 100 Hz; after the low-pass filter at 8 Hz, 50
+    # samples per second contain all information.
     decimation: int = 2
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
@@ -35,9 +35,9 @@ class TorqueTuning:
     correlation_weight: float = 30.0
     # [s] Duration of the segments from which the correlation time is estimated.
     segment: float = 1.0
-    # [1] Upper bound of an estimated prior standard deviation: exp(3) is a factor of 20 for masses and armatures; for
-    # torque offsets it is three times the typical friction. Logs that need more are of another arm than the URDF, or
-    # not in Nm.
+    # [1] Upper bound of an estimated prior standard deviation: for the logarithms of masses and armatures, 3 is a
+    # factor of exp(3) = 20; for torque offsets, 3 is three times the typical friction. Logs that need more are of
+    # another arm than the URDF, or not in Nm.
     max_width: float = 3.0
     # [1] Largest number of outer iterations; each makes Levenberg-Marquardt steps and then updates noise and prior.
     iterations: int = 20
@@ -75,7 +75,7 @@ class TorqueTuning:
     # from zero by this number of its standard deviations.
     min_significance: float = 4.0
     # [1] Smallest standard deviation of the torque of a friction compensation, as a fraction of the torque's standard
-    # deviation. Delays of milliseconds have a similar but smaller effect.
+    # deviation. Delays of milliseconds between torque and motion have a similar but smaller effect on the residual.
     min_compensation: float = 0.05
     # [1] Number of samples per block in computations of the torque Jacobian: a block and its derivatives need some 100
     # MB of memory for seven joints.
@@ -101,10 +101,11 @@ class TorqueTuning:
     # predicted motion is unreliable.
     weak_acceleration: float = 2.0
     # [1] Prior standard deviations of an adapted fit, for each value of the option `adapt`; the prior mean is the
-    # source fit. load: exp(3) is a factor of twenty for the mass. A larger value is too wide for short logs: with 10, a
-    # fit to half a second of motion of a UR10e predicts torques with an nMSE of 27. friction: temperature changes the
-    # common factor of all joints by tens of per cent, the factors of single joints by less (Bittencourt and Gunnarsson,
-    # J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of the same type also differ in mass, by a few per cent.
+    # source fit. load: exp(3) is a factor of twenty for the mass. A larger standard deviation is too wide for short
+    # logs: with 10, a fit to half a second of motion of a UR10e predicts torques with an nMSE of 27. friction:
+    # temperature changes the common factor of all joints by tens of per cent, the factors of single joints by less
+    # (Bittencourt and Gunnarsson, J. Dyn. Sys. Meas. Control 134:051013, 2012). unit: arms of the same type also differ
+    # in mass, by a few per cent.
     priors: Mapping[Adaptation, GaussianPrior] = field(
         default_factory=lambda: {
             "load": GaussianPrior(bodies=3.0),
@@ -126,7 +127,8 @@ class ResidualTuning:
     # freedom.
     standard_errors: float = 2.82
     # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
-    # `standard_errors`, since the motion of few recordings may repeat the errors of the model.
+    # `standard_errors`, since held-out and fitted motion of few recordings may be similar, with the same errors of the
+    # model.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.

@@ -1,0 +1,65 @@
+"""A fault of one of several recordings is an error that names this recording, and gives no line for all of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from servo_arm import servo_logs, write_servo_arm
+from test_log_geometry import arm, recorded  # noqa: F401
+
+import spelgen
+from spelgen.log_checks.check_logs import check_logs
+
+OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
+
+
+def reversed_joint(log, k, quantities):
+    sign = 1.0 - 2.0 * (np.arange(log.q.shape[1]) == k)
+    return replace(log, **{name: getattr(log, name) * sign for name in quantities})
+
+
+FAULTS = {
+    "joint-sense": lambda log: reversed_joint(log, 1, ("q", "qd")),
+    "torque-sense": lambda log: reversed_joint(log, 1, ("tau",)),
+    "torque-unit": lambda log: replace(log, tau=1000 * log.tau),
+}
+
+
+@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
+@pytest.mark.parametrize("code", FAULTS)
+def test_the_recording_whose_torques_contradict_the_others_is_named(arm, code):  # noqa: F811
+    logs = [replace(recorded(arm, 10 + k), name=f"run {k}") for k in range(4)]
+    assert check_logs(logs, arm).errors == ()
+    logs[2] = FAULTS[code](logs[2])
+    (error,) = map(str, check_logs(logs, arm).errors)
+    assert "trajectory run 2, " in error and OF_ONE in error and f"--accept {code}" not in error
+    assert "write '" not in error
+
+
+SERVO_FAULTS = {
+    "move against commands": lambda log: replace(log, u=log.u * [1, -1]),
+    "commands that other joints follow": lambda log: replace(log, u=log.u[:, ::-1]),
+    "above the positions throughout": lambda log: replace(log, u=log.u + np.array([0, 1.0])),
+    "positions in rad": lambda log: replace(log, q=np.radians(log.q), u=np.radians(log.u)),
+}
+
+
+@pytest.mark.parametrize("text", SERVO_FAULTS)
+def test_the_recording_of_servos_with_a_fault_is_named(tmp_path, text):
+    servos = spelgen.load_arm(write_servo_arm(tmp_path, "input: position\nlogs: {units: {q: deg}}\n"))
+    mapping = servos.settings.logs
+    logs = [replace(x, mapping=mapping) for x in servo_logs(4, 12.0)]
+    assert check_logs(logs, servos).errors == ()
+    logs[1] = SERVO_FAULTS[text](logs[1])
+    errors = list(map(str, check_logs(logs, servos).errors))
+    assert len(errors) == 1 and text in errors[0]
+    assert "trajectory motion 1" in errors[0] and OF_ONE in errors[0] and "write '" not in errors[0]
+
+
+def test_a_unit_of_one_recording_is_no_advice_for_all(tmp_path):
+    servos = spelgen.load_arm(write_servo_arm(tmp_path))
+    logs = servo_logs(3, 12.0)
+    logs[1] = replace(logs[1], q=np.degrees(logs[1].q), qd=np.degrees(logs[1].qd), u=np.degrees(logs[1].u))
+    (error,) = map(str, check_logs(logs, servos).errors)
+    assert "trajectory motion 1" in error
+    assert "if this is true of all recordings; else correct this one, or leave it out" in error
