@@ -112,7 +112,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 
 
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
-    """Return the indices of the recordings whose torques contradict those of the other recordings; at most half of all.
+    """Return the indices of the recordings whose torques contradict the torques of the others; at most half of all.
 
     Without the recording, the torques of the others determine parameters that explain them, and not the recording.
     """

@@ -75,8 +75,8 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
-    # [1] Smallest ratio of a recording's squared torque residual to that of the other recordings, to which the model is
-    # fitted, if the recording has another fault than the others.
+    # [1] Smallest ratio of a recording's squared torque residual to the residual of the other recordings, to which the
+    # model is fitted, if the recording has another fault.
     deviation: float = 5.0
     # [1] Relative residual variance above which a hypothesis is no advice. Mended logs of recorded arms have at most
     # 0.07 in the mean of the joints, and at most 0.27 at a joint whose torque is mostly friction.
