@@ -289,7 +289,7 @@ class ServoLogs:
     def _check_geometry(self, summary: Findings) -> None:
         """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Servos that no hypothesis explains, for example those with backlash, are not tested.
+        Servos that no hypothesis explains, for example servos with backlash, are not tested.
         """
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
@@ -298,8 +298,8 @@ class ServoLogs:
         if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
             return
         unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
-        # The cost must fall twice as much as for torques: with times stretched by two, the best wrong hypothesis lowers
-        # it by 20, and right ones by 40 to 240, on simulated arms.
+        # The cost must fall by double the bound for torques: with times stretched by two, the best wrong hypothesis
+        # lowers it by 20, and right ones by 40 to 240, on simulated arms.
         is_sure = better and better[0].cost < unchanged.cost - 2 * GEOMETRY.needed
         if not is_sure or better[0].errors.max() > GEOMETRY.explained:
             return
@@ -417,7 +417,7 @@ def _command_faults(
             got, do = "commands that other joints follow, and these do not", "check the names of the columns"
             faults[k] = CommandFault(got, "their own commands", keys, do)
     of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, log)
-    # Correlation and gain are those at the delay of largest correlation, so that a slow servo is not reported as a
+    # Correlation and gain are measured at the delay of largest correlation, so that a slow servo is not reported as a
     # fault.
     for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
         if k in faults:
