@@ -228,8 +228,8 @@ def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
 
     Let c be the joint of the row. There are two possible reasons:
 
-    - The joints of the columns are coaxial or, if prismatic, parallel. Each of these joints gives the bodies between c
-      and the tip the same velocity field, up to its sign.
+    - The joints of the columns are coaxial or, if prismatic, parallel. Each of these joints gives the bodies from c
+      to the tip the same velocity field, up to its sign.
     - Joint c is the last joint, its body is dynamically balanced about the axis of c (see `Axes`), and the joints of
       the columns are revolute and parallel. The entries then depend only on the angular velocities, which are equal up
       to sign.
