@@ -71,7 +71,7 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the URDF of the fit, for the baselines that were fitted to the training logs; None without baselines.
+        """Arm of the URDF of the fit, for the baselines that were fitted to the training logs; None without them.
 
         The baselines use its kinematics. Raises UrdfError, ArmError or SettingsError.
         """

@@ -69,7 +69,7 @@ class GaussianPrior(Group):
         shared_fractions: Part of the logit of one bristle fraction that is equal for all joints.
         shared_friction: Logarithm of a factor on all friction of all joints.
         friction_compensation: Torque per velocity with which a drive compensates friction, divided by typical friction
-            per typical speed. It is fitted only if the logs show such a torque.
+            per typical speed. It is fitted only if the logs, or implausible masses, indicate such a torque.
         degrees_of_freedom: Not a standard deviation. If a standard deviation is estimated from fitted parameters, its
             initial value has the weight of this number of further parameters. The standard deviation of each single
             body is estimated with the same weight, so that the prior of its parameters is a Student-t distribution with
