@@ -69,7 +69,10 @@ CHOICES: dict[str, tuple[str, ...]] = {name: get_args(kind) for name, kind in ge
 
 
 def load_design(preset: str | Path | Design) -> Design:
-    """Return the design with the name of a preset of spelgen, or in a YAML file. Raises SettingsError."""
+    """Return the design of a preset, given by its name, or of a YAML file, given by its path.
+
+    A `Design` is returned unchanged. Raises SettingsError for an unknown name or an invalid file.
+    """
     if isinstance(preset, Design):
         return preset
     # The name of a preset takes precedence over a file of the same name without a suffix.

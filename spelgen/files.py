@@ -43,9 +43,9 @@ def read_bytes(
     Args:
         path: the file.
         error: exception for an absent, unreadable or too large file.
-        kind: description of the expected file.
+        kind: description of the expected file, for the message about a path that is no regular file; None: omitted.
         largest: largest size [bytes].
-        do: advice for a file that is too large.
+        do: advice in the message about a file that is too large; None: no advice.
     """
     try:
         # The size of the file is checked before it is read: a sparse file can have many gigabytes without occupying
@@ -134,10 +134,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager in which an OSError about `path` gets this file name; an OSError about another file is unchanged.
+    """Context manager that sets the file name of an OSError about `path` to `path`; other errors are unchanged.
 
-    An error without a file name, such as the error on a full disk, is regarded as an error about `path`, as is an error
-    about the hidden file of `replacing`: the name of the hidden file contains the name of `path`.
+    An error is about `path` if it has no file name, as on a full disk, or if its file name contains the name of `path`,
+    as the name of the hidden file of `replacing` does.
     """
     try:
         yield

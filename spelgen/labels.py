@@ -103,7 +103,7 @@ def joints_in_words(joints: Sequence[int]) -> str:
 
 
 def axes_in_words(joints: Sequence[int]) -> str:
-    """Return the axes of joint indices (from 0) in words: ``the axis of joint 2``, ``the axes of joints 2 and 3``."""
+    """Return the axes of joint indices (from 0) in words: ``the axes of joints 2 and 3`` for (1, 2)."""
     return f"the {'axes' if len(joints) > 1 else 'axis'} of {joints_in_words(joints)}"
 
 
@@ -157,5 +157,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor: of the predictors with a disturbance observer, only the trained model."""
+    """Return True if charts show a predictor: the model with a disturbance observer, or any without one."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

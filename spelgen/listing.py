@@ -80,7 +80,10 @@ def _fitted(columns: Sequence[Sequence[str]]) -> list[Sequence[str]]:
 
 
 def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
-    """Return groups of column indices: the names of rows and the columns of one group fit into the page width."""
+    """Return groups of column indices: the columns of one group, next to the names of rows, fit into the page width.
+
+    columns: texts of each column; column 0 has the names of the rows and is in no group.
+    """
     # Names of rows are wrapped before the table is split; numbers cannot be wrapped.
     words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
     room = WIDTH - 2 - max(MIN_NAME, _width(words))

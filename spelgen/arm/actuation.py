@@ -49,10 +49,10 @@ class Drives(NamedTuple):
 class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
-    A motor that drives several joints has an entry, joint torque per motor torque, for each of its joints. If the logs
-    contain motor torques, the entries of such motors are in ``entries``, with all other entries of G. If the logs
-    contain joint torques, G is the identity for the driven joints; the entries of such motors are then in ``couplings``
-    and determine only the motor speeds (see `drives`).
+    A motor that drives several joints couples them: it has an entry, joint torque per motor torque, for each of its
+    joints. If the logs contain motor torques, these entries are entries of G, in ``entries``. If the logs contain joint
+    torques, G is the identity for the driven joints. The entries of coupling motors are then in ``couplings`` and
+    determine only the motor speeds (see `drives`).
     """
 
     joints: int

@@ -357,7 +357,11 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of revolute joints in ``moved`` whose parent is the body of ``frame``, parallel to ``axis``."""
+    """Return the names of revolute joints in ``moved`` that are on the same body and parallel to ``axis``.
+
+    frame: frame of a link of this body, which is the parent of the joints; [] for the root link. axis: direction (3,)
+    in the frame of the body.
+    """
     # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
     return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

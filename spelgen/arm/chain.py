@@ -147,8 +147,8 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    1. If the last joint is a jaw of a gripper, it is omitted. Jaws are two or more prismatic joints with the same
-       parent link: the last joint with its mimic joints, and the last joints of the other longest chains.
+    1. The last joint is omitted if it is a jaw of a gripper: the last joints of all longest chains, together with the
+       joints that mimic the last joint, must be two or more prismatic joints with the same parent link.
     2. If there are no jaws and several chains are the longest, the chain with effort limits of all joints is returned.
        Raises ArmError if no chain, or more than one, has these limits.
     """

@@ -73,7 +73,10 @@ class AngleRounding:
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
-        """Return the exact inertia tensor (3, 3) [kg m2] in the inertial frame; tiny products of inertia become 0."""
+        """Return the inertia tensor (3, 3) [kg m2] in the inertial frame as exact fractions of the numbers in the URDF.
+
+        Products of inertia below 1e-12 times the largest moment of inertia become 0, unless rounding is disabled.
+        """
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
             # CAD programs export products of inertia such as 1e-18 in place of 0 for symmetric parts.
@@ -134,10 +137,10 @@ class Frame(NamedTuple):
 
     Attributes:
         body: index of the body of the link, -1 for the root link.
-        rotation, position: exact rotation (3, 3) and position (3,) [m] of the link in the frame of this body.
-        composed: float64 rotation (3, 3) of the link relative to the start of its segment: the last body with a
-            revolute joint on the path from the root to the link, or the root. The exact rotations of the segment are
-            approximated from `composed`.
+        rotation, position: rotation (3, 3) and position (3,) [m] of the link in the frame of this body, as fractions.
+        composed: float64 rotation (3, 3) of the link relative to the start of its segment, from which `rotation` is
+            approximated. A segment starts at the root or at a body with a revolute joint. Bodies with prismatic joints
+            continue the segment, so that all rotations within it are constant.
     """
 
     body: int
@@ -252,13 +255,13 @@ class Placement:
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
-        """Return the exact rotation (3, 3) of a frame relative to a body, from its rotation in float64.
+        """Return the rotation (3, 3) of a frame relative to a body as fractions, approximated from float64.
 
         A zero element of a rotation means that an axis of the frame is normal to an axis of the body. Such zeros may
-        occur relative to each body of the segment, the bodies since the last revolute joint. A rational approximation
-        of the rotation relative to one body preserves the zeros relative to this body only. The rotation is therefore
-        approximated relative to each body of the segment in turn, and the approximation that preserves most zeros is
-        used.
+        occur relative to each body of the segment: the bodies since the last revolute joint, or since the root. A
+        rational approximation of the rotation relative to one body preserves the zeros relative to this body only. The
+        rotation is therefore approximated once per body of the segment. The approximation that preserves most zeros is
+        converted to the frame of ``body`` and returned.
 
         Args:
             body: index of the body, -1 for the root link.

@@ -116,7 +116,8 @@ def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -
 
     Elements differ by less than ``error``. The components of the quaternion, divided by the largest one, are replaced
     by close fractions: the rotation matrix of any rational quaternion is rational (Euler-Rodrigues). If a zero element
-    of ``rotation`` becomes nonzero in this way, `_rotation_with_zero` is used, which preserves the first zero element.
+    of ``rotation`` becomes nonzero in this way, `_rotation_with_zero` is used: the product of two rotations with errors
+    below ``error``. The construction of this product preserves one zero element, the first one.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY

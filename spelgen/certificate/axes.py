@@ -1,8 +1,9 @@
 """Tests of geometric relations between joint axes at all configurations, and of the mass balance of the last body.
 
-The results are proofs of the reasons for the structure of M and the potential energy V. A relation, such as parallel
-axes, is tested in exact arithmetic at two random rational configurations. A relation that is false at some
-configurations passes this test with a probability below 1e-9 (Schwartz 1980, Zippel 1979).
+The results are the reasons for the structure of M and the potential energy V. A relation, such as parallel axes, is
+tested in exact arithmetic at two random rational configurations. A relation that is false at some configurations passes
+this test with a probability below 1e-9 (Schwartz 1980, Zippel 1979). The mass balance is the position of the centre of
+mass and of the principal axes relative to the last joint axis (see `Axes`).
 """
 
 import random
@@ -100,10 +101,10 @@ class Axes:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
         The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
-        ``hinge`` and is parallel to the axis of ``slider``. The signed distances must be constant for all motions of
-        the joints after ``hinge``. The entry of M in the row of ``slider`` and the column of ``hinge`` is then
-        constant: if ``hinge`` rotates, the velocity of a point along ``slider`` is proportional to its distance from
-        the plane.
+        ``hinge`` and is parallel to the axis of ``slider``. If ``hinge`` rotates, the velocity of a point along
+        ``slider`` is proportional to its signed distance from the plane. If the distances are constant for all motions
+        of the joints after ``hinge``, the entry of M in the row of ``slider`` and the column of ``hinge`` is therefore
+        constant. If the two axes are parallel, the velocity along ``slider`` is zero for any such plane.
         """
         # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
         # any plane that is fixed to the child link of `hinge`.
@@ -150,12 +151,15 @@ def _configuration(arm: Chain, generator: random.Random) -> tuple[list[np.ndarra
 
 
 def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return True if two vectors are parallel at both configurations, (2, k) each."""
+    """Return True if two vectors of fractions, (2, k) each, are exactly parallel at both configurations of `Axes`."""
     products = a[:, :, None] * b[:, None, :]
     return not (products - products.mT).any()
 
 
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
-    """Return True if no point of a body with ``twist``, (2, 6), has a velocity along ``direction``, (2, 3) or (3,)."""
+    """Return True if no point of a body has a velocity component along ``direction``, (2, 3), or (3,) if constant.
+
+    twist: linear velocity, then angular velocity of the body, (2, 6): one row per configuration of `Axes`.
+    """
     v, w = np.split(twist, 2, axis=-1)
     return not (v * direction).sum(axis=-1).any() and not np.cross(w, direction).any()

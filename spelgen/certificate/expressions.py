@@ -50,7 +50,7 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Conversion of polynomials, coefficients of inertial parameters in M or in the potential energy, to SymPy terms.
+    """Conversion to SymPy terms of the polynomials that multiply inertial parameters in M or in the potential energy.
 
     The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position of each coordinate (see
     `Expansion`).

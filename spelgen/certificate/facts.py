@@ -65,8 +65,8 @@ class _Sentences:
 
     Attributes:
         structure: structure of the arm.
-        axes: tests of the joint axes, which prove the reasons of facts; None for an arm with branches or mimic joints,
-            whose facts have no reasons.
+        axes: tests of the joint axes, from which the reason for a fact is derived, for example that two axes are
+            parallel; None for an arm with branches or mimic joints, whose facts are given without reasons.
     """
 
     structure: Structure
@@ -226,10 +226,13 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    Let c be the joint of the row. The first possible reason is that the joints of the columns are coaxial or, if
-    prismatic, parallel: each of these joints gives the bodies that c carries the same velocity field, up to its sign.
-    The second is that c is the last joint, its body is dynamically balanced, and the joints of the columns are revolute
-    and parallel: the entries then depend only on the angular velocities, which are equal up to sign.
+    Let c be the joint of the row. There are two possible reasons:
+
+    - The joints of the columns are coaxial or, if prismatic, parallel. Each of these joints gives the bodies from c
+      to the tip the same velocity field, up to its sign.
+    - Joint c is the last joint, its body is dynamically balanced about the axis of c (see `Axes`), and the joints of
+      the columns are revolute and parallel. The entries then depend only on the angular velocities, which are equal up
+      to sign.
 
     entries: (row, column) of each entry, counted from 0.
     """

@@ -157,7 +157,10 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
 
 
 def _comments(formulas: Formulas, mark: str) -> list[str]:
-    """Return the names of robot, joints and bodies, and the omitted entries, as comments that begin with ``mark``."""
+    """Return comments that begin with ``mark``: names of robot, joints and bodies, and entries without expression.
+
+    Entries of M, or V, have no expression if their closed forms have too many terms.
+    """
     arm = formulas.arm
     lines = [f"{mark} Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):

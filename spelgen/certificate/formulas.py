@@ -138,7 +138,7 @@ class Formulas:
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The formulas with an expression, of entries of M or of the potential energy V."""
+        """The formulas with an expression, of entries of M or of V; a formula with too many terms has no expression."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
@@ -197,7 +197,9 @@ def formulas(
 
 
 class _Writer:
-    """Computes closed forms of entries of M and of the potential energy V; the expansion is prepared only once.
+    """Computes closed forms of entries of M and of the potential energy V.
+
+    M and V are prepared only once, for all entries, for their expansion to polynomials (`Expansion`).
 
     Attributes:
         base: base parameters in the closed forms.

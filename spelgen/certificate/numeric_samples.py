@@ -121,11 +121,12 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tuple[float, float]]:
-    """Return {quantity, such as "masses and inertias": largest relative differences of two readings of the URDF}.
+    """Return {quantity, such as "masses and inertias": two largest relative differences of readings of the URDF}.
 
-    The first difference is between Pinocchio and spelgen's chain without rounding of angles, the second between
-    spelgen's chains with and without rounding. Joint axes, masses and inertias are compared at random configurations.
-    Raises the exceptions of Pinocchio, and ValueError if the file has changed.
+    The URDF is read by Pinocchio, by spelgen, and by spelgen without rounding of angles such as 1.5708 to pi/2. The
+    first difference is between Pinocchio and spelgen without rounding, the second between spelgen with and without
+    rounding. Both are relative to the values without rounding. Joint axes, masses and inertias are compared at random
+    configurations. Raises the exceptions of Pinocchio, and ValueError if the file has changed.
 
     robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random configurations.
     """

@@ -225,10 +225,10 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
 
 
 def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact, with the numbers that test it, that M = sum_k c_k A_k + sum_j f_j(q) B_j (minimal form).
+    """Return the fact that M = sum_k c_k A_k + sum_j f_j(q) B_j with the fewest terms (minimal form), and its test.
 
     c_k are constants, f_j functions (outputs), A_k and B_j constant matrices. Each f_j must depend only on its own
-    joints, the c_k on no joint.
+    joints, the c_k on no joint, and the remainder of M must be zero. `_ranks` tests that no form has fewer terms.
     """
     n = len(structure.joints)
     remainder = samples.mass
@@ -257,10 +257,11 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
 
     Outputs are the terms that vary with q, constants the other terms; all terms are linearly independent. A matrix has
-    one column per entry of M. First, the number of outputs must be the rank of the changes of M, with one row per
-    configuration and moved joint. Second, the number of outputs and constants must be the rank of M itself, with one
-    row per configuration. Third, for each k, the number of outputs that depend on any of the first k joints must be the
-    rank of the changes due to these joints.
+    one column per entry of M. A change of M is its difference if one joint moves to another random position. First, the
+    number of outputs must be the rank of all changes of M, one row per configuration and moved joint. Second, the
+    number of outputs and constants must be the rank of M itself, one row per configuration. Third, for each k, the
+    number of outputs that depend on any of the first k joints must be the rank of the changes of M if one of these
+    joints moves.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
@@ -281,9 +282,9 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 
 
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
-    """Return the fact that the potential energy V depends only on the derived joints, with the numbers that test it.
+    """Return the fact that the potential energy V depends only on the joints `structure.potential`, and its test.
 
-    The numbers are gravity torques dV/dq in `samples`: zero at all other joints, nonzero at the derived joints.
+    The test uses the gravity torques dV/dq in `samples`: zero at all other joints, nonzero at these joints.
     """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):

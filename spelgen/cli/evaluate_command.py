@@ -242,7 +242,11 @@ def compare(
 
 
 def _comparison(target: Path, logs: list[Path], mapping: Path | None) -> Comparison:
-    """Return the comparison on the arm of a URDF with these logs, or the comparison that a YAML file specifies."""
+    """Return the comparison of presets on the arm of the URDF `target`, or as specified by the YAML file `target`.
+
+    logs, mapping: logs of the arm of the URDF, and mapping of their columns. UsageError if they are given with a YAML
+    file.
+    """
     from spelgen.comparison.arms import YAML, ComparedArm, Comparison, load_comparison
 
     if target.suffix not in YAML:

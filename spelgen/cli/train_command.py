@@ -111,10 +111,11 @@ def train(
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
     """Write the noise levels of the live estimator into the run folder; return the payload in the logs, or None.
 
-    A new fit of rigid bodies to torques estimates the noise levels from its logs. A run that was adapted from the run
-    in the folder `source` gets a copy of the noise levels of that run, if there are any. The payload is estimated only
-    for `adapt=load`, with the model and the noise levels of `source`; in all other cases the result is None. `source`
-    is None for a new fit.
+    A new fit of rigid bodies to torques estimates the noise levels from its logs; it has no payload.
+
+    A run that was adapted from the run in the folder `source` gets a copy of the noise levels of that run, if there are
+    any. For `adapt=load`, these noise levels and the model of `source` are used to estimate the payload. In all other
+    cases the result is None. `source` is None for a new fit.
     """
     from spelgen.live.levels import cross_validated_levels
     from spelgen.live.noise import keep_levels, stored_levels

@@ -167,8 +167,9 @@ def arm_inputs(
 ) -> ArmInputs:
     """Return the input files of the runs on an arm: URDF, mapping and logs.
 
-    If the arm has no logs, logs are simulated and written to ``folder``, together with the URDF that models may use.
-    splits: number of folds; LogError if there are too few trajectories. progress: argument of `simulate`.
+    If the arm has no logs, logs are simulated and written to ``folder``. Models of a simulated arm are built from a
+    copy of the URDF in this folder, without inertials, drives and friction. splits: number of folds; LogError if there
+    are too few trajectories. progress: argument of `simulate`.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """

@@ -61,9 +61,11 @@ class SimulatedFigures:
     """Results of one model of a simulated arm, for the comparison with other models.
 
     Attributes:
-        losses: {row of a table: squared prediction error, or relative error of M (see `mass_error`)}.
-        sizes: {row of a table: size of a network, duration of a training step, smallest eigenvalue of M, or rise of
-            energy}.
+        losses: {row of a table: squared prediction error (see `prediction_loss`), or relative error of M
+            (`mass_error`)}.
+        sizes: {row of a table: any other figure}: numbers of network outputs, inputs and parameters, duration of a
+            training step [ms], relative smallest eigenvalue of M, and relative rise of energy (see
+            `evaluation.rollout`).
     """
 
     losses: Figures

@@ -201,7 +201,8 @@ def run_job(job: Job) -> RunResult:
 def _own_checkpoint(job: Job, run: RunFolder) -> bool:
     """Return True if the run folder contains an interrupted fit with the same inputs, which can be resumed.
 
-    A fit with other inputs, recognized by its key in job.json (see `Job.key`), is discarded.
+    Otherwise, this function prepares the folder for a new fit: it deletes the config.json of a fit with other inputs,
+    recognized by its key in job.json, and writes the key of this job (see `Job.key`).
     """
     owner = job.folder / "job.json"
     if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:

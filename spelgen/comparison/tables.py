@@ -27,7 +27,10 @@ The row below contains the loss of the baseline (`BASELINE`) divided by the loss
 
 @dataclass(frozen=True)
 class ArmResults:
-    """The results of one arm: the preset with the smallest error, a sentence, and tables (the main result first)."""
+    """The results of one arm: the preset with the smallest error, and tables (the main result first).
+
+    sentence: text that compares the error of the best model with the errors of the other models.
+    """
 
     name: str
     best: str

@@ -117,9 +117,9 @@ def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
 
 
 def _sum(sums: Sums, terms: tuple[Tensor, ...]) -> Tensor | float:
-    """Return a linear combination of terms, (...,) each, with the order of operations of a module's source.
+    """Return a linear combination of terms, (...,) each, computed as in the source text of the emitted module.
 
-    sums: pairs (factor, index of a term).
+    The order of operations is the same, so that rounding errors are equal. sums: pairs (factor, index of a term).
     """
     # Negative terms are subtracted, as in the module's source, so that rounding errors are equal.
     total: Tensor | float = 0

@@ -105,7 +105,8 @@ def base_class(spec: ModelSpec) -> str:
 def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
     """Return ``fields`` without arguments that have their default values, so that the rows of a module are short.
 
-    fields: {name of a keyword argument: value}. is_default: True for names of arguments with their default values.
+    fields: {name of a keyword argument: value}. is_default: {name of an argument: True if its value is the default};
+    absent arguments are kept.
     """
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
@@ -223,8 +224,9 @@ def _mass_network(spec: ModelSpec) -> Call:
 def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
-    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. Both rows
-    are equal: the root mean square change of M if only one coordinate changes, divided by the largest such change.
+    The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. The rows are
+    equal, since a factor depends only on the joint: it is the root mean square change of M if only this coordinate
+    changes, divided by the largest such change of all coordinates.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
@@ -265,12 +267,12 @@ def _network(
     depth: int | None = None,
     min_units: int = 1,
 ) -> Call:
-    """Return the constructor call of a network, ``MaskedMLP`` or ``MaskedKAN``, as the design states.
+    """Return the constructor call of a network: ``MaskedKAN`` if the design has ``net: kan``, else ``MaskedMLP``.
 
     Args:
         spec: specification of the model, with width and depth of networks.
         outputs: names of the joints that each output depends on, as a tuple, or as a call that returns them.
-        scales: rows with the scales of the inputs, (n,) each.
+        scales: scales of the inputs, one row (n,) per input of a joint, such as cos q and sin q.
         width: number of hidden units per layer; None: ``units(spec)``.
         depth: number of hidden layers; None: the option of the specification.
         min_units: smallest number of hidden units per group of outputs that depend on the same joints.
@@ -331,10 +333,11 @@ def term_names(spec: ModelSpec) -> list[str]:
 
 
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
-    """Return the lower triangle of the nominal mean of M without armature, (n, n) [kg m^2, kg m, kg], rounded.
+    """Return the lower triangle of the mean of M without armature, (n, n) [kg m^2, kg m, kg], to 6 significant digits.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
-    outputs, constants: terms of M, with the nominal means of the outputs and values of the constants.
+    outputs, constants: terms of M, functions of q with their means over these positions, and constants with their
+    values.
     """
     mean = np.zeros((n, n))
     for constant in constants:

@@ -87,7 +87,7 @@ def flat(value: object) -> str:
 
 
 def _items(value: object) -> list[tuple[str, object]]:
-    """Return (prefix, item) for each item of a call, a dictionary or a tuple; [] for other values.
+    """Return (prefix, item) for each argument of a ``Call``, or item of a dictionary or tuple; [] for other values.
 
     The prefix is "key=" for a keyword argument of a call, "key: " for a dictionary, otherwise "".
     """

@@ -30,10 +30,12 @@ class Runtime(NamedTuple):
 
 
 def bundle(arm: str, model: str) -> dict[str, object]:
-    """Return the source of the runtime that a standalone module needs, directly or through other definitions.
+    """Return the variables of the template of standalone modules, with the runtime that the module needs.
 
-    The result has the variables of the template: ``imports``; ``rows``, the text that precedes the tables of the arm;
-    ``runtime``, the text that follows the tables; ``contents``, the names of the classes and functions in ``runtime``.
+    The runtime consists of the definitions that the module uses, and of all definitions that these use in turn. The
+    variables are ``imports``; ``rows``, the classes of the rows of the arm's tables, which must precede the tables;
+    ``runtime``, the definitions that follow the tables; ``contents``, the names of the classes and functions in
+    ``runtime``.
 
     arm, model: source texts of the module's tables and of its class ``Model``.
     """

@@ -71,7 +71,7 @@ def evaluate(
         arm: result of ``load_arm``, or the path of a URDF; by default the arm of the fit. It is needed for the URDF as
             a baseline, and for tip errors.
         baselines: dynamics by name, evaluated in addition to the baselines of `baselines.registry`, for example
-            ``{"truth": identify(...).dynamics}``.
+            ``{"identified": identify(...).dynamics}``.
         preprocessing: filter and delay of states and torques; by default the preprocessing of the fit.
         steps: prediction horizons [samples].
         seconds: prediction horizons [s]. Horizons longer than every trajectory are omitted, with a note.

@@ -71,9 +71,9 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the baselines that were fitted to the training logs; None if there are none.
+        """Arm of the URDF of the fit, for the baselines that were fitted to the training logs; None without them.
 
-        Raises UrdfError, ArmError or SettingsError.
+        The baselines use its kinematics. Raises UrdfError, ArmError or SettingsError.
         """
         if self.fitted_urdf is None or not self.baselines:
             return None

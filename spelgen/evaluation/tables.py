@@ -34,7 +34,7 @@ class Row:
     ranked: bool = True
 
     def text(self, column: str) -> str:
-        """Return the number of a column in this row as text; an empty text if the column has no number."""
+        """Return the value of this row in a column as text; an empty text if there is no value."""
         return number(self.values[column]) if column in self.values else ""
 
     @property

@@ -92,9 +92,10 @@ def verdict(
 
 
 def _assess_torques(results: Results, uses: _Uses) -> None:
-    """Add to `uses` the uses for which the model's torque error is small enough, and the error as a proof.
+    """Assess the uses of the model by its torque error: add the sufficient and the insufficient uses to `uses`.
 
-    The joint with the largest error decides, since a mean over joints would hide this joint.
+    The text with the error is added to `uses.proofs`. The joint with the largest error decides, since a mean over
+    joints would hide this joint.
     """
     torque = results.torque.get(MODEL)
     if torque is None or torque.mean_nmse is None:
@@ -159,7 +160,10 @@ def _assess_replays(results: Results, uses: _Uses) -> None:
 
 
 def _relative(errors: StateErrors | None) -> float:
-    """Return the relative error (RMS error / RMS change), averaged over q and qd of all joints; infinity if unknown."""
+    """Return the relative error, averaged over q and qd of all joints; infinity if unknown.
+
+    A relative error is the RMS error divided by the RMS change of q or qd over the prediction horizon.
+    """
     if errors is None or errors.mean_relative_rms is None:
         return math.inf
     return errors.mean_relative_rms

@@ -58,8 +58,9 @@ class Collisions:
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
         """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
 
-        bounds: position limits, for the random positions at which ``ignored`` is determined, and for the travel of
-        prismatic joints, by which displacements of the arm are bounded.
+        bounds: position limits of the joints. The pairs in ``ignored`` are determined at random positions within these
+        limits. The limits of prismatic joints also bound the length of the arm, and with it the displacement of its
+        points.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
@@ -119,10 +120,10 @@ class Collisions:
     def contact(self, motion: Motion) -> Contact | None:
         """Return the first distance of a motion that is below the clearance; None if there is none.
 
-        Distances are computed at selected positions of the motion. From one selected position to the next, a distance
-        changes by at most 1.5 times the clearance. Between two selected positions it therefore differs by at most 0.75
-        times the clearance from its value at the nearer one, and is positive if all computed distances are at least
-        the clearance.
+        Distances are computed at selected positions of the motion. Between two successive selected positions, no point
+        of the arm moves along a path longer than 1.5 clearances, relative to any object. At each position between the
+        two, a distance therefore differs by at most 0.75 clearances from its value at the nearer one, and is positive
+        if all computed distances are at least the clearance.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -52,16 +52,16 @@ class Criterion:
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:
-        """Return the condition number of the base regressor with columns of unit length, for states (3, T, n).
+        """Return the condition number of the base regressor with columns of unit length; infinite for a zero column.
 
-        The result is infinite if a column is zero.
+        states: q, qd and qdd, (3, T, n) [rad, m, s].
         """
         return float(self._log_condition(self._rows(states)).exp())
 
     def largest_efforts(self, states: Tensor) -> np.ndarray:
-        """Return the largest rigid-body torques divided by the effort limits, (n,), for states (3, T, n).
+        """Return the largest magnitudes of the rigid-body torques divided by the effort limits, (n,).
 
-        The result is NaN for a joint without an effort limit.
+        The result is NaN for a joint without an effort limit. states: q, qd and qdd, (3, T, n) [rad, m, s].
         """
         largest = self._efforts(self._rows(states)).abs().amax(dim=0)
         return torch.where(self.limits.isinf(), torch.nan, largest).numpy()

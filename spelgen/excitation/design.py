@@ -45,9 +45,11 @@ def excite(
 ) -> Excitation:
     """Return an exciting motion, which starts and ends at rest; the same arguments give the same motion.
 
-    The motion keeps the limits of position and velocity, also of <mimic> joints. The motion keeps effort limits, too,
-    if the URDF has effort limits and inertials and the optimizer finds such a motion. If the URDF has collision
-    geometry and Pinocchio is installed, motion and approach keep a clearance between links, and to the surroundings.
+    The optimizer minimizes the condition number of the base regressor, with penalties (see `criterion`). An approach
+    from ``start`` precedes the motion. The motion keeps the limits of position and velocity, also of <mimic> joints. It
+    keeps effort limits, too, if the URDF has effort limits and inertials and the optimizer finds such a motion. If the
+    URDF has collision geometry and Pinocchio is installed, motion and approach keep a clearance between links, and to
+    the surroundings.
 
     Args:
         arm: configured arm.
@@ -111,7 +113,10 @@ def excite(
 def _checked_harmonics(
     duration: float, sample_rate: float, harmonics: int | None, reach: float, speed: float
 ) -> int:
-    """Return ``harmonics``, or its default for ``duration``. Raises SettingsError for a bad argument of `excite`."""
+    """Return ``harmonics``; for None, 0.4 per second of ``duration``, at least 5.
+
+    Raises SettingsError for a bad argument of `excite`, which explains the arguments.
+    """
     bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
     bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}
     for name, (value, largest) in bounded.items():

@@ -132,11 +132,14 @@ class ExcitationTrajectory:
         return torch.stack([offset + q, qd, qdd])
 
     def amplitude_reduction(self, parameters: Tensor) -> Tensor:
-        """Return -log(amplitude / largest amplitude) of each joint, (n,), for parameters (size,)."""
+        """Return -log(amplitude / largest amplitude within the bounds) per joint, (n,), for parameters (size,)."""
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sine and cosine coefficients (2, H, n) and offset parameters (n,) for parameters (size,)."""
+        """Return sine and cosine coefficients (2, H, n) and offset parameters (n,) of H harmonics.
+
+        parameters: (size,), see the class; the amplitude parameters are not used.
+        """
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)
         k = self._numbers()

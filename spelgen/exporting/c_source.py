@@ -109,7 +109,8 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
     """Return the C function of an entry point, which computes the outputs of a CasADi function.
 
     entry: function of the model, such as inverse_dynamics. function: CasADi function of scalar expressions, made by
-    `named_function`. Its residual terms are inputs, which the C function computes by calls of other C functions.
+    `named_function`. Residual terms of the model are inputs of `function`; the C function computes them by calls of
+    other C functions.
     """
     # The C function computes the residual terms first, since its other statements depend on them.
     residuals, calls = residual_calls(model, residuals_needed(function))
@@ -149,9 +150,9 @@ def c_function(model: TrainedModel, entry: EntryPoint, function: ca.Function) ->
 
 
 def _parameter(model: TrainedModel, name: str, size: str) -> str:
-    """Return the C declaration of a parameter `name` of a function, an array.
+    """Return the C declaration of the array `name`, an argument of a C function of the model.
 
-    size: number of entries of the array, a C expression.
+    model: its name is the prefix of the C type. size: number of entries of the array, a C expression.
     """
     # C has no arrays of length zero: z is a pointer, which may be NULL for a model without bristles.
     return f"double *{name}" if name in FRICTION_STATES else f"{model.name}_real {name}[{size}]"

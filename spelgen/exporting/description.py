@@ -147,7 +147,7 @@ class TrainedModel:
 
     @property
     def input_inverse(self) -> np.ndarray:
-        """Matrix (n, n) from joint torques to motor torques: inverse of G, with 1 in zero rows of passive joints."""
+        """Matrix (n, n) from joint torques to motor torques: inverse of G with 1 on the diagonal for passive joints."""
         return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 
@@ -228,7 +228,7 @@ def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, En
 
 
 def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
-    """Return the `names` of functions in the order of `available`; all if there are none.
+    """Return the `names` of functions in the order of `available`; if `names` is empty, all available ones.
 
     Raises RunError for names that are not available.
     """

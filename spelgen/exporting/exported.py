@@ -23,7 +23,7 @@ class Exporter:
     """A format to which models are exported, such as urdf or onnx.
 
     Attributes:
-        title: last words of the README's title.
+        title: end of the title "Dynamics of <arm> ..." of the README in an export, such as "in C99".
         suffix: file name extension; empty for a format that is a folder.
     """
 

@@ -103,7 +103,10 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
 
 
 def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the angles of joint origins in URDF and MJCF, which no rounding has changed."""
+    """Return the rigid-body model with the angles of joint origins in the URDF, not rounded to multiples of pi/2.
+
+    The exported MJCF has these angles, too.
+    """
     arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
     chain = make_arm(
         arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity

@@ -82,9 +82,9 @@ def coriolis(model: TrainedModel, symbols: Symbols, qd: ca.SX, *, derivatives: b
 
 
 def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
-    """Return the coefficients c, (m, 1), with which 1/2 qd^T R qd = c^T mass; qd: (n, 1).
+    """Return the coefficients c, (m, 1), with which the residual term R of M gives 1/2 qd^T R qd = c^T r.
 
-    R is the residual term of M, `mass` (m, 1) are the m nonzero entries in its lower triangle.
+    r, (m, 1): the m nonzero entries in the lower triangle of R. qd: (n, 1) [rad/s, m/s].
     """
     products = []
     for row, column in model.residuals.entries:
@@ -97,8 +97,8 @@ def in_kinetic_energy(model: TrainedModel, qd: Scalars) -> Scalars:
 def symbol_jacobians(model: TrainedModel, symbols: Symbols) -> list[tuple[ca.SX, ca.SX]]:
     """Return pairs (symbol, Jacobian with respect to q) for the residual terms that depend on q.
 
-    A residual term is a symbol of k entries, (k, 1). Its Jacobian, (k, n), consists of the symbols of its derivatives,
-    for example ``stiffness`` for ``gravity``. symbols: the result of `residual_symbols`.
+    A residual term is a symbol of k entries, (k, 1). Its Jacobian, (k, n), consists of the symbols of its derivatives:
+    for example, the Jacobian of ``gravity`` is the symbol ``stiffness``. symbols: the result of `residual_symbols`.
     """
     # A friction factor depends only on the position of its own joint: each row of `joints` selects one joint.
     joints = np.eye(model.n)[list(model.residuals.friction)]

@@ -95,7 +95,11 @@ class RigidBodyProjection:
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
-    """Return the rigid bodies of a trained model, or the nearest ones, and the nearest viscous and Coulomb friction."""
+    """Return the rigid bodies, and viscous and Coulomb friction, that are equal to or approximate a trained model.
+
+    The bodies of a rigid-body model are used without its residual terms. For other models, rigid bodies are fitted to M
+    and the gravity torque at random positions. Friction is always fitted, by least squares.
+    """
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
     q = sampled_positions(arm.chain)

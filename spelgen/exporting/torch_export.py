@@ -22,9 +22,10 @@ FRICTION_STATE = ("friction_step", "friction_memory")
 
 
 def export_torch(trained: Trained) -> Exported:
-    """Return a .pt2 file per function of the model, such as inverse_dynamics, and its parameters as model.safetensors.
+    """Return a .pt2 program per function of the model, such as inverse_dynamics, and its file of parameters.
 
-    Raises RunError if results of the programs and of the model differ.
+    The file model.safetensors has all parameters of the model. Raises RunError if results of the programs and of the
+    model differ.
     """
     model = prepared(trained)
     programs = {name: _saved(export_program(model, name)) for name in program_names(trained)}
@@ -147,7 +148,10 @@ class _Program(nn.Module):
         self._model, self._function = model, PROGRAMS[name]
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Return the entry point's output, (batch, ...), for inputs (batch, n), or (batch, n, K) for z."""
+        """Return the output, (batch, ...), of the entry point, a function of the model such as inverse_dynamics.
+
+        inputs: arguments of this function, such as q and qd, (batch, n); the friction state z, (batch, n, K).
+        """
         return self._function(self._model, *inputs)
 
 

@@ -128,7 +128,8 @@ def _friction_text(trained: Trained, projection: RigidBodyProjection) -> str:
 def _law_constants(trained: Trained, projection: RigidBodyProjection) -> dict[str, np.ndarray]:
     """Return {name: constants of a model's friction law in SI units}: (n,), or (n, K) for K values per joint.
 
-    The names are the fields of ``FrictionConstants``, and ``position_factor``. projection: for the joint ranges.
+    The names are the fields of ``FrictionConstants``, and ``position_factor``, (n, 2): minimum and maximum of the
+    factor by which residual terms multiply the friction, over the joint ranges of the arm in `projection`.
     """
     model = trained.model
     constants = {name: array(value) for name, value in model.friction.prepare()._asdict().items()}

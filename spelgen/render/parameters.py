@@ -60,9 +60,9 @@ def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None
     columns = {"parameter": names, "URDF": urdf}
     note = "Intervals are of 95 % [kg, m, s]"
     if posterior is not None:
-        # The posterior has only the base parameters of bodies and armatures. Parameters of friction cannot be compared,
-        # because the fit and least squares have different friction models: the rows of friction have an empty column
-        # "model".
+        # The column "model" has the values of the posterior, which has only the base parameters of bodies and
+        # armatures. The column is empty for friction: its parameters cannot be compared, since the fit and least
+        # squares have different friction models.
         estimates = {x.name: x for x in posterior.base_parameters}
         columns["model, 95 %"] = [estimates[name].text if name in estimates else "" for name in names]
         pairs = zip(names, determined, strict=True)
@@ -159,6 +159,9 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
 
 
 def _with_units(values: Sequence[float], unit: str, joint_types: Sequence[str]) -> list[str]:
-    """Return the text of one value per joint. unit: format string for the units of a joint type."""
+    """Return the text of one value per joint, such as "0.12 Nm".
+
+    unit: format string, such as "{0.torque}", whose argument is the entry of `UNITS` for the type of the joint.
+    """
     pairs = zip(values, joint_types, strict=True)
     return [f"{value:.3g} {unit.format(UNITS[joint_type])}" for value, joint_type in pairs]

@@ -104,9 +104,9 @@ def growth_chart(
 def _error_limits(errors: Mapping[str, tuple[Values, Quantiles]]) -> tuple[float, float] | None:
     """Return the limits of the axis of prediction errors, so that errors of diverged baselines do not extend it.
 
-    The limits include the quantiles of the model, and the medians of all predictors except values above
-    `TUNING.outlier` times the largest quantile of the model. None is returned if `errors`, see `growth_chart`, has no
-    entry of the model, or no positive error.
+    The limits include the 10 % and 90 % quantiles of the error of the model, and the median errors of all predictors.
+    Medians above `TUNING.outlier` times the largest quantile of the model are excluded. None is returned if `errors`,
+    see `growth_chart`, has no entry of the model, or no positive error.
     """
     # A page of several runs has one line per run and no baselines that could extend the axis, so the axis is not
     # limited.

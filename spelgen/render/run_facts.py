@@ -27,7 +27,7 @@ from spelgen.spec import ModelSpec, Options
 
 
 class Run:
-    """The content of a run folder, read for its page; an attribute is None if its file is absent.
+    """The content of a run folder, read for its page; except for `baselines`, an attribute without a file is None.
 
     Attributes:
         config: Record of the fit.

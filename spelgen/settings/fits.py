@@ -68,12 +68,12 @@ class GaussianPrior(Group):
         shared_velocities: Logarithm of a factor on one velocity scale of friction of all joints.
         shared_fractions: Part of the logit of one bristle fraction that is equal for all joints.
         shared_friction: Logarithm of a factor on all friction of all joints.
-        friction_compensation: Friction compensation of a drive, divided by typical friction per typical speed, if the
-            logs show any.
-        degrees_of_freedom: No standard deviation, but the weight of the initial value in the estimate of a standard
-            deviation, as a number of parameters. The standard deviation of each single body is estimated with the same
-            weight, so that the prior of its parameters is a Student-t distribution with this number of degrees of
-            freedom.
+        friction_compensation: Torque per velocity with which a drive compensates friction, divided by typical friction
+            per typical speed. It is fitted only if the logs, or implausible masses, indicate such a torque.
+        degrees_of_freedom: Not a standard deviation. If a standard deviation is estimated from fitted parameters, its
+            initial value has the weight of this number of further parameters. The standard deviation of each single
+            body is estimated with the same weight, so that the prior of its parameters is a Student-t distribution with
+            this number of degrees of freedom.
     """
 
     bodies: Positive = 0.75

@@ -122,8 +122,8 @@ class LogUnits(JointUnits):
 class JointWords(Group):
     """Periods, or sign bits, of the logged signals of one joint, in logged units; default: values are plain numbers.
 
-    A period is the interval after which logged values wrap around. A sign bit s marks negative numbers in values of
-    sign and magnitude: s + x means -x.
+    A period (setting `period`) is the interval after which logged values wrap around. A sign bit s (`sign_bit`) marks
+    negative numbers in values of sign and magnitude: the logged value s + x is the number -x.
 
     Attributes:
         q: Period or sign bit of positions.
@@ -296,8 +296,8 @@ class LogMapping(Group):
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
         """Return the mapping with other names of columns.
 
-        columns: {joint: {quantity: name of the column}}; for None, the joint has the column of the mapping's attribute
-        `columns`.
+        columns: {joint: {quantity: name of the column}}. If a name is None, the column of the joint has the default
+        name, from the attribute `columns` of the mapping, which is for all joints.
         """
         joints = dict(self.joints)
         for joint, names in columns.items():
@@ -337,7 +337,8 @@ class LogMapping(Group):
         """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
 
         The result is in the unit of the log. key: name of the setting; a period is the interval after which logged
-        values wrap around. quantity: "q", "qd", "tau" or "u".
+        values wrap around, a sign bit is the value s, such as 32768, with which s + x means -x. quantity: "q", "qd",
+        "tau" or "u".
         """
         size: float | None = getattr(getattr(self.joint(joint), key), quantity)
         return size

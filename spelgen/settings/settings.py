@@ -176,7 +176,10 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """Warnings, and not errors: one per error in a group of keys that only one step uses, such as `training`."""
+        """One warning per error in a group of keys that only one step uses, such as `training`.
+
+        These errors are only warnings, because all other steps can use the settings.
+        """
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]
         return tuple(Diagnostic("warning", "unusable-settings", "settings", None, str(x)) for x in errors)

@@ -52,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults of simulations of controlled motions, which are made if neither `protocol` nor `inputs` is set."""
+    """Defaults if neither `protocol` nor `inputs` is set; controlled motions are then simulated."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4

@@ -65,7 +65,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the settings that are not None and are options of a fit, of at least one objective."""
+        """{name: value} of the settings that are not None and that are options of fits, for one or more objectives."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property

@@ -1,7 +1,7 @@
 """Read YAML files, validate each key, and report errors with their lines.
 
-Unsafe or ambiguous constructs of YAML are errors. The file has also the types of values in settings files, and the base
-class of their groups of keys.
+Unsafe or ambiguous constructs of YAML are errors. This module also defines the types of values in settings files, and
+the base class of their groups of keys.
 """
 
 from collections.abc import Iterable, Mapping
@@ -52,7 +52,7 @@ class YamlDocument:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
     def line(self, location: Location) -> int | None:
-        """Return the line of a key or list item; if it is absent, the line of the group that would contain it."""
+        """Return the line of a key or list item, or of the group that would contain it; None for an empty file."""
         if self.root is None:
             return None
         node, line = self.root, int(self.root.start_mark.line) + 1

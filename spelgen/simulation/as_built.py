@@ -60,7 +60,10 @@ def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
 
 
 def _settings(arm: Arm, seed: int) -> dict[str, object]:
-    """Return the settings of the random arm (gravity, inputs, couplings, simulated motion) without its drives."""
+    """Return the settings of the random arm that `as_built` makes from ``arm``, without the drives (`joints`).
+
+    Gravity, inputs and couplings are copied from ``arm``. seed: seed of simulated motions.
+    """
     nominal = arm.settings
     carried = nominal.model_dump(
         mode="json",

@@ -100,8 +100,9 @@ def record(
         M (qdd* + 2 omega e' + omega^2 e) + h(q, qd*) + friction(qd*)
 
     with the position error e = q* - q, and h: Coriolis, centrifugal and gravity torques. Friction is compensated at the
-    desired velocity only, so the viscous friction D e' of a joint remains as additional damping. If D > M_jj omega, it
-    would dominate and slow the decay of e down: the torque D omega e is added, which gives the time constant 1 / omega.
+    desired velocity only, so the viscous friction D e' of a joint remains as additional damping. If D > M_jj omega,
+    this damping would dominate and slow the decay of e down. In this case the torque D omega e is added: e then decays
+    with the time constant 1 / omega.
 
     Args:
         dynamics: The arm, with friction.

@@ -35,7 +35,10 @@ class MeshFolder:
         self._folder = folder
 
     def get(self, name: str) -> bytes:
-        """Return the content of the file of this name in the folder of the mesh. Raises SpelgenError."""
+        """Return the content of the file of this name in the folder of the mesh; a path in the name is ignored.
+
+        Raises SpelgenError for an absent, unreadable or too large file.
+        """
         return read_bytes(self._folder / Path(name.strip()).name, SpelgenError, largest=MAX_BYTES)
 
     __getitem__ = get
