@@ -122,8 +122,7 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of bodies and their point masses (see the class) at qd, (..., n) [rad/s,
-        m/s].
+        """Return velocities of bodies and point masses (see the class) at qd, (..., n) [rad/s, m/s].
 
         Returns:
             velocities of the four point masses of each body times sqrt(mass), (..., 3, bodies, 4); twists

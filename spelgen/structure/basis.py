@@ -66,7 +66,7 @@ class _Functional(NamedTuple):
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
-    """Return the varying terms f_j(q) B_j and the constant terms c_k A_k of the minimal exact form of M, their sum.
+    """Return the varying terms f_j(q) B_j and the constant terms c_k A_k whose sum is M, in the minimal exact form.
 
     Each f_j depends on a minimal set of joints (see the module). spans: samples of M and of its changes with q.
     """

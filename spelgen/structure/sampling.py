@@ -193,8 +193,7 @@ class Spans:
         """Return an echelon basis of the changes of M if joints other than ``joints`` move, (dimension, entries).
 
         It is a basis, in the prime field, of the sum of the spans T_i (see the class) of these other joints i. The
-        columns
-        are the entries of M in the order of the attribute ``order``.
+        columns are the entries of M in the order of the attribute ``order``.
         """
         first, last = min(joints), max(joints)
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]
