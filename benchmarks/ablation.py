@@ -120,11 +120,6 @@ def no_occam_factor(estimate: Any) -> float:
     return 0.0
 
 
-def every_sample(residual: Any, other: Any) -> Any:
-    """Replace `log_likelihood_ratio`: the errors of all samples are independent."""
-    return len(residual) * (other.square().sum(dim=0) / residual.square().sum(dim=0)).log()
-
-
 def no_limit(model: Any, samples: Any) -> None:
     """Replace `limit_friction`: nominal friction depends on effort limits only, not on the measured torque."""
 
@@ -149,7 +144,7 @@ def mechanisms() -> list[Mechanism]:
     return [
         Mechanism("correlated errors", tuned(TUNING, correlation_time=0.02, correlation_weight=NEVER)),
         Mechanism("correlation time from the data", tuned(TUNING, correlation_weight=NEVER)),
-        Mechanism("effective errors of friction models", ((stages, "log_likelihood_ratio", every_sample),)),
+        Mechanism("shorter correlation at reversals", tuned(TUNING, reversal_correlation_time=0.2)),
         Mechanism("bounded prior widths", tuned(TUNING, max_width=NEVER)),
         Mechanism("steps at the least-squares noise", tuned(TUNING, initial_steps=0)),
         Mechanism("noise annealing", tuned(TUNING, annealing_iterations=0)),

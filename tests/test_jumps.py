@@ -370,7 +370,7 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
 
 @pytest.mark.parametrize("form", ["degrees", "two's complement", "sign and magnitude"])
 def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
-    """One finding decodes positions and commands of all joints, also of a joint that hardly leaves 0."""
+    """One finding decodes positions and commands of all joints, also of a joint that moves little from 0."""
     arm = load_arm(write_servo_arm(tmp_path))
     t, rng = 0.02 * np.arange(1500), np.random.default_rng(0)
     motion = {"shoulder": 0.9 * np.sin(t), "elbow": -0.004 * (t > 15) + 0.003 * rng.standard_normal(len(t))}

@@ -10,7 +10,7 @@ from test_log_geometry import arm, recorded  # noqa: F401
 import spelgen
 from spelgen.log_checks.check_logs import check_logs
 
-OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
+OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
 
 def reversed_joint(log, k, quantities):
@@ -62,4 +62,4 @@ def test_a_unit_of_one_recording_is_no_advice_for_all(tmp_path):
     logs[1] = replace(logs[1], q=np.degrees(logs[1].q), qd=np.degrees(logs[1].qd), u=np.degrees(logs[1].u))
     (error,) = map(str, check_logs(logs, servos).errors)
     assert "trajectory motion 1" in error
-    assert "if this is true of all recordings; else correct this one, or leave it out" in error
+    assert "if this is true of all recordings; else correct this one, or omit it" in error

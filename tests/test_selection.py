@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
@@ -415,31 +414,6 @@ def test_the_tip_error_is_radius_times_angle_error():
 )
 def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, unlikely):
     assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
-
-
-@pytest.mark.parametrize(("coefficient", "varying"), [(0.0, False), (0.9, False), (0.0, True)])
-def test_errors_that_are_no_independent_samples_are_no_evidence(coefficient, varying):
-    """A superfluous parameter has a log likelihood ratio of one on average, as chi squared with one degree of freedom.
-
-    This holds for independent errors, for errors that are as correlated as the torque of the parameter, and for errors
-    that are larger where this torque is large. Counted as independent, the last two would have a mean of 9.5 and 3.
-    """
-    rng, count, joints = np.random.default_rng(0), 2000, 400
-    torque, errors = (
-        torch.from_numpy(lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0))
-        for _ in range(2)
-    )
-    if varying:
-        errors = errors * torque.abs()
-    fitted = torque * (torque * errors).sum(dim=0) / torque.square().sum(dim=0)
-    ratio = stages.log_likelihood_ratio(errors - fitted, errors)
-    assert 0.7 < float(ratio.mean()) < 1.3
-
-
-def test_equal_residuals_are_no_evidence():
-    """Two models with the same torque residual have a likelihood ratio of one."""
-    residual = torch.randn(50, 3).double()
-    assert stages.log_likelihood_ratio(residual, residual).tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_friction_state_must_lower_the_residual_in_most_blocks():

@@ -116,7 +116,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 
 
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
-    """Return the indices of the recordings whose torques contradict those of the other recordings; at most half of all.
+    """Return the indices of the recordings whose torques contradict the other recordings; at most half of all.
 
     Without the recording, the torques of the others determine parameters that explain them, and not the recording.
     """
@@ -132,7 +132,8 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         scale = np.maximum(tau.var(axis=0), 1e-30)
         return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
 
-    while 2 * len(deviating) + 1 < len(remaining) + len(deviating):
+    # Of two recordings that contradict each other, nothing shows the wrong one.
+    while len(remaining) > max(2, len(deviating) + 1):
         present = errors(remaining)
         worst = max(remaining, key=lambda x: float(present[x].max()))
         if present[worst].max() < GEOMETRY.unexplained / 5:
@@ -140,9 +141,9 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         reduced = [x for x in remaining if x != worst]
         without = errors(reduced)
         usual = np.mean([without[x] for x in reduced], axis=0)
-        if not (
-            (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
-        ).any():
+        # The others must agree: recordings that all have one fault also contradict each other.
+        is_worse = (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
+        if not is_worse.any() or usual.mean() > GEOMETRY.explained:
             break
         remaining, deviating = reduced, [*deviating, worst]
     return deviating

@@ -78,8 +78,8 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
-    # [1] Smallest ratio of a recording's squared torque residual to that of the other recordings, to which the model is
-    # fitted, if the recording has another fault than the others.
+    # [1] Smallest squared torque residual of a recording with a fault of its own, divided by the squared residual of
+    # the other recordings, to which the model is fitted.
     deviation: float = 5.0
     # [1] Relative residual variance of a joint above which a hypothesis does not explain its torque, so that its
     # correction is not advised. With the right correction, logs of recorded arms have at most 0.07 in the mean of the

@@ -221,7 +221,7 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 
 
 class CommandFault(NamedTuple):
-    """Finding that the commands of a joint are not those that its servo tracked.
+    """Finding that a joint has other logged commands than the ones that its servo tracked.
 
     Attributes:
         got: the finding.
@@ -289,7 +289,7 @@ class ServoLogs:
     def _check_geometry(self, summary: Findings) -> None:
         """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Servos that no hypothesis explains, for example those with backlash, are not tested.
+        Servos that no hypothesis explains, for example servos with backlash, are not tested.
         """
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
@@ -298,8 +298,8 @@ class ServoLogs:
         if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
             return
         unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
-        # The cost must fall twice as much as for torques: with times stretched by two, the best wrong hypothesis lowers
-        # it by 20, and right ones by 40 to 240, on simulated arms.
+        # The cost must fall by double the bound for torques: with times stretched by two, the best wrong hypothesis
+        # lowers it by 20, and right ones by 40 to 240, on simulated arms.
         is_sure = better and better[0].cost < unchanged.cost - 2 * GEOMETRY.needed
         if not is_sure or better[0].errors.max() > GEOMETRY.explained:
             return
@@ -394,7 +394,7 @@ def _command_faults(
 ) -> dict[int, CommandFault]:
     """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
 
-    The commands may be those of other joints, in another unit or sense than the positions, or increments of the
+    The commands may belong to other joints, be in another unit or sense than the positions, or increments of the
     position.
 
     Args:
@@ -417,7 +417,7 @@ def _command_faults(
             got, do = "commands that other joints follow, and these do not", "check the names of the columns"
             faults[k] = CommandFault(got, "their own commands", keys, do)
     of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, log)
-    # Correlation and gain are those at the delay of largest correlation, so that a slow servo is not reported as a
+    # Correlation and gain are measured at the delay of largest correlation, so that a slow servo is not reported as a
     # fault.
     for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
         if k in faults:
@@ -432,7 +432,7 @@ def _command_faults(
             faults[k] = CommandFault(got, "commanded positions", do=do)
         elif following.moves[k] and correlation < -FOLLOWS:
             got = f"positions that move against commands (correlation {correlation:.2g})"
-            do = "multiply the column of u or that of q by -1: the setting 'sign' applies to both"
+            do = "multiply the column of u or the column of q by -1: the setting 'sign' applies to both"
             faults[k] = CommandFault(got, "one sense", do=do)
     return faults
 
@@ -440,7 +440,7 @@ def _command_faults(
 def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
     """Return the correlation (n,) of each position with the sum of the commands of its joint.
 
-    It is 0 if the position moves neither as far as the sum (commands that are increments) nor as far as the integral
+    It is 0 if the amplitude of the position equals neither the sum (commands that are increments) nor the integral
     (commands that are velocities): a sum of periodic commands is correlated with any motion of this period.
     """
     u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
@@ -481,7 +481,7 @@ def _command_warning(
         # commands equal to positions: the logger wrote measured positions in place of commands
         code = "commands-are-positions"
         late = f", {abs(shift)} rows {'later' if shift > 0 else 'earlier'}" * bool(shift)
-        message = f"u is q{late}, to the last bit: are the commands those that were sent?"
+        message = f"u is q{late}, to the last bit: are they the commands that were sent?"
     elif not following.moves[k]:
         # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]

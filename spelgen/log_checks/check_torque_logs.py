@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION = "small-motion"
-# Codes of warnings after which the drives are not tested: the torques may not be those of the joints.
+# Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -230,9 +230,9 @@ class TorqueLogs:
     ) -> Iterator[LogError | Diagnostic]:
         """Yield the findings about the geometry of recordings, in the order of the tests.
 
-        The tests end with a finding that explains the torques, or that leaves them unexplained. Tested are the motion,
-        signs and limits of the torques, then hypotheses about senses, order, zeros, units and gravity, and, if the
-        torques agree with the mapping, the inertials of the URDF.
+        The tests end with the first finding that explains the torques, or states that nothing explains them. Tested
+        are the motion, signs and limits of the torques, then hypotheses about senses, order, zeros, units and gravity,
+        and, if the torques agree with the mapping, the inertials of the URDF.
 
         Args:
             problem: least-squares problem of the samples.

@@ -43,7 +43,7 @@ from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
 # Advice for a fault of some recordings: its settings would be wrong for the others.
-OF_ONE = "the other recordings do not have this fault: correct this one, or leave it out"
+OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
 Subject = TypeVar("Subject")
 
@@ -111,7 +111,7 @@ class Findings:
             return
         do = mapping_line(keys) if keys else check.do
         if is_partial:
-            do = f"{do} if this is true of all recordings; else correct this one, or leave it out"
+            do = f"{do} if this is true of all recordings; else correct this one, or omit it"
         do = f"{do}; --accept {check.code} if it is right"
         self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
 

@@ -8,7 +8,7 @@ locked motor. A rigid joint has H(f) = J + c / f^2, where the constant c is due 
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -210,7 +210,7 @@ def find_words(signals: JointSignals) -> Advice | None:
     Register words are defined in the module `jumps`. One finding has the settings for all signals of the joint.
     """
     mapping, joint, q = signals.trajectory.mapping, signals.joint, signals.q
-    message, keys = "", dict[str, dict[str, object]]()
+    message, keys, found = "", dict[str, dict[str, object]](), list[WordReading]()
     for name in signals.trajectory.quantities:
         reading, raw = _shared_reading(signals, name), signals.raw(name)
         if reading is None:
@@ -222,6 +222,7 @@ def find_words(signals: JointSignals) -> Advice | None:
         if name == "u" and np.std(in_si - q) > 0.3 * np.std(signals.signal("u") - q):
             continue
         q = in_si if name == "q" else q
+        found.append(reading)
         keys.setdefault(reading.key, {})[name] = plain_number(reading.size, 9)
         if reading.in_degrees:
             keys.setdefault("units", {})[name] = "deg"
@@ -244,10 +245,10 @@ def find_words(signals: JointSignals) -> Advice | None:
         message = f"{name} that jumps by {reading.size:.6g} ({unit}), {counted(count, 'time')}: {what}"
     if not message:
         return None
-    # The advised settings include the sign bits that the mapping states, so that they can replace its line.
-    stated = {name: mapping.word("sign_bit", name, joint) for name in signals.trajectory.quantities}
-    if "sign_bit" in keys:
-        keys["sign_bit"] = {x: plain_number(y, 9) for x, y in stated.items() if y} | keys["sign_bit"]
+    # The advised settings include the sign bits or periods that the mapping states, so that they can replace its line.
+    for key in {reading.key for reading in found}:
+        stated = {name: mapping.word(key, name, joint) for name in signals.trajectory.quantities}
+        keys[key] = {x: plain_number(y, 9) for x, y in stated.items() if y} | keys[key]
     units = {"units": keys.pop("units")} if "units" in keys else {}
     return Advice(message, units | keys)
 
@@ -273,7 +274,7 @@ class WordReading(NamedTuple):
         in_degrees: True if the mapping states no unit, and the size is a number of revolutions in degrees.
     """
 
-    key: str
+    key: Literal["period", "sign_bit"]
     size: float
     in_degrees: bool
 

@@ -26,7 +26,6 @@ from spelgen.fitting.torque.selection import (
     significant_reduction,
 )
 from spelgen.fitting.torque.tuning import TUNING
-from spelgen.identification.least_squares import correlation_time
 
 EFFECT_GROUPS = ("effects", "load_dependence")
 """Groups of the Stribeck effect, saturation and load dependence of friction, which not every joint has."""
@@ -137,15 +136,16 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     bristles is also significantly smaller (t test on ten blocks of the log). The reason is that the likelihood ratio of
     a single joint is unreliable, since the errors of a motion are correlated.
     """
-    friction, residual = estimate.problem.jacobian.model.friction, _torque_residual(estimate)
+    friction = estimate.problem.jacobian.model.friction
+    residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
     friction.memoryless.fill_(0.0)
     # The noise is estimated again, since bristles explain more of the torque than rate-only friction does.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
-    bristle_residual = _torque_residual(hysteretic)
-    evidence = log_likelihood_ratio(bristle_residual, residual) - fraction_occam_factor(hysteretic)
+    evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
     rate_only = _rejected(evidence)
     if evidence.sum() > 0:
+        bristle_residual = hysteretic.problem.jacobian.residual_samples(hysteretic.state.x).torque_residual
         rate_only &= _smaller_in_most_blocks(residual, bristle_residual)
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
@@ -177,11 +177,12 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
-    # effects: (n, effects), indices of the coefficients in x
-    effects = torch.stack([index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1)
+    effects = torch.stack(
+        [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
+    )  # effects: (n, effects), indices of the coefficients in x
     plain = _without(estimate, effects.flatten())
     # 2 is the penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
-    rejected = _rejected(log_likelihood_ratio(_torque_residual(estimate), _torque_residual(plain)) - 2)
+    rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
     if rejected.all():
         return plain
     return _without(estimate, effects[rejected].flatten()) if rejected.any() else estimate
@@ -200,32 +201,16 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
     return alternate(problem, state)
 
 
-def _torque_residual(estimate: TorqueEstimate) -> torch.Tensor:
-    """Return the torque residual (T, n) [Nm, N] at the initial motor gains (see `TorqueJacobian.logged_scale`)."""
-    jacobian, x = estimate.problem.jacobian, estimate.state.x
-    return jacobian.residual_samples(x).torque_residual * jacobian.logged_scale(x)
+def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> torch.Tensor:
+    """Return 2 log(L(estimate) / L(other)) of each joint, (n,), with the likelihood L of the joint's torque.
 
-
-def log_likelihood_ratio(residual: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Return 2 log(L / L') of each joint, (n,): the likelihoods L and L' of the joint's torque in two models.
-
-    Each likelihood is computed with the noise that maximizes it. Positive values favour the first model.
-
-    The result is N log(|r + d|^2 / |r|^2) with N independent errors. N is smaller than the number T of samples: errors
-    are correlated, and may be larger where the models differ, such as near reversals. To first order, the log
-    likelihood ratio has the variance of the sum of r d over the samples. N is T divided by the ratio of this variance
-    to its value for independent errors (estimated as by Newey and West, Econometrica 55:703, 1987).
-
-    Args:
-        residual: r, (T, n) torque residual of the first model [Nm, N], which has more parameters.
-        other: r + d, (T, n) torque residual of the second model [Nm, N].
+    Each likelihood is computed with the noise that maximizes it. Positive values favour `estimate`.
     """
-    difference = other - residual
-    scores = residual * difference
-    independent = (residual.square().mean(dim=0) * difference.square().mean(dim=0)).clamp(min=1e-300)
-    length = scores.square().mean(dim=0) / independent * torch.from_numpy(correlation_time([scores.numpy()]))
-    ratio = other.square().sum(dim=0) / residual.square().sum(dim=0)
-    return len(scores) / length.clamp(min=1.0) * ratio.log()
+    samples = estimate.problem.jacobian.samples
+    # With the noise that maximizes each likelihood, the likelihood ratio depends only on the squared residuals and on
+    # the number of independent errors.
+    errors = samples.count * min(1.0, samples.interval / TUNING.reversal_correlation_time)
+    return errors * (other.state.residual / estimate.state.residual).log()
 
 
 def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:

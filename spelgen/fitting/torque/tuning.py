@@ -27,6 +27,9 @@ class TorqueTuning:
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
     correlation_time: float = 0.2
+    # [s] Correlation time of torque errors in comparisons of friction models. It is shorter than `correlation_time`,
+    # because friction models differ only near reversals of velocity.
+    reversal_correlation_time: float = 0.1
     # [1] Weight of the prior mean `correlation_time` in the estimated correlation time, as a number of independent
     # errors.
     correlation_weight: float = 30.0
