@@ -81,7 +81,7 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return the generalised forces M qdd in W windows, (W, n) [Nm, N], with `disturbance` of `_stepper`.
+        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, plus `disturbance` as a force (see `_stepper`).
 
         pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
         """
@@ -89,10 +89,11 @@ def _stepper(
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Return the state after one step of ROS2 (see `roll_out_stiff`).
+        """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`); step: (W, 1) [s].
 
         The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
-        friction / d qd. If friction has a state z, K = d friction / d q through z, else K = 0.
+        friction / d qd. If friction has a state z, K is its derivative with respect to q, on which z depends; otherwise
+        K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -109,7 +110,7 @@ def _stepper(
             """Return the solution (v, a) of (1 - h A) (v, a) = (velocity, M^-1 force) in W windows, (W, n) each.
 
             A is the approximate Jacobian (see `step`), and h = GAMMA times the step length, with the parameter GAMMA of
-            ROS2.
+            the Rosenbrock method. v and a are rates of q and qd.
             """
             right = (force - h * stiffness * velocity).unsqueeze(-1)
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
@@ -206,8 +207,8 @@ class Solver:
     def __call__(self, windows: Windows, disturbance: Tensor | None = None) -> States:
         """Return predicted q and qd at samples 1 to K-1 of W windows of K samples, (W, K-1, n) each.
 
-        Values after a divergence are NaN. disturbance: constant disturbance in each window, (W, n), see
-        `roll_out_stiff`.
+        Values after a divergence are NaN. disturbance: constant force [Nm, N] or acceleration [rad/s^2, m/s^2] in each
+        window, (W, n), see `_stepper`; None: zero.
         """
         return self._integrated(windows, self.substeps, disturbance)
 

@@ -37,7 +37,7 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics with a method `equations_at`, which needs fewer operations than equations from forward dynamics."""
+    """Dynamics whose method `equations_at` gives M, force and friction with fewer operations than `_of_dynamics`."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""

@@ -61,7 +61,7 @@ class FrictionState(Protocol):
         """Number of bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, elements), after a long motion at constant qd, (..., n)."""
+        """Return z, (..., n, elements) [rad, m], after a long motion at constant qd, (..., n) [rad/s, m/s]."""
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state, (..., n, elements), after a displacement of the joints, (..., n) [rad, m].
@@ -133,8 +133,8 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
     """Return the arguments about friction that a caller appends to (q, qd, ...) in a call of a method of `dynamics`.
 
-    Three cases: () if z is None or friction has no state, since `direction` is passed after z; (z, direction) for
-    `RigidBodyDynamics` with a given direction; otherwise (z,).
+    The result is () if z is None or friction has no state; `direction` is then ignored, since it is the argument after
+    z. It is (z, direction) for a `RigidBodyDynamics` and a given direction, otherwise (z,).
 
     Args:
         dynamics: dynamics whose method is called.
@@ -150,7 +150,7 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
 
 
 class VelocityState:
-    """Adapter for rollouts of dynamics without momenta: its methods of momenta p use velocities qd in place of p."""
+    """Adapter for rollouts of dynamics without momenta: velocities qd replace the momenta p in all its methods."""
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics

@@ -3,11 +3,11 @@
 Servos act as springs, kp times the position error. These springs and dry friction are stiff. Both are integrated
 implicitly, so that a few steps between samples are stable for any kp. Springs are nonlinear (dead zone, torque limit),
 and are linearised at the start of a step (Rosenbrock method with the weights of the theta method; Hairer and Wanner,
-Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step from its duration x in units of the time
-constant of decay: it is 1/2 for slow motion, without numerical damping, and tends to 1 for motion that is too fast for
-the step. The computed decay is then exact to third order in x (exponential fitting; Liniger and Willoughby, SIAM J.
-Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from the displacement in the step. It
-is (K, ..., n) for K bristles per joint, in states as in `ServoDrives`.
+Solving ODEs II, IV.7). Theta = (3 + x) / (6 + x) is computed for each step: x is the duration of the step divided by
+the time constant with which the velocity decays. Theta is 1/2 for slow motion, without numerical damping, and tends to
+1 for motion that is too fast for the step. The computed decay is then exact to third order in x (exponential fitting;
+Liniger and Willoughby, SIAM J. Numerical Analysis 7:47, 1970). The friction state is not integrated, but computed from
+the displacement in the step. Its shape is (K, ..., n) for K bristles per joint.
 """
 
 from typing import NamedTuple
@@ -145,12 +145,12 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
-    linear in x. Of the solutions of these K + 1 linear equations, the one with the largest |x| is valid: a bristle
-    resists with at most its sliding force, so the resistance of the valid equation is the smallest one, and its |x| the
-    largest.
+    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. The reason: a bristle resists with the
+    smaller of its elastic and its sliding force. The valid equation therefore has the smallest resistance, and its |x|
+    is the largest.
 
     Args:
-        push: force on the joint, (..., n).
+        push: force on the joint, (..., n). In `advanced` it is a momentum, `slope` an inertia and x a velocity.
         slope: stiffness of the spring, without bristles, (..., n).
         strength, z, reach: stiffness, initial deflection and break-away displacement of each bristle, (K, ..., n), the
             shortest break-away displacement first: bristles begin to slide in this order.

@@ -1,1 +1,1 @@
-"""Fits of a module to logs, written to a run folder."""
+"""Fits of an arm's model to logs; the results are written to a run folder."""

@@ -230,6 +230,6 @@ class Validation:
         return choose_substeps(self.model, self.probe, self.scales, start=present or 1)
 
     def measure(self) -> tuple[int, float]:
-        """Return the number of integration steps per sample interval, and the validation loss with these steps."""
+        """Return the integration steps per sample interval (see `substeps`), and the validation loss with them."""
         substeps = self.substeps()
         return substeps, self.loss(substeps)

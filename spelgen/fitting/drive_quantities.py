@@ -1,4 +1,4 @@
-"""Constants of drives that have 95 % intervals, and friction torque approximated by a straight line over velocity."""
+"""Drive constants with 95 % intervals: armature, friction (a straight line over velocity), torque offset, gain."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -58,8 +58,8 @@ class Objective(ABC):
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
         """Run the fit until a stopping criterion holds; return the status. ``save`` writes a checkpoint.
 
-        The base class does nothing here: objectives without epochs run the whole fit in `begin`. KeyboardInterrupt may
-        be raised at any time.
+        The base class only returns "finished": objectives without epochs run the whole fit in `begin`. Ctrl-C raises
+        KeyboardInterrupt at any time; the caller catches it.
         """
         return "finished"
 

@@ -141,7 +141,7 @@ class TrainingProgress:
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)
 
     def momentum(self, step: int, steps: int, loss: float) -> None:
-        """Show the progress of the momentum stage: the number of steps, the maximum number, and the loss."""
+        """Show the progress of minimizing `momentum_loss`: number of steps, their maximum, and loss."""
         state = f"loss {loss:.3g}"
         self._show_stage("momentum", step, steps, state, f"{step} steps, {state}")
 

@@ -81,11 +81,11 @@ def _adaptive_step(
     duration.
 
     Args:
-        dynamics: dynamics whose bristles are displaced (see `memory_after`).
+        dynamics: dynamics whose `memory_after` computes z from the displacement of the joints.
         rhs: function of (q, p, z) that returns dq/dt and dp/dt.
         q, p: positions and momenta, (W, n).
         z: friction state of K bristles per joint, (W, n, K).
-        step: duration of the interval [s].
+        step: duration of the interval of each window, (W, 1) [s].
     """
     # torchdiffeq is imported only if needed, since its import takes half a second.
     from torchdiffeq import odeint
@@ -137,7 +137,7 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the divisors of the errors of q, qd and tau in the losses for windows of logs, from the logged motion.
+    """Return the `LossScales` of windows of logs: RMS changes of q and qd, and standard deviations of tau.
 
     A divisor is at least 1 % of the largest one of all joints, also for a joint that hardly moves. Raises LogError if
     no joint moves, since windows at rest do not determine a model. joint_types: see `position_difference`.
@@ -235,9 +235,10 @@ def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int)
 
 
 def integration_error(coarse: Tensor, fine: Tensor) -> float:
-    """Return the integration error of a rollout, divided by the prediction error of the model.
+    """Return the RMS integration error of a rollout, divided by the RMS prediction error of the model.
 
-    The integration error is the difference from a rollout with half the step size.
+    The integration error is the difference of `coarse` and `fine`, the prediction error is `fine`. A diverged rollout
+    gives infinity.
 
     Args:
         coarse: `rollout_errors` of the rollout, (W, K-1, 2n).

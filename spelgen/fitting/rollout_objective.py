@@ -40,7 +40,7 @@ class RolloutObjective(MomentumObjective):
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
-        """Fit torques if the model consists of rigid bodies, and compute the validation loss; return diagnostics."""
+        """Fit torques if `torque_first`, for a `RigidBodyDynamics`; compute the validation loss; return diagnostics."""
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
@@ -62,7 +62,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the stage of steps on `momentum_loss`, then epochs until the fit ends; ``save`` is called after each."""
+        """Minimize `momentum_loss`, then run epochs until the fit ends; call ``save`` after it and after each epoch."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -81,7 +81,7 @@ class RolloutObjective(MomentumObjective):
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
     def _set_up(self) -> None:
-        """Compute the validation loss of the current model; set the state and the optimizer of the first stage."""
+        """Compute the validation loss; initialize counters, fixed weights and optimizer of the first stage."""
         super()._set_up()
         self.generator = torch.Generator().manual_seed(self.request.seed)
         self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0

@@ -139,9 +139,9 @@ class Checkpoint(BaseModel):
             fitted to torques, or to positions under position servos.
         rollbacks: number of repeated epochs of a fit to windows.
         learning_rate_factor: factor on the learning rate after these repetitions.
-        momentum_done: whether the momentum stage has ended.
+        momentum_done: whether the first stage, the minimization of `momentum_loss`, has ended.
 
-    Further keys are states of an objective; torch checks their content.
+    Further keys are states of an objective; torch checks their content when `resume` loads them.
     """
 
     model_config = ConfigDict(frozen=True, extra="allow")

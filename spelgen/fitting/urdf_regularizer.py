@@ -24,9 +24,9 @@ class UrdfRegularizer(NamedTuple):
     Attributes:
         q: (S, n), positions [rad, m].
         whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
-        variation: (S, n, n), dimensionless, W (M - mean M) W^T for the M of the URDF.
+        variation: (S, n, n), dimensionless, W (M - mean M) W^T for M of the URDF, with its mean over the positions.
         gravity: (S, n), gravity torque of the URDF [Nm, N].
-        gravity_scale: (n,), divisor of the errors of the gravity torque [Nm, N].
+        gravity_scale: (n,), root mean square of `gravity` with a lower bound, the divisor of its errors [Nm, N].
     """
 
     q: Tensor
@@ -38,10 +38,9 @@ class UrdfRegularizer(NamedTuple):
     def loss(self, model: ArmModel) -> Tensor:
         """Return the mean squared difference between model and URDF, a dimensionless scalar.
 
-        The loss is the sum of two terms, averaged over the positions. The first one is the squared Frobenius norm,
-        divided by n, of the difference of W (M - mean M) W^T, where W is `whitening`, and mean M is over the positions,
-        for model and URDF separately (see the module). The second one is the mean square over the joints of the
-        difference of the gravity torques divided by `gravity_scale`.
+        The loss is the mean over the positions `q` of |W (M - mean M) W^T - `variation`|^2 / n + |(g - `gravity`) /
+        `gravity_scale`|^2 / n. M and g are the mass matrix and the gravity torque of the model, mean M is the mean over
+        the positions, W is `whitening`, and |.| is the Frobenius norm.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale

@@ -191,8 +191,8 @@ class JointFilters:
         """Initialize all states to zero: friction as in the model, no torque offset and no disturbance.
 
         Args:
-            deviations: prior standard deviations of the K states (friction change a, torque offset b if K = 3,
-                disturbance d), (..., n, K). The value for d is also the stationary standard deviation of d.
+            deviations: prior standard deviations of the K states, (..., n, K): friction change a [1], torque offset b
+                if K = 3 [Nm, N], disturbance d [Nm, N]. The value for d is also the stationary standard deviation of d.
             white: standard deviations of the white noise of the torque residual, (..., n) [Nm, N].
             time_constant: time constant of d, (..., n) [s].
             drifts: True: a is a random walk, and joints at rest update d. False: a is constant, and joints at rest
@@ -204,7 +204,7 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the drift filters of the estimator: states are friction change a, a random walk, and disturbance d."""
+        """Return the estimator's drift filters with two states: friction change a (a random walk) and disturbance d."""
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 

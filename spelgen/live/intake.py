@@ -28,7 +28,7 @@ class DelayLine:
         self.samples: list[tuple[float, np.ndarray]] = []
 
     def step(self, t: float, values: np.ndarray) -> np.ndarray:
-        """Add values, (3, n), at time t [s]; return the values at t - ``delay``, or the oldest stored values."""
+        """Add values (q, qd, tau), (3, n), at time t [s]; return them at t - ``delay``, or the oldest stored values."""
         samples, past = self.samples, t - self.delay
         if not samples or t - samples[-1][0] >= self.delay / TUNING.delay_samples:
             samples.append((t, values))
@@ -72,7 +72,7 @@ class Intake:
         self.line = DelayLine(abs(self.levels.delay))
 
     def accept(self, t: float, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> Refusal:
-        """Check a sample and update the bounds of the friction state.
+        """Check a sample and update the bounds of the friction state, which is unknown at first (see the class).
 
         Args:
             t: time [s].
@@ -81,7 +81,7 @@ class Intake:
             tau: measured torques, (n,) [Nm, N].
 
         Returns:
-            "used", or the reason why the sample is refused or only partly used.
+            "used", or the reason why nothing of the sample (`IGNORED`) or only a part of it is used (other reasons).
         """
         refusal = self._check(t, q, qd, tau)
         # After `TUNING.restart` consecutive samples that are refused as "reversed" or "jump", a permanent change of the

@@ -175,10 +175,10 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. A
     trial is an estimate x of the payload from several consecutive blocks, where x is the mass (k = 1), or mass and
     first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
-    Its mean is computed for each k and each length of trials, together with `prior_trials` imaginary trials of the
-    value `prior_variance`. The factor is the largest mean: errors of the model are correlated over time, so that the
-    mean may be larger for longer trials. The degrees of freedom are the number of trials of the largest mean's length,
-    imaginary ones included.
+    Its mean over the trials is computed for each k and each length of trials; each mean includes `prior_trials`
+    imaginary trials of the value `prior_variance`. The factor is the largest of these means, since errors that are
+    correlated over time may give a larger mean for longer trials. The degrees of freedom are the number of trials in
+    this mean, imaginary ones included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -227,8 +227,8 @@ def _likelihood(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the negative log likelihood of the torque residuals, (G, n), for G noise models per joint.
 
-    The second result is the mean squared prediction error divided by its variance, (G, n), from which the scale of the
-    noise is corrected.
+    `JointFilters` predicts the residual of each block. The second result is the mean of the squared prediction error
+    divided by its variance, (G, n), from which the scale of the noise is corrected.
 
     Args:
         segments: consecutive blocks of each log.
@@ -275,14 +275,15 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return the exponential distribution of the largest peaks of all logs, as fields of `NoiseLevels`.
+    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels` for the peaks of all logs.
 
-    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. Peaks
-    differ between logs, so thresholds from some logs cause too many alarms on others. The distribution is therefore
-    fitted to all peaks times a factor, which multiplies the contact thresholds, too. Cross-validation determines the
-    factor: for each log, thresholds are computed from all other logs. With these thresholds times the factor, all
-    held-out logs together have at most the number of alarms that the default rate of false alarms allows. The factor is
-    the same for all joints, because the joint that needs the largest factor differs between logs.
+    A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. An
+    exponential distribution is fitted to the largest peaks and gives the contact thresholds. Peaks differ between logs,
+    so thresholds from some logs cause too many alarms on others. All peaks, and thereby the thresholds, are therefore
+    multiplied by a factor. Cross-validation determines the factor: for each log, thresholds are computed from all other
+    logs. With these thresholds times the factor, all held-out logs together have at most the number of alarms that the
+    default rate of false alarms allows. The factor is the same for all joints, because the joint that needs the largest
+    factor differs between logs.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].
@@ -317,7 +318,7 @@ def _observer_residuals(
 
 
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
-    """Return the parameters of an exponential distribution of the largest peaks, as fields of `NoiseLevels`.
+    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`, from the largest of all peaks.
 
     peaks: largest normalised residuals of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
@@ -348,7 +349,8 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
     Args:
         signal: torque residual of the observer, (T, n) [Nm, N].
         qd: velocities, (T, n) [rad/s, m/s].
-        levels: its largest speeds are the unit of v, and its torque limits determine the lower bound of s.
+        levels: the values of v on the grid are fractions of `speed`, the largest speeds; s has a lower bound
+            proportional to `effort`, the torque limits.
     """
     grid = np.array(list(itertools.product(TUNING.resting_speeds, TUNING.resting_ratios)))
     noise, costs = np.zeros((2, len(grid), len(levels.speed)))

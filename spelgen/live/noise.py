@@ -54,13 +54,13 @@ class NoiseLevels(BaseModel):
     fifth of the peaks is modelled by an exponential distribution.
 
     Attributes:
-        drift: Noise of the torque residual, averaged over the blocks of samples of the drift filter.
-        load: Noise of the torque residual, averaged over the blocks of samples of the payload filter.
+        drift: `BlockNoise` of the torque residual, for averages over a block of samples of the drift filter.
+        load: `BlockNoise` of the torque residual, for averages over a block of samples of the payload filter.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
-        resting: Additional threshold for a joint at rest: three standard deviations of the noise at rest that is added
-            to `observer`, (n,) [Nm, N]. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
+        resting: Additional threshold for a joint at rest, (n,) [Nm, N]: three standard deviations of the noise that
+            exists at rest in addition to `observer`. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
         resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
-        peak_start: Smallest value of the exponential distribution, (n,) [1].
+        peak_start: Peak at which the exponential distribution begins, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
         peak_count: Effective number of peaks from which the scale of a joint is estimated.
         load_variance: Factor by which the covariance of an estimated payload is multiplied.
@@ -131,17 +131,17 @@ class NoiseLevels(BaseModel):
 
     @property
     def tail_peaks(self) -> float:
-        """Number of external-torque peaks per minute that exceed `peak_start`, of all joints together [1/min]."""
+        """Number of peaks per minute above `peak_start` (the largest fifth), of all joints together [1/min]."""
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
-        Peaks above `peak_start` have an exponential distribution, whose scale is estimated from m = `peak_count` peaks.
-        With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds it by more than x
-        with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start` + x, with the x
-        for which this probability times `tail_peaks`, the rate of peaks above `peak_start`, is the rate of false
-        alarms.
+        Peaks (see the class) above `peak_start` have an exponential distribution, whose scale is estimated from m =
+        `peak_count` peaks. With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds
+        it by more than x with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start`
+        + x, with the x for which this probability times `tail_peaks`, the rate of peaks above `peak_start` [1/min], is
+        the rate of false alarms.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

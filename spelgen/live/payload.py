@@ -117,8 +117,9 @@ def _at_scale(
     """Return the MAP estimate of a payload's parameters, its covariance, and the log evidence, for one prior mean.
 
     Newton's method minimizes w (1/2 theta^T precision theta - linear . theta) - 1/2 log det J + 1/2 tr(W^-1 J), with
-    the pseudo-inertia J of theta, the scale matrix W of the Wishart prior, and the weight w of the likelihood. W is the
-    pseudo-inertia of the prior mean, a homogeneous ball, divided by the degrees of freedom `TUNING.degrees`.
+    the pseudo-inertia J of theta and the weight w of the likelihood. The other terms are the Wishart prior of J with
+    `TUNING.degrees` = 6 degrees of freedom. Its scale matrix W is the pseudo-inertia of the prior mean, a homogeneous
+    ball, divided by 6.
 
     Without a ``start``, Newton's method starts from the prior mean, and w increases to 1 in steps. With w = 1 from the
     beginning it would stall at the boundary of the cone of physically consistent parameters, because the maximum of the

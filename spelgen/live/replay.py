@@ -101,7 +101,7 @@ class LogEstimate:
 
 
 def payload_content(payload: Payload) -> dict[str, object]:
-    """Return an estimated payload as content of a JSON file, with 95 % intervals if the status is "payload"."""
+    """Return a payload as content of a JSON file; with values and 95 % intervals if `Payload.status` is "payload"."""
     content: dict[str, object] = {"status": payload.status, "log_odds_of_no_payload": payload.log_odds}
     if np.isfinite(payload.limit):
         content["mass_limit"] = payload.limit

@@ -13,11 +13,11 @@ from spelgen.runtime.rows import Joint, Link, vector
 
 
 class ChainConfiguration(NamedTuple):
-    """Configuration cache of ``BodyChain``: all its quantities that depend on q only, in the base frame.
+    """Configuration cache of ``BodyChain``: its quantities that depend on q only, in the base frame.
 
-    Four point masses suffice to represent a rigid body (see ``BodyChain``). Positions and velocities of a
-    point are multiplied by the square root of its mass, so that products of two of them are moments and
-    energies.
+    Four point masses suffice to represent a rigid body (see ``BodyChain``). Coordinates of a point, and
+    velocities computed from them, are multiplied by the square root of its mass: products of two such
+    factors are second moments and energies.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
@@ -95,9 +95,9 @@ class BodyChain(nn.Module):
 
         Args:
             q: joint positions, (..., n) [rad, m].
-            points: block diagonal matrix, (4 B, 4 B) for B bodies; the block of a body has a column
-                (position, 1) * sqrt(mass) for each of its four point masses, in the body frame
-                [m kg^(1/2), kg^(1/2)].
+            points: block diagonal matrix, (4 B, 4 B) for B bodies. The 4 x 4 block of a body has a column
+                (position, 1) * sqrt(mass) for each of the four point masses that represent the body (see
+                the class), in the body frame [m kg^(1/2), kg^(1/2)].
         """
         # Joint displacements of all bodies; the displacement of a mimic joint is linear in q of its leader.
         value = q @ self.ratios.mT + self.offset
@@ -122,12 +122,12 @@ class BodyChain(nn.Module):
         return ChainConfiguration(place, mass, axes, jacobian, (self.base * mass).flatten(-3))
 
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities of bodies and point masses at joint velocities qd, (..., n) [rad/s, m/s].
+        """Return velocities of bodies and point masses (see the class) at qd, (..., n) [rad/s, m/s].
 
         Returns:
             velocities of the four point masses of each body times sqrt(mass), (..., 3, bodies, 4); twists
             of the bodies, (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies)
-            (Featherstone, 2.31).
+            (Featherstone, eq. 2.31).
         """
         rates = qd @ self.ratios.mT
         # Sums over the joints that carry a body: the Jacobian is zero for other joints, and twists are
@@ -143,8 +143,9 @@ class BodyChain(nn.Module):
         """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
 
         a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the
-        returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body. ``ratios``
-        transposed maps it to the n joints, to which mimic joints are coupled.
+        returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body.
+        ``ratios``, (bodies, n), transposed maps this torque to the n joints: it adds mimic joints to
+        their leaders.
 
         Args:
             cache: configuration cache at q.

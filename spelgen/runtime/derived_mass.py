@@ -100,13 +100,14 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    The result is M' = C + t (M - C), which is positive definite for all q and all parameters. C is
-    constant: ``entries`` with the nominal mean of each function (``Function.mean``) and the initial
-    constants, without armature. The factor t is 1, and M' equals M, if M - margin C is positive definite,
-    where ``margin`` is below 1. Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin
-    <= 1. The norm |X| is an upper bound of the spectral norm of L^-1 X L^-T, with C = L L^T. Since t is
-    piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M and the
-    linear relations between entries of M are valid for C, and therefore for M', too.
+    If M is not clearly positive definite, it is moved towards a constant matrix C = L L^T. C is
+    ``entries`` with the nominal mean of each function (``Function.mean``) and the initial constants,
+    without armature. The result is M' = C + t (M - C), which is positive definite for all q and all
+    parameters. The factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin``
+    is below 1. Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X|
+    is an upper bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives
+    of M' are t times the derivatives of M. The zeros of M and the linear relations between entries of M
+    are valid for C, and therefore for M', too.
     """
 
     def __init__(
@@ -156,9 +157,9 @@ class DerivedMass(LinearMass):
     def forward(self, encoded: Tensor, layers: Layers) -> tuple[Tensor, tuple[Intermediates, Tensor]]:
         """Return the mass matrix M'(q), (..., n, n), and intermediate values for its derivatives.
 
-        M' = C + t (M - C) is the corrected mass matrix, with the constant C and the factor t(q) of the
-        class. The intermediate values are the values of the network's layers, and t, (...). encoded:
-        encoding of q, (..., 2 n). layers: parameter cache.
+        M' = C + t (M - C), with the nominal mass matrix C and the factor t(q) of the class, is positive
+        definite. The intermediate values are the values of the network's layers, and t, (...). encoded:
+        encoding of q, (..., 2 n), by ``JointEncoding``. layers: parameter cache.
         """
         rows, intermediates = self.network.forward(encoded, layers)
         mass = rows.reshape(*rows.shape[:-1], *self.center.shape)
@@ -168,8 +169,8 @@ class DerivedMass(LinearMass):
     def fraction(self, mass: Tensor) -> Tensor:
         """Return the factor t of M' = C + t (M - C), (...), for the matrices M in ``mass``, (..., n, n).
 
-        t is 1 if M - margin C is positive definite, otherwise 1/2, 1/4, ...; the class defines C and
-        margin.
+        t is 1 if M - margin C is positive definite, with the nominal mass matrix C and a margin below 1.
+        Otherwise t is 1/2, 1/4, ...: small enough that M' is positive definite (see the class).
         """
         # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
         # matrices are indefinite.
@@ -204,8 +205,8 @@ class DerivedMass(LinearMass):
 class DenseIntermediates(NamedTuple):
     """Intermediate values of ``DenseMass.forward``, from which the derivatives of M are computed.
 
-    M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives the lower triangular U and e > 0; A is constant
-    (see ``DenseMass``).
+    M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives e > 0 and the factor U, a lower triangular matrix;
+    A is constant (see ``DenseMass``).
     """
 
     network: Intermediates
@@ -215,7 +216,7 @@ class DenseIntermediates(NamedTuple):
 
 
 def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
-    """Return C of ``DenseMass``, (3 n, 3 n): Cholesky factor of the nominal inverse of the large matrix.
+    """Return C of ``DenseMass``, (3 n, 3 n): C C^T is the inverse of the nominal large matrix.
 
     The large matrix of ``DenseMass`` has a row for the x, y and z axis of each joint. The block of the z
     axes is the nominal M. A row of an x or y axis has only a diagonal entry, equal to the diagonal entry of
@@ -238,14 +239,14 @@ def nominal_factor(joints: Sequence[Joint], mean: Rows) -> Tensor:
 
 
 class DenseMass(nn.Module):
-    """A mass matrix M(q), (..., n, n), without structure: a block of a matrix with three axes per joint.
+    """A mass matrix M(q), (..., n, n), without structure: the block of the z axes of a larger matrix.
 
     The large matrix, (..., 3 n, 3 n), has a row and a column for the x, y and z axis of each joint, as in the
-    model of Duong et al. (IEEE T-RO 40:3695, 2024). Its inverse is C U diag(e) U^T C^T. C is constant: the
-    Cholesky factor of the nominal inverse. A network with the encoding of q as input gives U, which is lower
-    triangular with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots. Joints
-    rotate about or move along their z axes only, so M is the block of the z axes: (U^-1 A)^T diag(1 / e) U^-1
-    A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
+    model of Duong et al. (IEEE T-RO 40:3695, 2024). The inverse of the large matrix is C U diag(e) U^T
+    C^T. C is the constant ``nominal_factor``. A network with the encoding of q as input gives U, which is
+    lower triangular with ones on the diagonal, and e > 0: a Cholesky factorisation without square roots.
+    Joints rotate about or move along their z axes only, so M is the block of the z axes: (U^-1 A)^T
+    diag(1 / e) U^-1 A, where A has the columns of C^-1 that belong to z axes, (3 n, n).
     """
 
     def __init__(self, joints: Sequence[Joint], *, mean: Rows, network: MaskedNetwork) -> None:
@@ -268,7 +269,7 @@ class DenseMass(nn.Module):
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse of the large matrix of the class, C U diag(e) U^T C^T, (..., 3 n, 3 n).
+        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n), see the class.
 
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
@@ -277,7 +278,7 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its diagonal of ones, (..., 3 n, 3 n), and e, (..., 3 n), of ``DenseMass``.
+        """Return U without its unit diagonal, (..., 3 n, 3 n), and e, (..., 3 n), see the class.
 
         raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and softplus^-1(e).
         """

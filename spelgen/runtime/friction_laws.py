@@ -9,15 +9,16 @@ from torch import Tensor, nn
 from spelgen.runtime.parts import Row
 from spelgen.runtime.rows import Joint, vector
 
-# Initial value of `coulomb_smoothing_velocity` divided by the typical speed of the joint. The smooth sign of
-# the velocity, by which dry friction is multiplied, is 0.7 at the smoothing velocity.
+# Initial `coulomb_smoothing_velocity` of ``SlidingFriction`` divided by the typical speed of the joint.
+# The smooth sign of the velocity, by which dry friction is multiplied, is 0.7 at the smoothing velocity.
 SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
     """Parameter cache of ``FrictionLaws``: constants of all joints, (n,), and of K bristles each, (n, K).
 
-    All constants are in SI units and >= 0. Constants that are torques are 0 at joints without friction.
+    All constants are in SI units and >= 0. All torques except ``min_load`` are 0 at joints without
+    friction.
     """
 
     viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]

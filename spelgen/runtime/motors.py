@@ -83,8 +83,8 @@ class PositionServo(nn.Module):
     u is the commanded position, q and qd are the position and velocity of a joint. d(x) is x reduced in
     magnitude by half the width of a dead zone, and 0 within the dead zone, which is due to gear backlash or
     to the controller. A servo is a spring and a damper: the spring stores the energy 1/2 kp d(q - u)^2, so
-    the arm with the input u is port-Hamiltonian. The trained parameters are logarithms of kp and kd, relative
-    to the given values.
+    the arm with the input u is port-Hamiltonian. The trained parameters are logarithms of kp and kd,
+    relative to the given values. Delay and dead zone are buffers: initially 0, set by a fit to commands.
 
     Args:
         kp: initial kp, (n,) [Nm/rad, N/m].

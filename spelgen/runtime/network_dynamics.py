@@ -116,7 +116,8 @@ class DenseInputDynamics(NetworkDynamics):
     """A ``NetworkDynamics`` whose input matrix G(q) is a network, too; G is diagonal.
 
     The network of G has three outputs per joint, one for each axis of the joint frame. Only the output of
-    the z axis, about or along which the joint moves, is used. The gain of a joint is 1 + output.
+    the z axis is used, since the joint moves about or along it: the diagonal entry of G is 1 + this
+    output.
     """
 
     def __init__(self, *, input_network: MaskedNetwork, **parts: Any) -> None:
@@ -148,8 +149,8 @@ class DenseInputDynamics(NetworkDynamics):
 class NetworkFriction(nn.Module):
     """Base class of dissipation matrices D(q, qd), (..., n, n), that are computed by a network.
 
-    The outputs of the network are scaled by typical friction and typical speed of the joints, so that they
-    are of the order of one.
+    D [Nm s/rad, N s/m] is computed in units of typical friction / typical speed of the joints, so that
+    the outputs of the network are of the order of one.
     """
 
     prepare: Callable[[], Parameters]  # returns the parameter cache (quantities independent of q and qd)
@@ -240,9 +241,9 @@ class DenseFriction(NetworkFriction):
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of a network with the entries of L as outputs, row after row.
+        """Return the parameter cache: layers of a network whose outputs are n rows of L in D = L L^T.
 
-        The class defines L and ``axes``. Only the row of each joint's last axis is included: n rows of n
+        Each joint has ``axes`` rows in L (see the class), of which D needs only the last one. A row has n
         * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)

@@ -30,7 +30,7 @@ class JointEncoding(nn.Module):
         self.slope = nn.Buffer((1 - self.revolute) / vector(joint.half_range for joint in joints))
 
     def forward(self, q: Tensor) -> Tensor:
-        """Return the encoding, (..., 2 n), of the joint positions q, (..., n) [rad, m]."""
+        """Return the encoding of q, (..., n) [rad, m]: cos q, then sin q (see the class), (..., 2 n)."""
         scaled = self.slope * (q - self.center)
         return torch.cat([torch.addcmul(scaled, self.revolute, q.cos()), self.revolute * q.sin()], dim=-1)
 

@@ -35,7 +35,8 @@ class Mass(Protocol):
     def kinetic_vjp(self, qd: Tensor, intermediates: Intermediates) -> Tensor:
         """Return the gradient of 1/2 qd^T M(q) qd with respect to the encoding of q, (..., 2 n).
 
-        qd: velocities, (..., n). intermediates: second result of ``forward`` at q.
+        The encoding is cos q and sin q of revolute joints (``JointEncoding``). qd: velocities, (..., n).
+        intermediates: second result of ``forward`` at q.
         """
 
     def jvp(self, rate: Tensor, intermediates: Intermediates) -> Tensor:

@@ -128,9 +128,9 @@ class ResidualTerms(nn.Module):
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
     def _by_entry(self, sizes: Tensor) -> Tensor:
-        """Return the parts of R, a term of M, due to its functions and constants, (their number, n, n).
+        """Return the part of R (added to M) due to each of its F functions and constants, (F, n, n).
 
-        sizes: values of the functions and constants, (functions + constants,) [kg m^2, kg m, kg].
+        sizes: values of the functions, then of the constants, (F,) [kg m^2, kg m, kg].
         """
         rows = torch.diag(sizes).unbind()
         return self.entries(*rows)
@@ -140,8 +140,8 @@ class ResidualTerms(nn.Module):
 
         R is the residual term of M, linear in its functions and constants (see the class). A + R is
         positive definite if no function or constant exceeds its bound: ``part`` (0.9 / largest number of
-        terms in a row of R) times the minimum of sqrt(d_i d_j) / |coefficient in R_ij| over the entries
-        of R, with d = 1 / (row sums of |A^-1|).
+        terms in a row of R) times the minimum of sqrt(d_i d_j) / |its coefficient in R_ij| over the
+        entries of R in which it occurs. d_i is 1 / (sum of row i of |A^-1|).
 
         Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
         dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
@@ -162,8 +162,8 @@ class ResidualTerms(nn.Module):
     def prepare(self, armature: Tensor) -> ResidualParameters:
         """Return the parameter cache: quantities that depend on trained parameters only.
 
-        armature: rotor inertia on the joint side, (n, n), for the ``bounds`` of functions and constants
-        in R.
+        armature: rotor inertia on the joint side, (n, n), from which ``bounds`` computes the largest
+        functions and constants of R, the residual term of M.
         """
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
@@ -239,8 +239,8 @@ class ResidualTerms(nn.Module):
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
 
-        It is dR/dt qd - ``gradient`` [Nm, N], with the residual term R of M. cache: configuration cache
-        at q. qd: velocities, (..., n).
+        It is dR/dt qd [Nm, N], with the residual term R of M, minus d/dq (``gradient``) of the residual
+        terms of 1/2 qd^T M qd - V. cache: configuration cache at q. qd: velocities, (..., n).
         """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)

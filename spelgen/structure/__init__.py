@@ -1,1 +1,1 @@
-"""Structure of an arm, derived exactly: zero, constant, varying entries of M, its minimal form, joints affecting V."""
+"""Exact structure of an arm: zero, constant, varying entries of M, the minimal form of M(q), joints affecting V."""

@@ -66,9 +66,9 @@ class _Functional(NamedTuple):
 
 
 def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
-    """Return the minimal exact form of M: its varying terms f_j(q) B_j (outputs), and its constant terms c_k A_k.
+    """Return the varying terms f_j(q) B_j and the constant terms c_k A_k whose sum is M, in the minimal exact form.
 
-    The symbols are defined in the docstring of the module. spans: samples of M and of its changes with q.
+    Each f_j depends on a minimal set of joints (see the module). spans: samples of M and of its changes with q.
     """
     functionals = list(_functionals(spans))
     entries = len(spans.keys)
@@ -114,8 +114,9 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
 
 
 def _functionals(spans: Spans) -> Iterator[_Functional]:
-    """Yield the functions f_j of the module, as independent functionals of M that determine every change of M with q.
+    """Yield the functions f_j(q) of the minimal form of M, in the order of the greedy selection (see the module).
 
+    Each f_j is a weighted sum of the entries of M(q). The f_j are independent and determine every change of M with q.
     spans: samples of M and the spans of its changes.
     """
     chosen = np.zeros((0, len(spans.varying)), dtype=np.uint64)
@@ -146,8 +147,8 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
 
-    The selection is described in the docstring of the module. Sets close to the tip are first, small sets before large
-    ones.
+    A set is sorted first by its joint closest to the root: joints near the tip come first. Sets with the same joint
+    closest to the root are sorted by size, small sets first (see the module).
     """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
@@ -164,16 +165,16 @@ def _candidates(
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
     """Yield two lists of candidates for f_j that depend on ``joints`` only: single entries of M, then sums of entries.
 
-    A candidate is a linear functional of M: its coefficients in the prime field and in double precision, (entries,)
-    each. Sums of few entries are first.
+    A candidate is a weighted sum of the entries of M, which varies only with the positions of ``joints``. It is given
+    by its weights, (entries,), in the prime field and in double precision. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
-        joints: the only joints that the functionals may depend on.
-        kernel: (m, entries), coefficients of a basis of the functionals that vanish on all changes of M caused by other
-            joints. Each row has the coefficient 1 for one entry of M that is not in `bound`; its other nonzero
-            coefficients belong to entries in `bound`.
-        bound: indices of the entries of M that are pivots of an echelon basis of these changes.
+        joints: the only joints that the candidates may depend on.
+        kernel: (m, entries), weights of a basis of all sums that do not change if other joints move. Each row has the
+            coefficient 1 for one entry of M that is not in `bound`; its other nonzero coefficients belong to entries in
+            `bound`.
+        bound: indices of the entries of M that are pivots of an echelon basis of the changes by other joints.
         tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """
@@ -219,10 +220,10 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
-    """Return the nonzero elements of a symmetric matrix's lower triangle, with row and column, as rational numbers.
+    """Return a symmetric matrix as `Weights`: row, column and rational value of each nonzero element.
 
-    spans: its `keys` are the rows and columns of the elements. exact, values: the elements, (entries,), in the prime
-    field and in double precision.
+    spans: `keys` has row and column of each element of the lower triangle. exact, values: the elements, (entries,), in
+    the prime field and in double precision.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)

@@ -57,7 +57,7 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return typical values of the terms of M in the ``structure`` of ``arm``, of its potential energy and torques."""
+    """Return the `Nominal` of an arm over random positions; ``structure`` has the terms f_j B_j and c_k A_k of M."""
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -99,9 +99,9 @@ def nominal(arm: Chain, structure: Structure) -> Nominal:
 
 
 def _functionals(terms: Sequence[Term], n: int) -> np.ndarray:
-    """Return the coefficients of m terms' functions f as linear functionals of M (`Term.functional`), (m, n(n+1)/2).
+    """Return the weights, (m, n(n+1)/2), with which the functions f of m terms are computed from M (`Term.functional`).
 
-    The columns are the entries of the lower triangle of M, row after row.
+    f is the sum of weight times entry over the lower triangle of M; the columns are the entries, row after row.
     """
     rows = [row_of(term.functional, n) for term in terms]
     return np.reshape(rows, (-1, n * (n + 1) // 2))

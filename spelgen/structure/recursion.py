@@ -61,7 +61,7 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """A rotation and a translation: of a joint frame in the frame of the parent body, or due to a joint's position.
+    """A rotation and a translation: from a joint frame to the frame of the parent body, or by the joint's motion.
 
     rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, so that
     products with them are recognized and not computed.
@@ -252,7 +252,7 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 
 def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return the inertia of a body about the axes of its joint's frame at q = 0, which does not move with the body.
+    """Return the inertia of a body, displaced by its joint, about the fixed axes of the joint's frame at q = 0.
 
     inertia: inertia of the body in the frame that moves with it. transform: rotation about z, or translation along z,
     from the moving frame to the frame at q = 0.

@@ -23,8 +23,8 @@ Ten = Sequence[Element]
 def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lower triangles of M, (1 + n, samples, n(n+1)/2), and V, (1 + n, samples), in the prime field.
 
-    M is the mass matrix, V the potential energy. Index 0 of the first axis has random positions; the positions of index
-    1 + k differ from index 0 in coordinate k only (see the module's docstring).
+    M is the mass matrix, V the potential energy. The first axis has 1 + n blocks: block 0 has random positions; the
+    positions of block 1 + k differ from block 0 in coordinate k only.
 
     Args:
         arm: the arm, with n coordinates.
@@ -120,10 +120,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
+    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S), see the module.
 
-    values: 2 S random values, (2 S,). Block ``index`` + 1 gets the last S values, all other blocks get the first S
-    values: the coordinate differs from block 0 in block ``index`` + 1 only.
+    values: 2 S random values, (2 S,). Block ``index`` + 1, the only block in which this coordinate differs from block
+    0, gets the last S values. All other blocks get the first S values.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))
@@ -139,10 +139,11 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 
 
 class Spans:
-    """Linear spans of M and of its changes, in the prime field, from which the structure of an arm is derived.
+    """Linear spans of M and of its changes, from which the structure of an arm is derived.
 
-    A vector of the spans has the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_i the span
-    of the changes of M if only coordinate i moves, and U the sum of all T_i. A basis has a row per dimension.
+    The spans are computed in the prime field, in which ranks and zeros need no tolerances. A vector of the spans has
+    the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_i the span of the changes of M if only
+    coordinate i moves, and U the sum of all T_i. A basis has a row per dimension.
 
     Attributes:
         n: Number of coordinates.
@@ -153,8 +154,8 @@ class Spans:
         order: Order in which entries of M are eliminated: entries that depend on many joints first.
         change_bases: Echelon basis of each T_i, (dim T_i, entries), with the entries in the order ``order``.
         varying: Basis of U, (dim U, entries).
-        floats: Samples of M in double precision, (1 + n, 2 S, entries), in 1 + n blocks (see the module). They
-            determine the values of nonzero coefficients; zeros and ranks are determined in the prime field.
+        floats: Samples of M in double precision, (1 + n, 2 S, entries): in block 1 + k, only coordinate k differs from
+            block 0. They determine the values of nonzero coefficients.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -182,17 +183,17 @@ class Spans:
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        Joints are in increasing order. Each joint has 2 S samples: the changes of M if only this joint moves from the
-        positions of block 0 of ``floats``.
+        Each joint has 2 S rows, in increasing order of the joints. A row is M in the block of ``floats`` in which only
+        this joint has moved, minus M in block 0.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
 
     def outside(self, joints: frozenset[int]) -> np.ndarray:
-        """Return an echelon basis of the changes of M caused by all joints except ``joints``, (dimension, entries).
+        """Return an echelon basis of the changes of M if joints other than ``joints`` move, (dimension, entries).
 
-        It is a basis, in the prime field, of the sum of the spans T_i of all joints i except ``joints``. The columns
-        are the entries of M in the order of the attribute ``order``.
+        It is a basis, in the prime field, of the sum of the spans T_i (see the class) of these other joints i. The
+        columns are the entries of M in the order of the attribute ``order``.
         """
         first, last = min(joints), max(joints)
         between = [self.change_bases[k] for k in range(first, last) if k not in joints]

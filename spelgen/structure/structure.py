@@ -1,12 +1,12 @@
 """Structure of an arm: zero, constant and varying entries of M, the joints that M and V depend on, minimal form of M.
 
 V is the potential energy. The minimal form is M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions
-f_j and constant matrices A_k and B_j. Let T_i be the span of the changes M(q) - M(q') when only joint i moves, U the
-sum of all T_i, and W the span of M(q), for all q and all assumed inertial parameters. The minimal number of functions
-f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only on the
-joints in a set J if and only if it vanishes on T_i for every i outside J; this test selects the functionals that define
-the f_j. All tests are ranks or zeros of samples in a prime field (``field``): exact with an error probability of about
-1e-16, without tolerances.
+f_j and constant matrices A_k and B_j. Let W be the span of M(q), T_i the span of the changes M(q) - M(q') when only
+joint i moves, each for all q and all assumed inertial parameters, and U the sum of all T_i. The minimal number of
+functions f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only
+on the joints in a set J if and only if it vanishes on T_i for every i outside J; this test selects the functionals that
+define the f_j. All tests compute ranks or zeros of random samples of M and its changes in a prime field (``field``):
+exact with an error probability of about 1e-16, without tolerances.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class Structure:
             valid for the values of the URDF.
         joints: names of the coordinates.
         entries: entries of the lower triangle of M.
-        outputs: varying terms f_j(q) B_j of the minimal form of M.
+        outputs: varying terms f_j(q) B_j of the minimal form of M (see the module).
         constants: constant terms c_k A_k of the minimal form of M.
         base_parameter_count: number of base inertial parameters.
     """

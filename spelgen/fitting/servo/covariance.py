@@ -17,15 +17,16 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
 
     The fit determines the covariance of k parameters. The derivatives of the K parameters of the model with respect to
     these k parameters give the covariance (K, K). Users of the result multiply standard deviations by 1.96. The
-    covariance is therefore scaled such that this product is half the 95 % interval of Student's t.
+    covariance is therefore scaled such that this product is half the width of the 95 % interval of Student's t
+    distribution.
 
-    Two covariances are added to it: the variance of kd, armature and friction due to errors of the friction model
+    Two covariances are added: the variance of kd, armature and friction due to errors of the friction model
     (`ServoTuning.model_deviation`), and the prior covariance of the body parameters orthogonal to the directions that
     the fit changes (`ParameterMap.directions`).
 
-    If no kp is known, the logs determine the common factor of all torques only by effort limits, and the limits in
-    URDFs often differ from the limits of the motors. The variance of the logarithm of this factor is therefore raised
-    to at least the prior variance of the logarithm of a mass.
+    If no kp is known, positions do not depend on a common factor of gains, masses, friction and offsets, except by
+    effort limits. The limits in URDFs often differ from the limits of the motors. The variance of the logarithm of this
+    factor is therefore raised to at least the prior variance of the logarithm of a mass.
 
     The result also has the standard deviation of the delay, `delay_std` [s].
     """

@@ -31,7 +31,8 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    # A cost is NaN if a rollout diverged. The comparison is then False, and no dead zone is selected.
+    # A cost with a dead zone is NaN or infinite if a rollout diverged: no dead zone is then selected. Costs without are
+    # finite, since the rollouts at x are.
     better = costs_with + TUNING.significance**2 / 2 < costs_without
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
     active[problem.parameters.row(DEAD_ZONE)] = better
@@ -86,11 +87,10 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
 def with_dead_zones(problem: ServoProblem, x: ServoParameters, fraction: float) -> ServoParameters:
     """Return parameters x with a dead zone at every joint, as the initial guess of a fit of dead zones.
 
-    The model of the problem gets the parameters x. All parameters of the result are marked as fitted (`active`). The
-    static position error is (dry friction) / kp + half the dead
-    zone. Half the dead zone is set to ``fraction`` times (dry friction) / kp, and Coulomb friction is reduced by the
-    same fraction. The static error then remains about the same, or exactly the same if Coulomb friction is the only dry
-    friction.
+    All parameters of the result are marked as fitted (`active`). As a side effect, x is written to the problem's model.
+    The static position error of a servo is (dry friction) / kp plus half the width of the dead zone. This half width is
+    set to ``fraction`` times (dry friction) / kp, and Coulomb friction is reduced by the same fraction. The static
+    error remains about the same, or exactly the same if Coulomb friction is the only dry friction.
     """
     rollouts, row, joints = problem.rollouts, problem.parameters.row, x.joints.clone()
     model = rollouts.model

@@ -125,7 +125,7 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Reduce the integration error by a Gauss-Newton step with half the integration step; record the results."""
+        """Take a last Gauss-Newton step, with half the integration step length; set `results` and the checkpoint."""
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
@@ -165,7 +165,7 @@ class ServoObjective(Objective):
         self._update_checkpoint(float(self._errors.square().mean().sqrt()))
 
     def _update_checkpoint(self, rms: float) -> None:
-        """Set the content of checkpoint.pt. rms: RMS position error of all joints [rad, m]."""
+        """Set the checkpoint, in memory, that ``save`` writes. rms: RMS position error of all joints [rad, m]."""
         self._make_checkpoint(rms, time.monotonic() - self._since, self._windows.steps, self._steps)
         self._checkpoint["servo"] = {
             "start": self._initial_weights,

@@ -136,7 +136,7 @@ class ParameterMap:
         return self._inertial(self._log_cholesky(bodies)).flatten()
 
     def _log_cholesky(self, bodies: Tensor) -> Tensor:
-        """Return the log-Cholesky parameters of B bodies, (B, 10): prior mean plus `directions` times `bodies` (r,)."""
+        """Return log-Cholesky parameters, (B, 10), of B bodies: prior mean plus `directions` times coordinates (r,)."""
         return self._mean_bodies + (self.directions @ bodies).view_as(self._mean_bodies)
 
     def _inertial(self, log_cholesky: Tensor) -> Tensor:

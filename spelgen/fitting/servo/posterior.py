@@ -1,4 +1,4 @@
-"""Posterior of a model that was fitted to positions under position servos: quantities relative to kp."""
+"""Posterior of a fit to positions under position servos, which determine damping, friction, ... only relative to kp."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -24,7 +24,7 @@ SERVO_UNITS = {
 }
 """Unit of each quantity of position servos.
 
-lag: kd/kp plus the delay of the commands. dead zone: half its width. static error: coulomb/kp plus half the dead zone.
+lag: kd/kp plus the delay of the commands. dead zone: half its width. static error: coulomb/kp plus this half width.
 """
 SUMS = {"lag": ("kd/kp", "delay"), "static error": ("coulomb/kp", "dead zone")}
 """Sums of two quantities that logs of servos may determine better than either of the two."""
@@ -39,10 +39,10 @@ class ServoPosterior(Posterior):
 
     @property
     def scale_joint(self) -> str | None:
-        """Name of the joint to whose kp the base parameters are given as ratios; None if a kp is known.
+        """Name of the joint whose kp divides the base parameters; None if a kp is known.
 
-        Of all joints, this joint gives ratios with the smallest median of the relative standard deviations. If a kp is
-        known, the base parameters themselves are determined, and no ratios are needed.
+        Of all joints, this joint gives quotients with the smallest median of the relative standard deviations. If a kp
+        is known, the base parameters themselves are determined and not divided.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 
@@ -85,8 +85,8 @@ class ServoPosterior(Posterior):
         """Return the quantities of the servos that have intervals, and the function that returns their values.
 
         The quantities are kp, kd/kp, lag (kd/kp plus the delay), armature/kp, coulomb/kp, dead zone (half its width),
-        static error (coulomb/kp plus half the dead zone) and offset/kp, with the units `SERVO_UNITS`. The function
-        returns (8, n) for a model.
+        static error (coulomb/kp plus this half width) and offset/kp, with the units `SERVO_UNITS`. The function returns
+        (8, n) for a model.
         """
         line, joints = friction_line(self.model), tuple(range(self.model.n))
         quantities = [
@@ -94,7 +94,7 @@ class ServoPosterior(Posterior):
         ]
 
         def ratios(model: ArmModel) -> Tensor:
-            """Return the values of the quantities in `SERVO_UNITS`, (8, n), in this order."""
+            """Return kp, kd/kp, ..., offset/kp of all joints, (8, n), in the order of `SERVO_UNITS`."""
             servo, kp = model.servo, model.servo.kp()
             damping, dry = servo.kd() / kp, line(model)[1] / kp
             return torch.stack([
@@ -106,7 +106,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of `scale_joint`, to whose kp the base parameters are given as ratios; None if a kp is known."""
+        """Index of `scale_joint`, whose kp divides the base parameters; None if a kp is known (no division)."""
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))
@@ -118,7 +118,7 @@ class ServoPosterior(Posterior):
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return the r base parameters / kp of a joint, (r,), with a square root (r, k) of their covariance."""
+        """Return r ratios, base parameter / kp of a joint, (r,), with a square root (r, k) of their covariance."""
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

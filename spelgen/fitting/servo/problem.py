@@ -43,7 +43,7 @@ class Likelihood:
         Args:
             errors: (W, K', n), position errors [rad, m].
             noise: (n,), lower bound of the scale [rad, m].
-            max_samples: upper bound of ``samples_per_error``.
+            max_samples: upper bound of ``samples_per_error``, the number of samples per independent error.
         """
         # 1.4826 times the median of |error| is the standard deviation of a Gaussian. Unlike the RMS, the median is
         # insensitive to outliers.
@@ -81,7 +81,7 @@ class ServoProblem:
 
     Shapes: W windows, K' samples of a window after the burn-in, n joints, k parameters.
 
-    noise: (n,), lower bound of the scale of the position errors [rad, m].
+    noise: (n,), standard deviation of encoder rounding, the lower bound of `Likelihood.scale` [rad, m].
     """
 
     rollouts: ServoRollouts
@@ -92,7 +92,7 @@ class ServoProblem:
     def of(cls, rollouts: ServoRollouts, noise: Tensor, errors: Tensor) -> ServoProblem:
         """Return the problem whose residual is computed by `rollouts`, with a likelihood estimated from `errors`.
 
-        noise: (n,) [rad, m], see the class. errors: (W, K', n), position errors at K' samples of W windows [rad, m].
+        noise: (n,), standard deviation of encoder rounding [rad, m]. errors: (W, K', n), position errors [rad, m].
         """
         max_samples = max(1, round(TUNING.correlation_time * rollouts.windows.rate))
         return cls(rollouts, noise, Likelihood.of(errors, noise, max_samples))
@@ -161,9 +161,9 @@ class ServoProblem:
         return NormalEquations(windows.curvature.sum(dim=0) + torch.diag(precision), descent)
 
     def window_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
-        """Return the normal equations of each window at x, (W, k, k) and (W, k), without the prior.
+        """Return the normal equations of each of W windows for k parameters, (W, k, k) and (W, k), without prior.
 
-        errors: position errors at x, (W, K', n) [rad, m].
+        errors: position errors at x, at K' samples of each window after the burn-in, (W, K', n) [rad, m].
         """
         of_joints, of_shared = self.rollouts.jacobian(x)
         weights = self.likelihood.weights(errors)

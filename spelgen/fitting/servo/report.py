@@ -83,10 +83,11 @@ class ServoSolution:
 
 
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
-    """Take one more solver step from x; return the parameters, their normal equations and their covariance.
+    """Take one Gauss-Newton step from x; return the parameters, their normal equations and their covariance.
 
     x is the result of a fit with longer integration steps than ``problem`` has. The step is therefore an estimate of
-    the integration error of x, and its outer product is added to the covariance. If the step raises the cost, x is
+    the integration error of x, and its outer product is added to the covariance. The normal equations are computed at
+    x, and extrapolated to the end of the step. If the step raises the cost, x is
     returned.
     """
     # The dead zones of all joints are free parameters here: if they were fixed at zero, the covariance of dry friction
@@ -127,7 +128,8 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
     respect to both are proportional.
 
     Args:
-        blocks: normal equations of B blocks with respect to all k parameters, (B, k, k) and (B, k).
+        blocks: normal equations of B blocks of windows with respect to all k parameters, (B, k, k) and (B, k); they are
+            summed.
         precision: (k,), inverse prior variance of each parameter.
         indices: (m,), indices of the m parameters.
     """

@@ -48,7 +48,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts from the measured states of `windows`; x0 are the model's current parameters."""
+        """Return the rollouts from the measured states of `windows`; x0 of the class are the model's parameters."""
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -56,9 +56,9 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Return the rollouts with the load recomputed along another fixed motion, ``motion``, for parameters x.
+        """Write x to the model; return the rollouts with the load recomputed for x along the fixed motion ``motion``.
 
-        x replaces x0 (see the class); the model's parameters are set to x.
+        The load is the torque of the bodies: gravity, inertia, Coriolis forces. x replaces x0 of the class.
         """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
@@ -82,8 +82,8 @@ class ServoRollouts:
         """Return derivatives of the `residual` (W, K', n) of W windows with respect to joint and shared parameters.
 
         Returns:
-            (p, W, K', n), with respect to the p parameters of the same joint; zero for parameters that are fitted at
-                no joint.
+            (p, W, K', n), with respect to the p parameters of the same joint; zero for a parameter that is fixed at all
+                joints.
             (r + 1, W, K', n), with respect to the r coordinates of the body parameters and to the delay, which all
                 joints share.
         """
@@ -114,12 +114,12 @@ class ServoRollouts:
         return q[:, :, first:] - self.windows.q[:, first:]
 
     def _rollout_at(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return positions [rad, m] and velocities [rad/s, m/s] of W windows predicted for x, (1, W, K, n) each."""
+        """Return predicted positions and velocities of W windows, (1, W, K, n) each, for one set of parameters, x."""
         commands = self.windows.commands(x.delay)
         return self._rollout(x.joints.unsqueeze(0), x.bodies.unsqueeze(0), commands.unsqueeze(0))
 
     def _rollout(self, joints: Tensor, bodies: Tensor, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return predicted q and qd, (P, W, K, n) each, for P sets of parameters and W windows of K samples.
+        """Return predicted q [rad, m] and qd [rad/s, m/s], (P, W, K, n), for P sets of parameters and W windows.
 
         Args:
             joints: (P, p, n), values of `ServoParameters.joints`.

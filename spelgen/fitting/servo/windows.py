@@ -165,7 +165,7 @@ class BodyLoad(NamedTuple):
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
-    """Return the load of the model's bodies along a motion of W windows of K samples, at their K-1 midpoints."""
+    """Return inertia, bias, gravity torque and regressor of the bodies at the K-1 midpoints of a motion."""
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature

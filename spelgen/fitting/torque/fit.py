@@ -54,8 +54,8 @@ class FitComparison(NamedTuple):
         behind: True if the regression is significantly better than the fit.
         replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
             regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
-        discarded: None if the returned model is a fit. Otherwise it is the model before the fit, since the logs do not
-            support a fit, and `discarded` is the error of the fit, which is not smaller than `fit`.
+        discarded: None if the returned model is a fit. Otherwise the returned model is the model before the fit, since
+            the logs do not support a fit, and `discarded` is the error of the fit, which is not smaller than `fit`.
     """
 
     fit: float
@@ -293,7 +293,7 @@ def _run_stages(
 def _max_samples(model: ArmModel) -> int:
     """Return the largest number of samples of a fit; larger logs are subsampled.
 
-    This number limits the memory of two regressors, of the torque and of the gravity torque, to
+    A fit stores two regressors, one of the torque and one of the gravity torque. Their memory is limited to
     `TUNING.regressor_bytes`.
     """
     numbers = 2 * model.n * model.inertial_parameters.numel()

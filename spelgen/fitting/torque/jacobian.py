@@ -98,7 +98,7 @@ class TorqueJacobian:
 
     @cached_property
     def torque_std(self) -> torch.Tensor:
-        """Standard deviation of the measured joint torque over the samples, (n,) [Nm, N]."""
+        """Standard deviation over the samples of the logged torques, converted to joint torques G tau, (n,) [Nm, N]."""
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
@@ -120,8 +120,8 @@ class TorqueJacobian:
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
         """Return initial / current motor gain per joint, (n,) [1]; 1 for fixed gains.
 
-        The measured joint torque is proportional to the current gain. Multiplied by this factor, the measured joint
-        torque no longer depends on the current gain.
+        G (tau - offset) of the measured joint torque is proportional to the gain: multiplied by this factor, it does
+        not depend on the current gain. Friction compensation is not proportional to the gain.
         """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 
@@ -325,13 +325,13 @@ class TorqueJacobian:
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
         """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
 
-        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. Its
-        rows of several joints are computed in one reverse pass (graph colouring: Curtis, Powell and Reid, J. Inst.
-        Maths Applics 13:117, 1974). Joints on which no common drive acts may have the same colour. A parameter of a
-        drive then affects the torque of at most one joint of a colour, and so does the gravity torque on the drive. A
-        derivative of the sum of all torques of a colour is therefore the derivative of the torque of this joint. Most
-        arms have one colour, so one pass replaces n passes. Each sample has its own copy of the parameters, so that a
-        pass gives the derivatives of all samples.
+        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. One
+        reverse pass differentiates the sum of the torques of several joints, which have the same colour (graph
+        colouring: Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974). No common drive acts on joints of one
+        colour. A parameter of a drive, or the gravity torque on the drive, then affects the torque of at most one joint
+        of a colour, and the derivative of the sum is the derivative of this torque. Most arms have one colour, so one
+        pass replaces n passes. Each sample has its own copy of the parameters, so that a pass gives the derivatives of
+        all samples.
 
         Args:
             parameters: {name: values}, the parameters at which the derivatives are computed.
@@ -341,7 +341,8 @@ class TorqueJacobian:
             The scaled residual, (T, n) [Nm, N].
             A list of matrices (T, K'), one per colour: derivatives with respect to the K' parameters of drives and
                 friction, that is, to all parameters except body parameters.
-            A list of matrices (T, n), one per colour: derivatives with respect to the gravity torques on the drives.
+            A list of matrices (T, n), one per colour: derivatives with respect to the gravity torques on the drives, on
+                which friction depends.
         """
         copies = {}
         for name, tensor in parameters.items():

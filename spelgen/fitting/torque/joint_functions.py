@@ -38,9 +38,9 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries, for example the spline coefficients of the joint. For the weights w (P,), the entries are
-    trends @ w[:L] + w[L:]. The L trends, for example mean and slope of the spline coefficients, change all entries
-    together.
+    The term has W entries, for example the spline coefficients of the joint. The first L weights are amplitudes of
+    trends, which change all entries together, for example mean and slope of the spline coefficients. The other W
+    weights change one entry each: for the weights w (P,), the entries are trends @ w[:L] + w[L:].
 
     scale: the parameter of the model is entries / scale.
     position: (T,) position of the joint [rad, m].
@@ -50,11 +50,11 @@ class JointFunction:
     direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
-    friction: (T,) friction torque with the current factor, if the term is a friction factor; None: the term is a
-        torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized change
-        of the friction torque.
-    visit_length: mean number of samples of a visit, which count as one independent error. A visit of a position is a
-        run of samples in which the joint moves by the knot spacing of the splines.
+    friction: (T,) friction torque [Nm, N] with the current factor, if the term is a friction factor; None: the term is
+        a torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized
+        change of the friction torque.
+    visit_length: mean number of samples of a visit. A visit of a position is a run of samples in which the joint moves
+        by the knot spacing of the splines; its samples count as one independent error.
     """
 
     parameter: str
@@ -70,9 +70,9 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return the weights (P,) of the `JointFunction` that represent the term's current parameter in `terms`.
+        """Return the P = L + W weights (P,) that represent the current values of this term's W entries in `terms`.
 
-        The weights of the L trends (see the class) are zero: the W weights of single entries suffice.
+        The weights of the L trends are zero: the W weights of single entries suffice (see the class).
         """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
@@ -93,9 +93,10 @@ class JointFunction:
             terms.get_parameter(self.parameter)[self.joint] = entries / self.scale
 
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
-        """Return the torque (T,) [Nm, N] of the residual term for weights (P,) at the samples `rows`.
+        """Return the part of the torque residual (T,) [Nm, N] that weights (P,) explain at the samples `rows`.
 
-        For a friction factor, this is the change of the friction torque by the factor.
+        For a torque it is the term's torque, without the part that rigid bodies and friction would absorb (`features`).
+        For a friction factor it is the change of the friction torque if the current factor is 1.
         """
         features = self.features[rows]
         if self.friction is None:
@@ -164,10 +165,10 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    A term is fitted to the residual with its features, orthogonalized columns, which gives the weights of a joint fit
-    of the term and the rigid bodies (theorem of Frisch, Waugh and Lovell). Friction factors are written to the model.
-    Position-dependent torques are returned as linear terms with the fitted penalty. The next fit of the rigid-body
-    parameters eliminates their weights; in the model, these torques are set to zero.
+    A term is fitted to the residual with its `features`. For a torque these columns are orthogonalized: the weights are
+    the same as in a simultaneous fit of torque and rigid bodies (theorem of Frisch, Waugh and Lovell). Friction factors
+    are written to the model. Position-dependent torques are returned as linear terms with the fitted penalty. The next
+    fit of the rigid-body parameters eliminates their weights; in the model, these torques are set to zero.
 
     Args:
         model: model with residual terms.
@@ -209,11 +210,11 @@ def joint_functions(
 ) -> Iterator[JointFunction]:
     """Yield the candidate terms of each joint (smooth torque, friction factor, ripple), or only the selected ones.
 
-    The spline coefficients of a smooth torque or of a friction factor have one common prior precision. A smooth torque
-    also has the mean and the slope of its coefficients with precisions of their own, since, unlike splines, a line
-    extrapolates to positions without samples (torque of a spring). Ripple is a sum of sines and cosines of the
-    position, with one precision per frequency. Frequencies with less than two periods within the samples are omitted:
-    they would fit a trend, and be wrong at other positions.
+    The spline coefficients of a smooth torque or of a friction factor have one common prior precision. The mean and the
+    slope of the coefficients of a smooth torque are additional weights, each with its own prior precision: a line,
+    unlike splines, extrapolates to positions without samples (torque of a spring). Ripple is a sum of sines and cosines
+    of the position, with one precision per frequency. Frequencies with less than two periods within the samples are
+    omitted: they would fit a trend, and be wrong at other positions.
 
     projection: projection onto the rigid-body and friction model. selected: (parameter, joint) of the terms to yield;
     None: all.
@@ -263,6 +264,6 @@ def joint_functions(
 
 
 def rms_per_joint(torque_residual: torch.Tensor) -> torch.Tensor:
-    """Return the root mean square (n,) of a torque residual (T, n), used as noise; it is never zero."""
+    """Return the root mean square (n,) of a torque residual (T, n), used as noise, with a tiny lower bound."""
     rms = torque_residual.square().mean(dim=0).sqrt()
     return rms.clamp(min=1e-12 * float(rms.max()) + 1e-300)

@@ -86,10 +86,10 @@ class RigidProjection(NamedTuple):
     posterior_gain: tuple[torch.Tensor, ...]
 
     def orthogonalize(self, joint: int, torque: torch.Tensor) -> torch.Tensor:
-        """Return the residuals (T, P) of P torques on a joint, `torque` (T, P), after projection onto the model.
+        """Return P torques on a joint, `torque` (T, P) [Nm, N], minus the parts that the model would absorb, (T, P).
 
-        If such a torque were added to the measured torque, this would be the torque residual of a refit of the
-        rigid-body and friction parameters.
+        If such a torque were added to the measured torque and the rigid-body and friction parameters were refitted, the
+        torque residual would change by the result.
         """
         jacobian = self.jacobian[joint]
         return torque - jacobian @ (self.posterior_gain[joint] @ (jacobian.mT @ torque))

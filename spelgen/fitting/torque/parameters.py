@@ -256,7 +256,7 @@ class ParameterPrior:
     an estimated width for each body.
 
     Attributes:
-        rigid: `ParameterVector` of the parameters x.
+        rigid: map between the model and the vector x.
         widths: current standard deviation of each group of parameters; for bodies, the scale of the t distribution.
         hyperprior: initial standard deviation of each group, the center of the hyperprior of its width (see
             `update_widths`).
@@ -280,8 +280,8 @@ class ParameterPrior:
     def plausible(self) -> bool:
         """Whether the masses of the URDF differ from the fitted masses by at most a factor of `TUNING.wrong_urdf`.
 
-        Their ratio is estimated as exp(root mean square of `body_widths`), since the logarithm of a mass is a
-        parameter.
+        The factor is estimated as exp(root mean square of `body_widths`): the logarithm of a mass is a parameter, and
+        these prior standard deviations are re-estimated from the fitted parameters.
         """
         return float(self.body_widths.square().mean().sqrt().exp()) <= TUNING.wrong_urdf
 

@@ -80,7 +80,7 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the largest noise (n,) [Nm, N]: for the RMS residual `max_error`, or `torque_std` if smaller."""
+        """Return the largest noise (n,) [Nm, N]: the noise for an RMS residual of min(`max_error`, `torque_std`)."""
         return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
@@ -148,8 +148,9 @@ class TorqueProblem:
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
-        widths: initial standard deviations of the prior. adapt, max_error: purpose of the fit, and upper bound of the
-        root mean square torque error (see the class). The initial noise is `NoiseEstimator.upper_bound`.
+        widths: initial standard deviations of the prior. adapt: "load", "friction", "unit" or None, the estimated
+        parameters (see the class). max_error: upper bound of the root mean square torque error, (n,) [Nm, N]. The
+        initial noise is `NoiseEstimator.upper_bound`.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -165,7 +166,7 @@ class TorqueProblem:
 
     @cached_property
     def noise_estimator(self) -> NoiseEstimator:
-        """Estimator of the torque noise for the samples of the Jacobian."""
+        """Estimator of the torque noise from the residual on all samples of ``jacobian``."""
         return NoiseEstimator.of(self.jacobian, self.correlation_time, self.max_error)
 
     @property
@@ -177,9 +178,10 @@ class TorqueProblem:
         """Return the problem with the noise that is estimated from the residual of unconstrained least squares.
 
         The torque is linearized at x (K,) and fitted by least squares in the inertial, drive and friction parameters,
-        without a prior and without physical consistency of the bodies. The torque is linear in these parameters except
-        for some of friction, so that no x has a much smaller residual: this noise is approximately a lower bound. Noise
-        estimated from the residual of a poor initial guess would be too large, and the fit would stop early.
+        without a prior and without physical consistency of the bodies. The torque is linear in most of these
+        parameters; velocity scales of friction are an exception. No x therefore has a much smaller residual, and this
+        noise is approximately a lower bound. Noise that is estimated from the residual of a poor initial guess would be
+        too large, and the fit would stop early.
         """
         estimator = self.noise_estimator
         noise, rows = estimator.upper_bound(), list(self.jacobian.joint_rows(x))
@@ -285,7 +287,8 @@ class TorqueEstimate:
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
 
-        The squared residual is recomputed with the current friction model of each joint: with or without bristles.
+        The squared residual is recomputed with the current friction model of each joint, with or without bristles
+        (`FrictionLaws.memoryless`).
         """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
@@ -317,8 +320,8 @@ class TorqueEstimate:
         """Return the torque residual at the estimate, and a `RigidProjection` for torques of residual terms.
 
         The projection computes the part of a joint torque that the rigid-body and friction model would absorb. The
-        posterior covariance of the parameters must be current (see `with_current_covariance`): the absorbed part is
-        proportional to it, and a covariance for a larger noise would be too large.
+        absorbed part is proportional to the posterior covariance divided by the noise variance. The covariance must be
+        current (see `with_current_covariance`): `alternate` may have lowered the noise after computing it.
         """
         jacobian, x = self.problem.jacobian, self.state.x
         projection = jacobian.rigid_projection(x, self.problem.noise, self.covariance)
@@ -329,7 +332,7 @@ def alternate(problem: TorqueProblem, state: State) -> TorqueEstimate:
     """Alternate Levenberg-Marquardt steps with updates of noise and prior; return the MAP estimate.
 
     The iterations end when an update lowers the noise of no joint by more than a few per cent, and after
-    `TUNING.iterations` at the latest. A noise that rises counts as converged, since the next residual is not larger.
+    `TUNING.iterations` at the latest. A noise that rises does not continue the iterations.
 
     Args:
         problem: problem with initial noise and prior.
@@ -365,8 +368,9 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     The torque error is a sum of two errors: filtered white noise, with a correlation time of 0.06 s, and the error of
     the model, with tenths of a second to seconds. The integrated correlation time of the sum is estimated on segments
     of samples, from the residual. Since fitted parameters reduce the correlation of the residual, the residual is
-    corrected first (see `RigidProjection.errors`). The result is the mean of the estimate and the prior mean
-    `TUNING.correlation_time`, weighted with the numbers of independent errors.
+    corrected first (see `RigidProjection.errors`). The result is a weighted mean of this value and of the prior mean
+    `TUNING.correlation_time`. The weights are numbers of independent errors: in the samples, and a constant for the
+    prior mean.
 
     The correlation time is estimated only once. Updates in the outer iterations would be unstable: a joint with a long
     correlation time has a small weight, so its residual grows, which makes the correlation time even longer.

@@ -94,7 +94,7 @@ def _regression(
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the squared residual of each block, summed, (blocks, n), after a ridge fit to all other blocks."""
+        """Return the squared residual / `torque_std`^2 of each block, (blocks, n), after a ridge fit to the others."""
         weights = solution(total - grams.sum(axis=1), penalty)[:, None, :, None]
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 

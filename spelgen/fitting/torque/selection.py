@@ -6,8 +6,8 @@ correlated. Every sample is held out once and then has a held-out error. A candi
 
 - The relative reduction of the held-out squared error is significant (one-sided t test over ten contiguous blocks of
   all samples, 1 %, or 0.1 % for one or two recordings).
-- Fitted to the first half of the samples, the candidate also lowers the error on the last half: often one motion
-  repeats errors that another motion does not have.
+- Fitted to the first half of the samples, the candidate also lowers the error on the last half: errors often repeat
+  within one motion, and differ between motions.
 - With one or two recordings, the torque of the candidate is plausible (`max_torques`).
 
 If no candidate of a joint passes, the tests are repeated without the samples whose positions are outside the range of
@@ -53,13 +53,13 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if `count` samples suffice: the gap between `split_halves` is at most as long as the first slice."""
+    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice."""
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return two slices of `count` samples: the first half, shortened by `_gap` samples, and the last half."""
+    """Return two slices of `count` samples: the first half, minus `_gap(correlation_length)`, and the last half."""
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -73,9 +73,9 @@ def _gap(correlation_length: float) -> int:
 
 
 def within_range(position: torch.Tensor, fitted: torch.Tensor) -> torch.Tensor:
-    """Return a mask (T, ...), True for the T positions that are within the range of the fitted positions.
+    """Return a mask (T, ...): True for positions (T, ...) between the minimum and the maximum of the fitted positions.
 
-    fitted: T' positions, (T', ...).
+    fitted: T' positions, (T', ...) [rad, m].
     """
     return (position >= fitted.amin(dim=0)) & (position <= fitted.amax(dim=0))
 
@@ -150,7 +150,8 @@ def _best(
         noise: (n,) standard deviations of the torque noise [Nm, N].
         correlation_length: number of samples per independent error.
         recordings: (T,), index of the recording of each sample.
-        limits: bounds of the term's torque, see `max_torques`, for one or two recordings; None: no bounds.
+        limits: bounds of the standard deviation of the term's torque (see `max_torques`), if there are only one or two
+            recordings; None: no bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
     # In the second test, a candidate is fitted to the first half, and its error is computed on the last half: fitted

@@ -121,7 +121,7 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
 
 
 def _without_line(values: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """Return the residual of the regression of values (T, n) on a constant and the position q (T, n) of each joint."""
+    """Return values (T, n) minus their regression on a constant and q (T, n), separately for each column."""
     values, q = values - values.mean(dim=0), q - q.mean(dim=0)
     return values - q * ((q * values).sum(dim=0) / q.square().sum(dim=0).clamp(min=1e-300))
 
@@ -131,10 +131,10 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
     joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of the fits with and without bristles decide (see `_rejected`), with one exception. If the likelihoods
-    of all joints together favour bristles, a joint has rate-only friction only if its torque residual on ten blocks of
-    the log is also significantly smaller without bristles (t test). The reason is that the likelihood ratio of a single
-    joint is unreliable, since the errors of a motion are correlated.
+    likelihoods of the fits with and without bristles decide (see `_rejected`). If the likelihoods of all joints
+    together favour bristles, rate-only friction of a joint needs a second criterion: its torque residual without
+    bristles is also significantly smaller (t test on ten blocks of the log). The reason is that the likelihood ratio of
+    a single joint is unreliable, since the errors of a motion are correlated.
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
@@ -214,7 +214,7 @@ def log_likelihood_ratio(estimate: TorqueEstimate, other: TorqueEstimate) -> tor
 
 
 def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
-    """Return -2 log(Occam factor) of the bristle fractions of each joint, (n,).
+    """Return -2 log(Occam factor) of each joint's bristle fractions (the parts of dry friction per bristle), (n,).
 
     The marginal likelihood of a model is its likelihood times the Occam factor, which accounts for the noise that free
     parameters explain (MacKay, 1992). The result is log det of the prior covariance of the fractions minus log det of
@@ -276,7 +276,7 @@ def _refit(
 ) -> TorqueEstimate:
     """Refit the selected residual terms and the rigid-body parameters; return the new estimate.
 
-    Factors of friction over position are fitted first, then position-dependent torques together with rigid bodies.
+    Position-dependent friction factors are fitted first, then position-dependent torques and rigid bodies together.
     """
     model, correlation_length = estimate.problem.jacobian.model, estimate.problem.correlation_length
     projected = refit_terms(model, *estimate.linearize(), _keys(selected), correlation_length)
