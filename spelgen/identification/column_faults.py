@@ -185,7 +185,7 @@ class JointSense(WrongScale):
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about joints whose motion has the opposite sense of the URDF, and about their torques."""
+        """Return the text about joints whose motion is opposite to the URDF's sense, and the sense of their torques."""
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():

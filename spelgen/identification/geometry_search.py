@@ -118,7 +118,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
     """Return the indices of the recordings whose torques contradict the other recordings; at most half of all.
 
-    Parameters fitted to the other recordings explain their torques, but not the torques of such a recording.
+    Parameters fitted to the other recordings explain the torques of these recordings, but not of the deviating one.
     """
     coarse = problem.thinned(GEOMETRY.confirming_samples)
     number, unchanged = coarse.samples.recording, coarse.unchanged
@@ -126,7 +126,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     remaining, deviating = np.unique(number).tolist(), list[int]()
 
     def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
-        """Return {recording: squared residual (n,) / torque variance}, for parameters fitted to `fitted` recordings."""
+        """Return {recording: squared residual (n,) / torque variance}, with parameters of a fit to only `fitted`."""
         counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
         residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
         scale = np.maximum(tau.var(axis=0), 1e-30)
@@ -157,11 +157,11 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis without hysteresis, and b the
-    decrease with hysteresis. No part of b is hidden, but b is also larger for wrong hypotheses: on recorded arms up to
-    32, and a only up to 17. Therefore half of b counts, and the new cost is the cost of `base` minus max(a, b / 2). For
-    a hypothesis with another delay than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a
-    delay.
+    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
+    and b the decrease in fits with hysteresis. For right hypotheses b shows the whole decrease, but for wrong ones it
+    is larger, too: on recorded arms they have b up to 32 and a up to 17. Therefore half of b counts, and the new cost
+    is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay than `base`, it is the cost of `base`
+    minus min(a, b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.

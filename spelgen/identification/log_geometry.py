@@ -47,8 +47,8 @@ class GeometryProblem:
             speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
-            free_gains: True if each fit estimates an unknown positive factor on the torques of each joint, such as the
-                gain kp of a servo, whose torque is kp times the position error.
+            free_gains: True if each fit also estimates a positive factor on the torques of each joint, such as the
+                unknown gain kp of a servo, whose torque is kp times the position error.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)

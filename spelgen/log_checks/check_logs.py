@@ -79,7 +79,7 @@ def check_logs(
 
 
 def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
-    """Return the notes on logs; of notes with the same text, one about each joint, one remains and names all joints."""
+    """Return the notes on logs; notes with the same text about several joints become one note that names the joints."""
     groups = dict[tuple[Severity, str, str, str], list[str]]()
     for note in notes:
         prefix, joint, name = note.where.partition("joint '")

@@ -293,8 +293,8 @@ class ServoLogs:
     def _check_geometry(self, summary: Findings) -> None:
         """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Nothing is tested if the unchanged log has a large residual at a servo, for example due to backlash. The
-        hypothesis must explain the position errors of all joints.
+        Nothing is tested if a servo's residual with the unchanged log is above `GEOMETRY.no_advice`, for example due to
+        backlash. The hypothesis must explain the position errors of all joints.
         """
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
@@ -359,8 +359,8 @@ class ServoLogs:
     def _check_commands(self, following: Following, saturation: np.ndarray, summary: Findings) -> set[int]:
         """Add the faults of the commands to `summary`; return the indices of the joints with errors.
 
-        Each recording is tested by itself. If a joint tracks its commands in some recordings, its error names the other
-        ones.
+        Each recording is tested by itself. If a joint tracks its commands in some recordings, its error names the
+        recordings with the fault.
 
         following: tracking of the commands in all recordings. saturation: see `measure_following`.
         """

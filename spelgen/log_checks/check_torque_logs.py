@@ -230,10 +230,9 @@ class TorqueLogs:
     ) -> Iterator[LogError | Diagnostic]:
         """Yield the findings about the geometry of recordings, in the order of the tests.
 
-        The tests: is the motion large enough; do the torques have signs; are they clipped at a limit; do hypotheses
-        about senses, order, zeros, units and gravity explain them better; and, if the torques agree with the mapping,
-        are the inertials of the URDF right. The first finding that explains the torques, or states that nothing
-        explains them, ends the tests.
+        Tested are the range of the motion, lost signs of torques, clipped torques, hypotheses about senses, order,
+        zeros, units and gravity, and, if the torques agree with the mapping, the inertials of the URDF. The first
+        finding that explains the torques, or states that nothing explains them, ends the tests.
 
         Args:
             problem: least-squares problem of the samples.

@@ -87,7 +87,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
-    # The unit advised for q also applies to commands, unless the commands move much less than q, as in SI units.
+    # The unit advised for q also applies to commands, unless the commands move much less than q: they are then SI.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     return Advice(f"{message}: {units}", keys) if keys else None
