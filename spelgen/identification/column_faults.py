@@ -46,10 +46,11 @@ class WrongOrder(Fault):
             yield base.changed(self, source=source)
 
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques with the best orders of all joints, one per start.
+        """Yield least-squares fits of the log's torques with the best order of the columns that each search finds.
 
-        A search starts at an order of the joints, and improves it by exchanging two joints at a time. It also starts at
-        random orders, since the cost has local minima for arms with many joints.
+        Each search starts at another order of the joints' columns, and exchanges two joints at a time. Some of the
+        orders are random, since the cost has local minima for arms with many joints. unchanged: fit of the unchanged
+        log.
         """
         joints, rng = problem.arm.joint_names, np.random.default_rng(0)
         present = np.arange(len(joints))
@@ -97,13 +98,13 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Base class of faults that factors correct: motion or torques of the opposite sense or in another unit.
+    """Base class of faults that are corrected by factors: motion or torques of the opposite sense or in another unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
-    All subclasses share the method `joint_keys`, which converts the factors to settings: the setting `sign` reverses
-    both the motion and the torque of a joint, so a correction of only the motion also changes the setting `gain` of the
-    torque.
+    All subclasses share the method `joint_keys`, which converts the factors to settings. The setting `sign` reverses
+    both the motion and the torque of a joint. If only the motion is wrong, the setting `gain` of the torque is
+    therefore negated, too.
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
@@ -112,16 +113,22 @@ class WrongScale(Fault):
 
     @abstractmethod
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints with this fault, for factors (n,) that correct their motion and torque."""
+        """Return the mask (n,) of the joints with this fault.
+
+        motion, torque: (n,) factors that correct the joints' motion and torques.
+        """
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the log's torques with each of `factors` added to the hypothesis of `base`."""
+        """Yield least-squares fits of the log's torques, with the scales in `base` multiplied by each of `factors`."""
         return self._scaled_by(self.factors, problem, base)
 
     def _scaled_by(
         self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
     ) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fit of the log's torques with each of the factors (2, n) on motion and torque."""
+        """Yield, for each array of `factors`, the least-squares fits of the log's torques with scaled signals.
+
+        Rows of an array (2, n) are factors on the motion and on the torques in the hypothesis of the fit `base`.
+        """
         reading = base.hypothesis
         for factor in factors:
             # Both signs of the offset are tried: the offset in the mapping may have been measured with the right or the
@@ -178,7 +185,7 @@ class JointSense(WrongScale):
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about joints whose motion has the opposite sense; it states the sense of the torques, too."""
+        """Return the text about joints whose motion is opposite to the URDF's sense, and the sense of their torques."""
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():
@@ -199,7 +206,7 @@ class TorqueSense(WrongScale):
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints of which only the torque has the opposite sense.
 
-        motion, torque: (n,) correction factors of the joints; here `motion` is positive and `torque` negative.
+        motion, torque: (n,) correction factors. For joints in the mask, `motion` is positive and `torque` negative.
         """
         return np.asarray((torque < 0) & (motion > 0))
 
@@ -218,10 +225,10 @@ class TorqueUnit(WrongScale):
     evidence = "by the URDF's gravity"
 
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
-        """Define the candidates.
+        """Define the candidates for corrections of the torques' unit.
 
         factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
-        may have another unit. is_milli: (n,) True for joints whose torques are declared in mNm.
+        may have another unit: the mapping states mNm or none. is_milli: (n,) True for torques declared in mNm.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
@@ -275,23 +282,24 @@ class TorqueUnit(WrongScale):
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
         """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
 
-        The total factor on the torques, relative to the unchanged log, is rounded to two digits.
+        The product of `factors` and the correction factors in `fit` is rounded to two digits before the fit.
         """
         (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
         rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit: its correction factor is not 1 or -1.
+        """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
 
-        motion, torque: (n,) correction factors of the joints.
+        motion, torque: (n,) correction factors of the joints; only `torque` counts: it is neither 1 nor -1.
         """
         return np.asarray(np.abs(torque) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about torques in another unit: the factor that is farthest from 1, and its sense.
+        """Return the text about torques in another unit, with the factor of the joint whose |log |factor|| is largest.
 
-        An opposite sense is omitted if another fault of the hypothesis, such as `TorqueSense`, already states it.
+        If this factor is negative, the text also states that the sense is opposite, unless the hypothesis contains
+        `JointSense` or `TorqueSense`, whose texts state it.
         """
         torque = correction.factors[1]
         largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
@@ -313,9 +321,10 @@ class TorqueUnit(WrongScale):
 
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for ratios of logged gravity torques to the URDF's that wrong inertials do not explain.
+    """Return True for ratios of the gravity in logged torques to the URDF's gravity torque that show another unit.
 
-    The magnitude of such a ratio is at least `GEOMETRY.other_unit`, or at most its inverse.
+    Wrong inertials do not explain a ratio whose magnitude is at least `GEOMETRY.other_unit`, or at most its inverse.
+    factor: a ratio, or an array of ratios; the result has the same shape.
     """
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
@@ -340,14 +349,14 @@ class PositionUnit(WrongScale):
     rarity = 2
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit: their correction factor is not 1 or -1.
+        """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
 
-        motion, torque: (n,) correction factors of the joints.
+        motion, torque: (n,) correction factors of the joints; only `motion` counts: it is neither 1 nor -1.
         """
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about positions in another unit, which names this unit."""
+        """Return the text that the positions have another unit, with the name of the unit in `correction`."""
         joints = np.flatnonzero(self.has(*correction.factors)).tolist()
         return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
 

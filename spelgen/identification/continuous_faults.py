@@ -76,7 +76,7 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets: the largest one of the joints that `JointSense` does not correct."""
+        """Return the text about zero offsets, with the largest one; the text of `JointSense` covers reversed joints."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -88,8 +88,8 @@ class ZeroOffset(Fault):
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
         """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
 
-        For a joint of the opposite sense, {} is returned, too: `JointSense` returns sign and offset of such a joint,
-        since another sign may need another offset.
+        {} is also returned for a joint whose sense `correction` reverses: the method of `JointSense` returns both its
+        sign and its offset, since another sign may need another offset.
         """
         offset = correction.hypothesis.offset[joint]
         if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
@@ -114,11 +114,11 @@ class Delay(Fault):
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques in which the signals of a joint, or all torques, are delayed.
+        """Yield least-squares fits of the log's torques, each with one set of delayed signals (`_delayed_signals`).
 
-        Each fit has the best delay of its signals. Delays as short as the apparent delays that friction causes are
-        omitted. Nothing is yielded if the hypothesis of the fit `base` has a delay already, or if the samples lack the
-        signals before and after them, from which delayed signals are interpolated.
+        Each fit has the best delay of its signals. Delays below `GEOMETRY.min_delay` are omitted: friction causes such
+        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if the samples
+        lack the earlier and later signals from which delayed signals are interpolated.
         """
         reading, longest = base.hypothesis, problem.samples.longest_delay
         if not longest or reading.delay.any():
@@ -153,7 +153,7 @@ class Delay(Fault):
         return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `delay` of a joint's signals; {} if the setting `torque_delay` of the log is enough."""
+        """Return the setting `delay` of a joint's delayed signals; {} without delay, or if `log_keys` corrects it."""
         mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
         if self.log_keys(correction) or not delays.any():
             return {}
@@ -201,8 +201,8 @@ class JointClock(Fault):
         """Yield the best fit with a drifting delay of some signals, if one step from the fit `base` lowers the cost.
 
         `base` has no delays. For each set of `_delayed_signals`, a Gauss-Newton step gives the delays at the start and
-        end of a recording. The derivatives of the residual with respect to them are 1 - t and t times the derivative
-        with respect to a constant delay, with the relative time t from 0 to 1.
+        end of a recording; only the set of lowest cost is refined. The residual's derivatives with respect to the two
+        delays are (1 - t) d and t d: t is the relative time, 0 to 1, and d the derivative for a constant delay.
         """
         reading, parameters = base.hypothesis, base.parameters
         residual, columns = problem.residual(reading, parameters), []
@@ -225,8 +225,8 @@ class JointClock(Fault):
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield at most three least-squares fits in which the delay of some signals changes linearly with time.
 
-        Each set of signals (`_delayed_signals`) and each final delay `GEOMETRY.clock_starts` is an initial guess; the
-        three guesses of lowest cost are refined. unchanged: fit of the unchanged log.
+        Initial guesses are all pairs of a set of signals (`_delayed_signals`) and a delay at the end of the recordings
+        [s] from `GEOMETRY.clock_starts`; the three of lowest cost are refined. unchanged: fit of the unchanged log.
         """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
@@ -413,7 +413,7 @@ class Gravity(Compensation):
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if the tilt of gravity may be an error of the mounting; else ""."""
+        """Return the code of a warning if gravity is tilted little, as for an arm mounted slightly askew; else ""."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

@@ -76,7 +76,10 @@ def drive_rows(
 
 
 def drive_problem(chain: BodyChain, drives: Drives, samples: MotionSamples) -> DriveProblem:
-    """Return the least-squares problem of the joint torques of `samples`, without a shift of torques in time."""
+    """Return the least-squares problem of the joint torques of `samples`, at their logged times.
+
+    Unknown are the inertial parameters of the bodies and the friction and inertia of the `drives`.
+    """
     q, qd, qdd = samples.motion
     regressors = drive_rows(chain, q, qd, qdd, drives.speeds)
     rows = np.concatenate([regressors, samples.tau[..., None]], axis=2)
@@ -128,7 +131,7 @@ class DriveProblem:
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Sum of the squared torque residuals of each joint in each block, (B, n), divided by `size` of the joint.
+        """Squared torque residual of each joint, summed over each block, divided by the joint's `size`, (B, n) [1].
 
         The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """

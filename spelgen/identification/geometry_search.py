@@ -58,7 +58,7 @@ def kinds_of_faults(
 
 
 def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
-    """Return the kinds of faults that positions and commands of servos share, such as a joint of the opposite sense."""
+    """Return the kinds of faults that positions and commands of a servo have in common, such as the opposite sense."""
     sense = JointSense(len(arm.coordinates))
     sense.factors = [factor for factor in sense.factors if (factor[1] < 0).any()]
     order = WrongOrder("joint-order", "the columns of other joints", (0, 1), starts=3)
@@ -68,10 +68,10 @@ def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    The hypotheses have about the same cost, and the best one is first. If no decrease is significant, the best
-    hypothesis with other evidence, such as a comparison of the torques with the URDF's gravity, is returned, too, if it
-    lowers the cost at all. Otherwise the result has only the fit of the unchanged log. faults: kinds of faults; each
-    kind and combinations are tested.
+    The best hypothesis is first; costs of the others are within `GEOMETRY.ambiguous` of its cost. If no decrease is
+    significant, hypotheses with evidence other than the cost are tried (faults with `needed` = 0, such as
+    `TorqueUnit`). The best one is returned, too, if it lowers the cost at all; otherwise the result has only the fit of
+    the unchanged log. faults: kinds of faults, tested singly and combined.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
@@ -118,7 +118,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
     """Return the indices of the recordings whose torques contradict the other recordings; at most half of all.
 
-    Without the recording, the torques of the others determine parameters that explain them, and not the recording.
+    Parameters fitted to the other recordings explain the torques of these recordings, but not of the deviating one.
     """
     coarse = problem.thinned(GEOMETRY.confirming_samples)
     number, unchanged = coarse.samples.recording, coarse.unchanged
@@ -126,13 +126,13 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     remaining, deviating = np.unique(number).tolist(), list[int]()
 
     def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
-        """Return {recording: squared residual (n,) of a fit to the recordings `fitted`, relative to the variance}."""
+        """Return {recording: squared residual (n,) / torque variance}, with parameters of a fit to only `fitted`."""
         counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
         residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
         scale = np.maximum(tau.var(axis=0), 1e-30)
         return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
 
-    # Of two recordings that contradict each other, nothing shows the wrong one.
+    # If only two recordings contradict each other, nothing shows which of the two is wrong.
     while len(remaining) > max(2, len(deviating) + 1):
         present = errors(remaining)
         worst = max(remaining, key=lambda x: float(present[x].max()))
@@ -141,7 +141,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         reduced = [x for x in remaining if x != worst]
         without = errors(reduced)
         usual = np.mean([without[x] for x in reduced], axis=0)
-        # The others must agree: recordings that all have one fault also contradict each other.
+        # The others must agree with each other: recordings that all have the same fault contradict each other, too.
         is_worse = (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
         if not is_worse.any() or usual.mean() > GEOMETRY.explained:
             break
@@ -157,11 +157,11 @@ def _weighed(
     The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
-    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis without hysteresis, and b the
-    decrease with hysteresis. No part of b is hidden, but b is also larger for wrong hypotheses: on recorded arms up to
-    32, and a only up to 17. Therefore half of b counts, and the new cost is the cost of `base` minus max(a, b / 2). For
-    a hypothesis with another delay than `base`, it is the cost of `base` minus min(a, b), since hysteresis resembles a
-    delay.
+    Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
+    and b the decrease in fits with hysteresis. For right hypotheses b shows the whole decrease, but for wrong ones it
+    is larger, too: on recorded arms they have b up to 32 and a up to 17. Therefore half of b counts, and the new cost
+    is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay than `base`, it is the cost of `base`
+    minus min(a, b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.

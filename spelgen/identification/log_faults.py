@@ -77,9 +77,9 @@ class Fault(ABC):
     Attributes:
         code: code of the finding.
         description: text about the fault, for faults with a constant text.
-        rarity: penalty on the cost of hypotheses with this fault, 0 for the most frequent faults. The penalty decides
-            between hypotheses that explain the torques equally well.
-        needed: smallest cost decrease of an accepted hypothesis.
+        rarity: penalty on the cost (negative log posterior) of hypotheses with this fault, 0 for the most frequent
+            faults. The penalty decides between hypotheses that explain the torques equally well.
+        needed: smallest decrease of the cost with which a hypothesis is accepted.
         evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
         advice: remedy of a fault that no setting corrects.
 
@@ -101,8 +101,8 @@ class Fault(ABC):
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
         """Return least-squares fits of hypotheses that take seconds to find, such as permutations of all columns.
 
-        `compare_hypotheses` calls this function only if none of the quick `fits` explains the torques, or if the best
-        one has a drifting delay. unchanged: fit of the unchanged log.
+        `compare_hypotheses` calls this method only if none of the quick `fits` explains the torques, or if in the best
+        one the delay of a signal drifts with time. unchanged: fit of the unchanged log.
         """
         return ()
 
@@ -131,5 +131,5 @@ class Fault(ABC):
         return {}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if an inexact URDF or mounting may be the cause; "" if the fault is an error."""
+        """Return the code of a warning if `correction` is as small as errors of a URDF or mounting; "" for an error."""
         return ""

@@ -47,8 +47,8 @@ class GeometryProblem:
             speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
-            free_gains: True for torques up to an unknown positive factor per joint, which each fit estimates, such as
-                the position errors of servos.
+            free_gains: True if each fit also estimates a positive factor on the torques of each joint, such as the
+                unknown gain kp of a servo, whose torque is kp times the position error.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
@@ -187,7 +187,8 @@ class GeometryProblem:
         flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains = mean, np.ones(len(normal))
-        # Number of reweightings: further ones change the cost by less than 0.1. Gains converge more slowly.
+        # Number of reweightings: further ones change the cost by less than 0.1. With unknown gains, the fit converges
+        # more slowly.
         for _ in range(12 if self._free_gains else 6):
             if self._free_gains:
                 gains = self._gains(x, normal, right, variance)
@@ -227,8 +228,8 @@ class GeometryProblem:
             coupled = gram[columns, :bodies] @ x[:bodies]
             load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - coupled @ friction @ coupled)
             agreement = float(product[:bodies] @ x[:bodies] - coupled @ friction @ product[columns])
-            # The factor is positive, and at most 1,000 times the one with which loads are as large as the torques. It
-            # is 1 if the bodies do not load the joint.
+            # The factor is positive, and at most 1,000 times the factor that makes the torques as large as the loads
+            # of the bodies. It is 1 if the bodies do not load the joint.
             agreement = max(agreement, 1e-3 * float(np.sqrt(max(load, 0.0) * power)))
             gains.append(load / agreement if load > 1e-9 * power and agreement > 0 else 1.0)
         return np.array(gains)

@@ -1,4 +1,4 @@
-"""Samples of an arm's motion and torques, with signals shortly before and after each, of successive trajectories."""
+"""Samples of an arm's motion and torques; each sample includes the signals shortly before and after its time."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class MotionSamples(NamedTuple):
     Attributes:
         values: (S, n, 4, E) q [rad, m], qd, qdd (per s, per s^2) and tau [Nm, N] at the E times `OFFSETS` relative to
             each sample. Before the start and after the end of a recording, the first and last values continue. E = 1 if
-            signals are stored only at the samples, and not around them.
-        bent: (S, n, K) deflections of K bristles per joint for the motion in the current mapping, divided by the
-            break-away displacements; K = 0 for samples without a history of motion.
+            a sample has only the signals at its own time, which suffice if no delays are tested.
+        bent: (S, n, K) deflections of K bristles per joint, divided by the break-away displacements, for the motion as
+            the mapping of the log converts it; K = 0 for samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
-        times: (S,) times of the samples since the start of their recording [s]; 0 for E = 1.
+        times: (S,) times of the samples since the start of their recording [s]; unused and 0 for E = 1.
         recording: (S,) index of the recording of each sample, in the order in which recordings were added.
     """
 
@@ -57,7 +57,7 @@ class MotionSamples(NamedTuple):
     def of(
         cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
     ) -> MotionSamples:
-        """Return samples of signals, (S, n) each, that are stored only at the samples, and not around them."""
+        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples."""
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         numbers = np.full(len(q), recording)
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)), numbers)
@@ -78,11 +78,11 @@ class MotionSamples(NamedTuple):
         return self.values[..., self.values.shape[3] // 2]
 
     def at(self, delays: np.ndarray) -> np.ndarray:
-        """Return the signals (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
+        """Return q, qd, qdd and tau (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        delays: (n, 4), the same for all samples, with magnitudes up to `longest_delay`: interpolated from the signals
-        stored with each sample. Or (S, n, 4), of any magnitude: interpolated from the signals stored with the sample
-        nearest to the delayed time.
+        `delays` of shape (n, 4) are the same for all samples, up to `longest_delay` in magnitude: signals are
+        interpolated from the values of the same sample. `delays` of shape (S, n, 4) may be of any magnitude: signals
+        are interpolated from the values of the sample nearest to the delayed time.
         """
         if not delays.any():
             return self.central
@@ -100,7 +100,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest time before or after a sample at which signals are stored for it [s]; 0 if none are stored there."""
+        """Largest delay [s], earlier or later, for which `values` of a sample contain the signals; 0 for E = 1."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def part(self, rows: slice | np.ndarray) -> MotionSamples:
@@ -123,9 +123,10 @@ def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
 
 @cache
 def interpolation() -> CubicSpline:
-    """Return a function of time [s] after a sample, which returns weights (E,) for the values at the times `OFFSETS`.
+    """Return a function of the time [s] after a sample, whose results are weights (E,) for cubic interpolation.
 
-    The weighted sum of the E values is their cubic spline at this time.
+    The sum of the weights times a signal's values at the E times `OFFSETS` around the sample is the cubic spline
+    through these values, evaluated at this time.
     """
     return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
@@ -180,16 +181,16 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
-        """Return the samples at which the arm moves, every `_every`-th of them, with the signals around each.
+        """Return every `_every`-th sample at which the arm moves, with the signals at the times `OFFSETS` around it.
 
-        start: time of the first sample since the start of the recording [s].
+        start: time from the start of the recording to the first of `samples` [s].
         """
         inner = samples[ENDS:-ENDS]
         assert inner.z is not None and inner.direction is not None
         moving = np.flatnonzero(is_moving(inner.qd))
         while (
             len(moving[:: self._every]) > 2 * HINTS.samples
-        ):  # the signals around all samples of a log of hours would need gigabytes
+        ):  # samples are removed first: the signals around all samples of a log of hours would need gigabytes
             self._thin()
         signals = np.stack([samples.q, samples.qd, samples.qdd, samples.tau @ self._inputs.T], axis=2)
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")

@@ -91,9 +91,10 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques in a `DriveProblem`; if a coupling of motors is found, it is returned instead.
+    """Return the delay of the torques in a `DriveProblem`; if motors are coupled, only `coupling` of the result is set.
 
-    Both are detected by the decrease of the torque residual of least squares; the coupling after removal of the delay.
+    Both are detected by the decrease of the least-squares torque residual. A coupling is searched after the torques
+    are shifted by the delay.
     """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
@@ -165,10 +166,11 @@ def _estimate(rows: np.ndarray) -> _Estimate:
 def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the delay [s] with the smallest torque residual, and the coefficients (K + D,) of this residual.
 
-    products: (K + D, K + D) Gram matrix of the K columns of the regressor and of D columns of torques, which were
-    shifted by the D times in `OFFSETS`. The residual is the sum of these K + D columns times the coefficients: K
-    parameters, and minus the D weights of a cubic spline that interpolates the torque at the delay. The spline is
-    valid, since filtered torques are smooth over one step.
+    The residual is Y p - T w, with the regressor Y (K columns), the parameters p, and D columns T of torques at the
+    times `OFFSETS` relative to the samples. The weights w (D,) of a cubic spline interpolate the torque at the delay,
+    which is valid, since filtered torques are smooth over one step. The coefficients are p and -w.
+
+    products: (K + D, K + D) Gram matrix of the columns of Y and T.
     """
     moved = len(OFFSETS)
     parameters = normal_solution(products, moved)

@@ -57,24 +57,27 @@ class LogGeometryTuning:
     # [1] Constant added to a joint's relative residual variance: (2 %)^2, since errors of friction models are 2 % of
     # the torque.
     error_floor: float = 4e-4
-    # Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
+    # [1] Smallest cost decrease of an accepted hypothesis. On recorded arms the largest decrease of a wrong hypothesis
     # is 17.
     needed: float = 20.0
-    # A hypothesis is compared with hysteresis only if it lowers the cost without hysteresis by more than this value.
+    # [1] A friction model with hysteresis is fitted under a hypothesis only if the hypothesis lowers the cost without
+    # hysteresis by more than this value.
     slight: float = 3.0
-    # [1] Number of the best hypotheses that are also compared with hysteresis.
+    # [1] Number of the best hypotheses under which a friction model with hysteresis is fitted, too.
     weighed: int = 10
     # [1] Number of the best hypotheses to which a further correction is added if the best one does not explain the
     # torques of all joints (see `explained`).
     beam: int = 3
-    # Cost difference up to which two hypotheses count as equally good, and are both reported.
+    # [1] Cost difference up to which two hypotheses count as equally good, and are both reported.
     ambiguous: float = 8.0
-    # [1] Smallest factor between torques and the URDF's gravity that wrong inertials do not explain.
+    # [1] Torques have another unit if their ratio to the URDF's gravity torques is at least this factor, or at most its
+    # inverse: inertials of a URDF are wrong by less.
     other_unit: float = 5.0
-    # [1] A hypothesis lowers the mean relative residual variance of the joints if the ratio to the variance without the
-    # hypothesis is below this value.
+    # [1] A hypothesis lowers the mean relative residual variance of the joints noticeably if the variance with the
+    # hypothesis is below this fraction of the variance without it.
     lower: float = 0.9
-    # [1] Largest relative residual variance of a joint whose torques a hypothesis explains.
+    # [1] A hypothesis explains the torques of a joint if their residual variance is at most this fraction of their
+    # variance.
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
@@ -101,15 +104,15 @@ class LogGeometryTuning:
     min_delay: float = 0.03
     # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
     delay_start: float = 0.06
-    # [s] Delays at the end of a log from which the search for the rate of a clock starts.
+    # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
-    # [1] Largest ratio of a joint's squared residuals with and without a delay of its signals; wrong delays have
-    # ratios from 0.78 on, on recordings of seven arms.
+    # [1] A delay is accepted if the squared residual of a joint with the delay is below this fraction of its value
+    # without delay; wrong delays have fractions from 0.78 on, on recordings of seven arms.
     delay_gain: float = 0.65
     # [1] A joint's torques were logged as magnitudes if the squared residual with restored signs is below this fraction
     # of the squared residual with the logged torques.
     unsigned_gain: float = 0.4
-    # Cost increase up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
+    # [1] Increase of the cost up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
     # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
     serious_angle: float = 0.17

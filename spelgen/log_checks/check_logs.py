@@ -32,7 +32,7 @@ def check_logs(
         logs: one or several trajectories; an iterator is consumed once, one trajectory at a time.
         arm: the arm. Its input matrix converts logged torques to joint torques.
         mapping: mapping of the logs; None: the mapping in the arm's settings. Units that it declares are not checked,
-            and checks that it accepts are omitted.
+            and checks whose codes it lists under `accept` are omitted.
 
     Raises:
         LogError: if there is no trajectory, for a trajectory with another number of joints, and for a trajectory
@@ -58,7 +58,7 @@ def check_logs(
         checked.add(trajectory)
         log_checks.add(trajectory)
         measured.append(statistics(trajectory))
-        if len(examples) < 2:  # the HTML page of the report plots two trajectories
+        if len(examples) < 2:  # only two are kept: the HTML report plots two trajectories
             examples.append(trajectory)
     if not measured:
         raise LogError("no trajectory", expected="at least one")
@@ -79,7 +79,7 @@ def check_logs(
 
 
 def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
-    """Return the notes on logs; notes on several joints with the same text are one note, which names these joints."""
+    """Return the notes on logs; notes with the same text about several joints become one note that names the joints."""
     groups = dict[tuple[Severity, str, str, str], list[str]]()
     for note in notes:
         prefix, joint, name = note.where.partition("joint '")

@@ -40,7 +40,8 @@ DELAYS = np.linspace(-0.1, 0.4, 51).round(9)
 NO_DELAY = int(np.argmin(np.abs(DELAYS)))
 FILTER_SAMPLES = 12  # [1] Smallest number of samples of a segment without gaps, for the smoothing polynomial.
 FOLLOWS = SIGNALS.agreement
-# [rad, m] Constant distance of commands from positions that shows another zero; servos deviate less under their load.
+# [rad, m] A larger constant distance of commands from positions shows that their zeros differ; loads displace servos
+# by less.
 OTHER_ZERO = {"revolute": GEOMETRY.serious_angle, "prismatic": GEOMETRY.serious_shift}
 # Encoders of bus servos have 2**k counts per turn, with k from 10 to 14. Positions therefore have the same quantisation
 # step at all joints: 360/2**k degrees, or 360/(2**k - 1) with LeRobot. LeRobot's normalised positions have another step
@@ -48,19 +49,21 @@ OTHER_ZERO = {"revolute": GEOMETRY.serious_angle, "prismatic": GEOMETRY.serious_
 # a normalised position. NORMALISED_STEPS are the smallest and the largest quantisation step of normalised positions,
 # for calibrated ranges of 800 to 5000 counts.
 NORMALISED_RANGE, NORMALISED_STEPS = 100.001, (0.04, 0.25)
-# SAME_STEP: relative difference below which the steps of all joints count as equal. ENCODER_STEP: relative difference
-# below which a step counts as a step of an encoder.
+# SAME_STEP: the steps of all joints count as equal if smallest and largest differ by less than this fraction.
+# ENCODER_STEP: a step counts as a step of an encoder if it differs from 360/2**k degrees by less than this fraction.
 SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 
 
 def find_servo_unit(logs: Sequence[Trajectory], joints: Sequence[str], unit: str) -> Advice | None:
     """Return a finding if the positions of servos have another unit than `unit`, one of `ANGLES`; else None.
 
-    1. In one of both units, the positions have the quantisation steps of encoders (see the comment at
-       `NORMALISED_RANGE`): this is their unit.
-    2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by 0.5 rad or more, but
-       not by over two turns: the unit is "rad".
-    3. `unit` is "deg", and each joint has another step: the positions are normalised.
+    Quantisation steps of encoders (see the comment at `NORMALISED_RANGE`) in `unit` show that it is right. Otherwise
+    the finding is the first of these:
+
+    1. In another of the units `ANGLES`, the positions have the steps of encoders: this is their unit.
+    2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by more than 0.5 rad
+       and less than two turns: the unit is "rad".
+    3. `unit` is "deg", and the step differs from joint to joint: the positions are normalised.
 
     Args:
         logs: recordings, with positions converted to radians from `unit`.
@@ -92,7 +95,7 @@ def find_servo_unit(logs: Sequence[Trajectory], joints: Sequence[str], unit: str
 
 
 def _steps(logs: Sequence[Trajectory]) -> np.ndarray:
-    """Return the quantisation steps (n,) [degrees] of the positions; NaN for joints without steps."""
+    """Return the quantisation steps (n,) [degrees] of the positions; NaN for positions that are not quantised."""
     return np.degrees([quantisation_step(column) for column in np.concatenate([x.q for x in logs]).T])
 
 
@@ -106,7 +109,8 @@ def _are_encoders(steps: np.ndarray) -> bool:
     return bool(len(counts) and (np.abs(counts / 2**powers - 1) < ENCODER_STEP).mean() > 0.5)
 
 
-# [s] Delays of the commands, of which the best one is used in the test of senses, order and zeros of the joints.
+# [s] Candidates for the delay of positions after commands; the test of senses, order and zeros of the joints uses the
+# candidate of smallest residual.
 COMMAND_DELAYS = (0.0, 0.02, 0.035, 0.05, 0.075, 0.1)
 ONE_ZERO = "one zero of positions and commands"
 ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
@@ -167,8 +171,8 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     stacked = np.array(correlations)
-    # A periodic motion is also correlated, negatively, with commands half a period before: a negative correlation must
-    # be clearly larger.
+    # A periodic motion is also correlated, negatively, with commands half a period before: the magnitude of a negative
+    # correlation must therefore exceed the positive ones clearly.
     is_opposite = -stacked.min(axis=0) > stacked.max(axis=0) + 0.1
     best = np.where(is_opposite, stacked.argmin(axis=0), stacked.argmax(axis=0))
     correlation = np.take_along_axis(stacked, best[None], axis=0)[0]
@@ -221,13 +225,13 @@ def _midpoints(x: np.ndarray) -> np.ndarray:
 
 
 class CommandFault(NamedTuple):
-    """Finding that a joint has other logged commands than the ones that its servo tracked.
+    """Finding that the logged commands of a joint are not the commands that its servo tracked.
 
     Attributes:
-        got: the finding.
-        expected: expected commands; findings of several joints with the same expectation are one error.
+        got: text about the logged commands.
+        expected: text about right commands; findings of several joints with the same text are one error.
         keys: settings of the joint, in the group `logs`, that correct the log; empty if there are none.
-        do: remedy without settings.
+        do: remedy if there are no such settings.
     """
 
     got: str
@@ -289,7 +293,8 @@ class ServoLogs:
     def _check_geometry(self, summary: Findings) -> None:
         """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Servos that no hypothesis explains, for example servos with backlash, are not tested.
+        Nothing is tested if a servo's residual with the unchanged log is above `GEOMETRY.no_advice`, for example due to
+        backlash. The hypothesis must explain the position errors of all joints.
         """
         problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
@@ -308,10 +313,10 @@ class ServoLogs:
         summary.extend([geometry_finding(problems[best], self._logs[0].mapping, unchanged, better)])
 
     def _geometry_problem(self, delay: float) -> GeometryProblem | None:
-        """Return the least-squares problem of the torques kp (u - q), with unknown kp of each servo.
+        """Return the least-squares problem of the torques kp (u - q), with an unknown gain kp of each servo.
 
-        Friction in it includes the damping of the servos. delay: delay of the commands u [s]. None is returned for too
-        few samples.
+        Its friction terms include the damping of the servos. delay: delay [s] of the positions q after the commands u.
+        None is returned for too few samples, or if u = q in all of them.
         """
         chain, alone = self._arm.chain, np.eye(len(self._names))
         collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())
@@ -327,7 +332,9 @@ class ServoLogs:
     def _check_units(self, summary: Findings) -> None:
         """Add an error to `summary` if positions of one or of all recordings have another unit than the mapping states.
 
-        Nothing is tested unless all joints have the same unit in the mapping, or if there is already an error.
+        The error names single recordings if another one has the steps of encoders in the stated unit. Nothing is tested
+        if `summary` already has an error, or if the mapping states several units for the joints or a unit that is not
+        in `ANGLES`.
         """
         mapping = self._logs[0].mapping
         units = {mapping.unit("q", name) or "rad" for name in self._names}
@@ -338,8 +345,8 @@ class ServoLogs:
         is_sound = any(_are_encoders(_steps([log])) for log, finding in findings if not finding)
         for log, finding in {str(x.keys): (log, x) for log, x in findings if x}.values():
             check = UNIT if finding.keys else NORMALISED
-            # The warning of the file reader that degrees of LeRobot may be normalised positions is omitted: this error
-            # states more.
+            # The file reader warned that positions of a LeRobot data set, read as degrees, may be normalised. This
+            # warning is omitted, since the error below states the unit.
             summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
             if check.code in log.accepted:
                 continue
@@ -352,7 +359,8 @@ class ServoLogs:
     def _check_commands(self, following: Following, saturation: np.ndarray, summary: Findings) -> set[int]:
         """Add the faults of the commands to `summary`; return the indices of the joints with errors.
 
-        Each recording is tested by itself. A fault names its recordings if the joint tracks its commands in another.
+        Each recording is tested by itself. If a joint tracks its commands in some recordings, its error names the
+        recordings with the fault.
 
         following: tracking of the commands in all recordings. saturation: see `measure_following`.
         """
@@ -394,7 +402,7 @@ def _command_faults(
 ) -> dict[int, CommandFault]:
     """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
 
-    The commands may belong to other joints, be in another unit or sense than the positions, or increments of the
+    The commands may belong to other joints, be in another unit or sense than the positions, or be increments of the
     position.
 
     Args:
@@ -407,8 +415,8 @@ def _command_faults(
     correlations, mapping = following.correlation.diagonal(), log.mapping
     is_tracked = following.moves & (following.correlation > FOLLOWS).any(axis=1)
     exchanged = np.flatnonzero(is_tracked & (correlations < 0.5)).tolist()
-    # In one of several recordings, a joint may rest at an obstacle while another one moves as its command does by
-    # chance: at least two joints must track each other's commands.
+    # In one of several recordings, a joint may rest at an obstacle while another joint happens to move like the command
+    # of the resting joint. Commands therefore count as exchanged only if this is found for at least two joints.
     if len(exchanged) > 1 or is_only:
         for k in exchanged:
             source = int(following.correlation[:, k].argmax())
@@ -440,8 +448,8 @@ def _command_faults(
 def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
     """Return the correlation (n,) of each position with the sum of the commands of its joint.
 
-    It is 0 if the amplitude of the position equals neither the sum (commands that are increments) nor the integral
-    (commands that are velocities): a sum of periodic commands is correlated with any motion of this period.
+    It is 0 unless the amplitude of the position is, within a factor of 2, the amplitude of the sum (commands that are
+    increments) or of the integral (velocities): a sum of periodic commands correlates with any motion of this period.
     """
     u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
     summed = measure_following([replace(log, u=u)], following.saturation)
@@ -453,10 +461,10 @@ def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
 
 
 def _command_units(gain: float, q: str | None, u: str | None) -> dict[str, str]:
-    """Return the units of a joint's positions and commands, {"q": ..., "u": ...}, that explain the ratio of both.
+    """Return the units of a joint's positions and commands, {"q": ..., "u": ...}, that explain the ratio `gain`.
 
-    {} is returned if no units do. gain: amplitude of positions divided by amplitude of commands, in the units q and u
-    of the mapping (None: rad).
+    One of both units is changed; {} is returned if no unit explains the ratio within 25 %. gain: amplitude of positions
+    divided by amplitude of commands, each converted by its unit q or u in the mapping (None: rad).
     """
     present = np.array([SCALES.get(x or "", 1.0) for x in (q, u)])
     candidates = []
@@ -472,8 +480,8 @@ def _command_warning(
 ) -> Iterator[Diagnostic]:
     """Yield a warning if the logged command of joint k may not be the command that its servo tracks.
 
-    The command equals the position in all `logs`, hardly changes, is not tracked, has a constant distance from the
-    position, or comes after it.
+    Reasons: in all `logs` the command equals the position, or the position up to two rows earlier or later; or it
+    hardly changes, is not tracked, has a constant distance from the position, or comes after the position.
     """
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     shift = next((x for x in (0, 1, 2, -1, -2) if all(_is_shifted(log, k, x) for log in logs)), None)

@@ -99,7 +99,7 @@ class TorqueLogs:
 
         The findings are added to `summary`. reports: statistics of each joint.
         """
-        # a check is omitted if the mapping accepts its findings, or if the mappings of all trajectories do
+        # a check is omitted if `self._mapping`, or the mapping of every trajectory, accepts its findings
         accepted = set(self._mapping.accept) | set.intersection(*self._declared)
         empty = MotionSamples.of(*np.zeros((4, 0, len(reports))))
         motion = joined_samples([empty, *self._samples]).thinned(6000)
@@ -142,7 +142,7 @@ class TorqueLogs:
         return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
 
     def _evidence(self, reports: Sequence[JointReport], motion: MotionSamples) -> list[JointEvidence]:
-        """Return the joints with their statistics, to which the fit of gravity to samples of a motion is added."""
+        """Return the joints of the URDF with their statistics `reports` and fits of gravity to the samples `motion`."""
         evidence, coordinates = [], self._arm.chain.coordinates
         fits = fit_gravity(self._arm.chain, motion)
         for coordinate, report, gravity in zip(coordinates, reports, fits, strict=True):
@@ -153,13 +153,13 @@ class TorqueLogs:
     def _geometry_findings(
         self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
     ) -> list[LogError | Diagnostic]:
-        """Return the findings about the geometry of the logs: of all recordings together, if their torques agree.
+        """Return the findings about the geometry of the logs.
 
-        Recordings that contradict the others are tested by themselves, and the others together. Errors of such a
-        recording name it, unless the others have errors, too.
+        Recordings whose torques agree are tested together. If they have no errors, each recording that contradicts
+        them is tested by itself; its errors name it, and its warnings are omitted.
 
         Args:
-            samples: unfiltered samples, and filtered ones, which are preferred.
+            samples: unfiltered samples, then filtered ones, which are used unless they are too few.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
         """
@@ -214,8 +214,8 @@ class TorqueLogs:
     def _problem(self, samples: MotionSamples, share: float = 1.0) -> GeometryProblem | None:
         """Return the least-squares problem of the samples, for the comparison of hypotheses about the log.
 
-        None is returned for too few samples, or if all torques are constant. share: fraction of the recordings from
-        which the samples are.
+        None is returned for too few samples, or if all torques are constant. share: number of recordings that the
+        samples belong to, divided by the number of all recordings.
         """
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
@@ -230,13 +230,13 @@ class TorqueLogs:
     ) -> Iterator[LogError | Diagnostic]:
         """Yield the findings about the geometry of recordings, in the order of the tests.
 
-        The tests end with the first finding that explains the torques, or states that nothing explains them. Tested
-        are the motion, signs and limits of the torques, then hypotheses about senses, order, zeros, units and gravity,
-        and, if the torques agree with the mapping, the inertials of the URDF.
+        Tested are the range of the motion, lost signs of torques, clipped torques, hypotheses about senses, order,
+        zeros, units and gravity, and, if the torques agree with the mapping, the inertials of the URDF. The first
+        finding that explains the torques, or states that nothing explains them, ends the tests.
 
         Args:
             problem: least-squares problem of the samples.
-            flat: flat tops of the positions and torques.
+            flat: extreme values at which positions and torques are constant.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
         """
@@ -272,18 +272,18 @@ class TorqueLogs:
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
-        # The only evidence for another unit of one torque is the magnitude of its gravity torque, which a wrong link of
-        # the URDF changes as well: wrong links are reported, too.
+        # If a hypothesis changes the unit of only one joint's torque, the evidence is the magnitude of gravity in this
+        # torque. A wrong link of the URDF changes it as well, so warnings about links are added.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for wrong units.
+        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
-        The candidates for factors on torques follow from the magnitude of gravity in the torques. A unit of torques
-        that the mapping states is assumed to be right, except mNm: such torques may be in Nm.
+        The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
+        unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -335,11 +335,11 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose mass or first moment, by least squares, is far from its value in the URDF.
+    """Yield a warning for each link whose least-squares mass or first moment is beyond 0.4 to 2.5 times the URDF's.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference between both values must change the torque of a joint by at least half of its standard deviation, since
-    parameters with a small effect on the torques are uncertain.
+    difference from the URDF must also change the torque of a joint by more than half of this torque's standard
+    deviation, since parameters with a small effect on the torques are uncertain.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)

@@ -24,9 +24,9 @@ RIGHT = "joints, zeros, units and gravity as the URDF and the settings state the
 
 
 def stated_hypothesis(arm: Chain, mapping: LogMapping, gears: np.ndarray | float = 1.0) -> Hypothesis:
-    """Return the hypothesis of a log without faults, with the signs, scales and offsets of the mapping.
+    """Return the hypothesis that a log has no faults: the signs, scales and offsets of its columns are the mapping's.
 
-    gears: (n,) factors on the scales of the torques.
+    gears: (n,) gear ratios, by which the scales of the torques are multiplied.
     """
     joints = arm.joint_names
     scale = np.array([[mapping.scale(quantity, joint) for joint in joints] for quantity in ("q", "tau")])
@@ -110,13 +110,14 @@ def find_unexplained(
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
     """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
 
-    A relative residual is the squared torque residual divided by the variance of the torque; `no_torque` and
-    `no_advice` are thresholds in `GEOMETRY`.
+    A relative residual is the squared torque residual divided by the variance of the torque. `no_torque` and the lower
+    bound `no_advice` are thresholds in `GEOMETRY`.
 
-    1. If the mean residual of all joints is above `no_torque`: the joints with a residual above `no_advice`, and the
-       mean. It is weighted with the variances of the torques: the torque of a joint at rest may be only noise.
-    2. Otherwise: the moving joints with a residual above `no_torque` whose torque by the URDF varies at least half as
-       much as the logged torque, and the largest residual of these joints.
+    1. If the mean residual of all joints is above `no_torque`, the mask contains the joints with a residual above
+       `no_advice`, and the mean is returned. It is weighted with the variances of the torques, since the torque of a
+       joint at rest may be only noise.
+    2. Otherwise the mask contains the moving joints with a residual above `no_torque` whose torque by the URDF has more
+       than half the standard deviation of the logged torque, and the largest residual of these joints is returned.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)

@@ -171,17 +171,16 @@ def torque_factors(
 ) -> list[np.ndarray]:
     """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
-    Let r be the gravity in a joint's logged torques divided by the gravity torque of the URDF; r is negative if the
-    torques have the opposite sense. If |r| is above five or below a fifth, wrong inertials do not explain it. For each
-    joint with such an r there is a candidate with the factor 1 / r for this joint and 1 for all others. If the
-    magnitude of the median of r over the joints is above five or below a fifth, there is also a candidate with 1 /
-    median for all joints.
+    For joints that are True in both masks and show gravity clearly, let r be the gravity in the logged torques divided
+    by the gravity torque of the URDF; r is negative if the torques have the opposite sense. If |r| is above five or
+    below a fifth, wrong inertials do not explain it. For each joint with such an r there is a candidate with the factor
+    1 / r for this joint and 1 for all others. If the magnitude of the median of r over the joints is beyond these
+    bounds, and all joints are `undeclared`, there is also a candidate with 1 / median for all joints.
 
     Args:
         joints: the joints with their fits of gravity.
-        undeclared: (n,) True for joints whose torque may have another unit: none in the mapping, or mNm. A candidate
-            for all joints requires True for all joints.
-        loaded: (n,) True for joints that gravity loads enough. Only joints that are True in both masks have an r.
+        undeclared: (n,) True for joints whose torque may have another unit: the mapping states no unit, or mNm.
+        loaded: (n,) True for joints that gravity loads enough.
     """
     seen: list[float] = []
     factors = []

@@ -49,7 +49,7 @@ class StampedState(NamedTuple):
 
 
 def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the joint states of a bag, or of a single file of a bag, as one table.
+    """Return a list of one table: the joint states of a bag, or of a single file of a bag.
 
     Times t [s] are relative to the first message. They are the stamps of the headers, or the times of the recorder if
     no message has a stamp. Messages without any of the joints belong to another device and are omitted. Raises
@@ -223,7 +223,10 @@ def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
 
 
 def _unfinished(path: Path) -> list[Path]:
-    """Return all MCAP files of a bag if one of them lacks its end (the recorder was killed); [] if all are complete."""
+    """Return all MCAP files of a bag if one of them lacks its end (the recorder was killed); [] if all are complete.
+
+    `rosbags` cannot open such a bag, so `_without_end` reads all its files.
+    """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as source:

@@ -42,7 +42,7 @@ from spelgen.logs.unit_checks import (
 from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
-# Advice for a fault of some recordings: its settings would be wrong for the others.
+# Advice for a fault of some recordings: settings that correct these recordings would be wrong for the others.
 OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
 Subject = TypeVar("Subject")
@@ -84,7 +84,7 @@ class Findings:
     errors: list[SpelgenError] = field(default_factory=list)
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
-        """Add errors and notes."""
+        """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
         for finding in findings:
             if isinstance(finding, Diagnostic):
                 self.notes.append(finding)
@@ -303,8 +303,8 @@ class LogChecks:
                 where += f", joint {', '.join(map(repr, names))}"
             entries = {name: self._results[name, check][0][0].joint for name in names}
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
-            # Units and columns would be wrong for recordings that have others. Dropped rows, periods and sign bits do
-            # not change sound recordings.
+            # Advised units, columns and sample rates may be wrong for the recordings without the fault. Dropped rows,
+            # periods and sign bits do not change recordings without the fault.
             is_partial = len(occurrences) < self._count and any(
                 x in str(keys) for x in ("units", "columns", "rate")
             )
@@ -312,12 +312,12 @@ class LogChecks:
         return summary
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
-        """Return the settings of the group `logs` that correct one fault of several joints.
+        """Return the settings of the group `logs` that correct a fault which several joints have in common.
 
-        If most joints of the same type (revolute or prismatic) need the same units, the units are also set for the
-        other joints of this type, unless the motion of a joint contradicts them.
+        If the fault is a wrong unit of most joints of one type (revolute or prismatic), the units are also set for the
+        other joints of this type, unless a joint's ratio of dq/dt to qd contradicts the units.
 
-        entries: settings that correct each faulty joint, by its name.
+        entries: {joint: settings of this joint that correct the fault}.
         """
         first, *_ = entries
         units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))

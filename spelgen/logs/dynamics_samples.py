@@ -103,7 +103,8 @@ def _columns(
     """Return the arrays of `DynamicsSamples` for one gap-free piece, at the samples at which a joint moves.
 
     The arrays are q, qd, qdd and tau, (T, n), then the states z (T, n, K) of K bristles per joint, if `reach` has
-    bristles, and the direction (T, n) of dry friction, if `reach` also has a velocity over which its sign is smoothed.
+    bristles, and the direction (T, n) of dry friction, the smooth sign of the velocity, if `reach` also has a
+    `smoothing_velocity`.
 
     Args:
         piece: gap-free piece of a log.
@@ -115,7 +116,7 @@ def _columns(
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals of the piece, (T, ...), filtered and resampled to 100 Hz."""
+        """Return signals of `piece` at its sample times, (T, ...), filtered and resampled to the times t (100 Hz)."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
         # A dense log is filtered before it is resampled: resampling first would alias frequencies above 50 Hz.

@@ -207,7 +207,8 @@ def find_dropouts(signals: JointSignals) -> str | None:
 def find_words(signals: JointSignals) -> Advice | None:
     """Return a finding if signals of the joint consist of undecoded register words or of wrapped angles.
 
-    Register words are defined in the module `jumps`. One finding has the settings for all signals of the joint.
+    Register words are the raw integers of a drive's register, see the module `jumps`. The finding has the settings that
+    decode all such signals of the joint.
     """
     mapping, joint, q = signals.trajectory.mapping, signals.joint, signals.q
     message, keys, found = "", dict[str, dict[str, object]](), list[WordReading]()
@@ -234,8 +235,8 @@ def find_words(signals: JointSignals) -> Advice | None:
             continue
         is_signed = reading.key == "sign_bit"
         what = "words with a sign bit" if is_signed else "a register or an angle that starts again"
-        # Jumps are counted between all samples that are no outliers of the decoded signal: the first sign-magnitude
-        # words of a signal may be 0, and would be removed as lost samples.
+        # Jumps of the logged words are counted without the samples that are outliers of the decoded signal. Outliers of
+        # the logged words are not removed: among words with a sign bit, a genuine 0 looks like a lost sample.
         continued = values if is_signed else unwrapped(raw, reading.size)
         count = jump_count(raw[~is_outlier(continued, smooth=name == "q")], reading.size)
         is_angle = name in ("q", "u") and signals.kind != "prismatic"
@@ -245,7 +246,8 @@ def find_words(signals: JointSignals) -> Advice | None:
         message = f"{name} that jumps by {reading.size:.6g} ({unit}), {counted(count, 'time')}: {what}"
     if not message:
         return None
-    # The advised settings include the sign bits or periods that the mapping states, so that they can replace its line.
+    # The advised line, such as `period: {...}`, replaces the joint's line of the same key in the mapping. It therefore
+    # repeats the sign bits or periods that the mapping states for other signals of the joint.
     for key in {reading.key for reading in found}:
         stated = {name: mapping.word(key, name, joint) for name in signals.trajectory.quantities}
         keys[key] = {x: plain_number(y, 9) for x, y in stated.items() if y} | keys[key]
@@ -282,9 +284,9 @@ class WordReading(NamedTuple):
 def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
     """Return the decoding of a signal of the joint as register words; None if it does not consist of such words.
 
-    The registers of all joints are of one type: of the decodings of the joints, the most frequent one that removes the
-    jumps of this joint is preferred. A single jump, or noise at an end of the register, does not determine the
-    decoding. name: signal, "q", "qd", "tau" or "u".
+    The registers of all joints are of one type, and a single jump, or noise at an end of the register, does not
+    determine the decoding of a joint. The result is therefore the most frequent of the decodings found for all joints
+    that removes the jumps of this joint. name: signal, "q", "qd", "tau" or "u".
     """
     present, raw = _reading(signals, name), signals.raw(name)
     if not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
@@ -305,15 +307,15 @@ def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
 
 
 def _reading(signals: JointSignals, name: str) -> WordReading | None:
-    """Return the decoding of a signal as register words that its own jumps show; None if there is none."""
+    """Return the decoding of a signal as register words, derived from its own jumps; None if no decoding fits."""
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
         has_unit = mapping.unit(name, signals.joint) is not None
         turns = [2 * np.pi / abs(mapping.scale(name, signals.joint)), *([] if has_unit else [360.0])]
-    # Lost samples and outliers are removed before the search for register words, because their jumps have other causes
-    # than register words.
+    # Lost samples and outliers are removed first: they cause jumps, too, but only jumps by the period or sign bit of
+    # register words determine a decoding.
     is_valid = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
     for turn in turns:
         word = read_as_words(signals.raw(name)[is_valid], turn)

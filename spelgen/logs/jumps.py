@@ -46,9 +46,9 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
 
 
 def decoded(words: np.ndarray, key: str, size: float) -> np.ndarray:
-    """Return the numbers that register words (T,) represent.
+    """Return the numbers (T,) that register words (T,) represent.
 
-    key: "sign_bit" or "period", the type of the words. size: the sign bit or the period.
+    key: "sign_bit" or "period", the type of the words. size: sign bit or period, in the unit of the words.
     """
     return signed(words, size) if key == "sign_bit" else centred(unwrapped(words, size), size)
 
@@ -128,7 +128,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin:
     such a signal, the step at the end of a stale block must also be larger than four typical steps.
 
     values: the signal (T,). changes: another signal (T,), which shows that the measured quantity must have changed.
-    margin: number of samples at both ends of a block in which the changes do not count.
+    margin: number of samples at both ends of a block in which changes of `changes` do not count.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -165,10 +165,10 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    In a block of k equal rows, all rows after the first are repeats if the arm moved while they were written: the step
-    at the end of the block is then about as large as k steps between later rows. The number m of copies is the median
-    of k over these blocks, since a logger may write each row m times; m is 1 without such blocks. In all other blocks,
-    the arm was at rest: every m-th row is original, and the rows between are repeats (none for m = 1).
+    In a block of k equal rows, all rows after the first are repeats if the arm moved while the block was written: the
+    position step at the end of the block then makes up for the k rows, as in 1, 1, 1, 4, 5 for k = 3. The number m of
+    copies is the median of k over these blocks, since a logger may write each row m times; m is 1 without such blocks.
+    In all other blocks, the arm was at rest: every m-th row is original, the rows between are repeats (none for m = 1).
 
     positions: number of leading columns that are positions.
     """
@@ -221,9 +221,9 @@ class Word(NamedTuple):
 def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     """Return the decoding of a signal as register words if a decoding removes at least half of its jumps; else None.
 
-    The candidates are words with a sign bit and words that overflow at a period. The sign bit or the period is a
-    multiple 2^k of a revolution or of the quantisation step. The decoding with the fewest remaining jumps is returned;
-    of several with equally few jumps, the one with the smoothest signal.
+    Candidates are words with a bit for the sign and words that overflow at a period. The value of the sign bit or the
+    period is 2^k revolutions or 2^k quantisation steps, with a whole number k. The decoding with the fewest remaining
+    jumps is returned; of several with equally few jumps, the one with the smoothest signal.
 
     values: (T,) in the unit of the log. turn: one revolution in this unit; None for a joint that does not rotate.
     """
@@ -248,9 +248,9 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     best, best_score = None, (len(rows) / 2, np.inf)
     is_whole = bool((values == values.round()).all())
     for size in sizes:
-        # `readings`: possible decodings. Words that overflow have a range of at most one period (plus 1 % for noise, if
-        # they are not whole numbers). Words with a sign bit have values above the sign bit, which represent negative
-        # numbers.
+        # `readings`: possible decodings. If words overflow at a period, their range is at most this period (plus 1 %
+        # for noise, if they are not whole numbers). If words have a sign bit, values from the sign bit on represent
+        # negative numbers, so such values must occur.
         readings = []
         if np.ptp(values) < (size if is_whole else 1.01 * size):
             readings.append(Word("period", size, decoded(values, "period", size)))
@@ -258,8 +258,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # A decoding is rejected if the jumps become shorter by one period but remain large: they are then steps of
-            # the motion.
+            # A decoding is rejected if its signal is still far from smooth at the rows of the logged jumps: these were
+            # then large steps of the motion, and not overflows or changes of sign.
             if np.median(jumps[rows]) > TUNING.jump * typical:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

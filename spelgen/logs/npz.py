@@ -137,7 +137,10 @@ def _equally_long(
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table, for the draft of a mapping, of all arrays with the most rows; a matrix is a column of lists."""
+    """Return a table, for the draft of a mapping, of the arrays whose number of rows is the largest in the archive.
+
+    A matrix becomes a column of lists.
+    """
     names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
@@ -146,12 +149,10 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return the columns of the mapping that are columns of a matrix (T, n) of an archive; {} without this matrix.
+    """Return {column name in the mapping: (matrix, index of its column)}, such as {"q_elbow": ("q", 2)}.
 
-    Keys are names of columns in the mapping, such as `q_elbow`; values are the name of the matrix and the index of its
-    column, such as ("q", 2).
-
-    The array `joints` of the archive states the order of the columns; without it the order is the arm's.
+    Thus a matrix (T, n) of an archive replaces n arrays, one per joint; {} is returned if the archive lacks the matrix.
+    The array `joints` of the archive states the order of its columns; without it the order is the arm's.
 
     pattern: name of the columns in the mapping, such as `q_{joint}` for the matrix `q`. names: names of the arm's
     joints in the log.

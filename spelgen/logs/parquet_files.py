@@ -80,7 +80,8 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
-    # LeRobot 2, whose joint names have no suffix, always writes degrees: remarks on the unit do not apply.
+    # Joint names without the suffix ".pos" are from LeRobot 2, which always writes degrees: the remarks that positions
+    # may be normalised are removed.
     if ENDING not in str(info["features"][STATE]["names"]):
         remarks = ()
     fps = info.get("fps")

@@ -41,10 +41,11 @@ class Preprocessing:
                 raise SettingsError(repr(getattr(self, name)), element=name, expected=expected)
 
     def resolved(self, rates: Iterable[float]) -> Preprocessing:
-        """Return the options with cutoff and decimation chosen for windows of logs with these sample rates [Hz].
+        """Return the options in which defaults (None) are replaced, for windows of logs of these sample `rates` [Hz].
 
-        The record of a training run contains the resolved options. A torque delay of None becomes 0. A cutoff of None
-        becomes 8 Hz if all logs are sampled above 50 Hz. Otherwise it remains None, and the logs are not filtered.
+        A torque delay of None becomes 0. A cutoff of None becomes 8 Hz if all logs are sampled above 50 Hz; otherwise
+        it remains None, and the logs are not filtered. For a decimation of None see the class. The record of a training
+        run contains the resolved options.
         """
         rates = list(rates)
         cutoff, decimation = self.cutoff, self.decimation or 1
@@ -67,8 +68,7 @@ class Preprocessing:
     def filtered(self) -> bool:
         """True if q, qd and tau are filtered before windows are cut from the logs.
 
-        The options must be a result of ``resolved``: in other options, a cutoff of None does not state whether there is
-        a filter.
+        This object must be a result of ``resolved``: in other options, a cutoff of None may still become 8 Hz.
         """
         return bool(self.cutoff)
 
@@ -76,7 +76,7 @@ class Preprocessing:
     def diagnostics(self) -> list[Diagnostic]:
         """A list with a remark that states the cutoff; [] if the logs are not filtered.
 
-        The options must be a result of ``resolved``.
+        This object must be a result of ``resolved``.
         """
         if not self.cutoff:
             return []
@@ -86,7 +86,7 @@ class Preprocessing:
     def pieces(self, trajectories: Sequence[Trajectory], *, shortest: int) -> list[Trajectory]:
         """Return the filtered gap-free pieces of the trajectories that have at least `shortest` samples.
 
-        The options must be a result of ``resolved``. Raises LogError for a trajectory without a piece of this length.
+        This object must be a result of ``resolved``. Raises LogError for a trajectory without a piece of this length.
         """
         prepared: list[Trajectory] = []
         errors: list[SpelgenError] = []

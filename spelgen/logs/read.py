@@ -85,14 +85,14 @@ def _read(
     segments: LogSegments,
     joint_types: Sequence[str] | None = None,
 ) -> list[Trajectory]:
-    """Return the trajectories of all files; `segments` collects their rows, or a part of them above a memory limit.
+    """Return the trajectories of all files, from the rows that `segments` keeps: all, or a part within a memory limit.
 
     If files have faults, one LogError with the first error of each file is raised.
 
     Args:
         paths, role: see `read_logs`.
         source: joints of the logs, and the mapping of their columns.
-        segments: empty collector of rows, which determines the limit of memory.
+        segments: empty collector of the rows of the files; its argument is the memory limit.
         joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))

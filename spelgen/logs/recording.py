@@ -205,8 +205,8 @@ def _remove_delays(rows: Rows) -> None:
 def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may be 0 for some time, and jump: an
-    outlier is a single 0 or a value other than 0, twice as far from the position as all other commands.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may jump, or be 0 for some time. An
+    outlier of the commands is therefore twice as far from the position as all others, and no 0 next to other zeros.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
@@ -236,8 +236,8 @@ def stale_rows(
         u: (T,) commanded positions of the joint [rad, m]; empty for joints without position servo.
     """
     if u.size:
-        # Positions lag behind their commands by less than 0.25 s. Dry friction holds servos of an SO-101 while their
-        # commands change by up to 0.13 rad.
+        # Positions lag behind their commands by less than 0.25 s, hence the margin. Dry friction holds servos of an
+        # SO-101 while their commands change by up to 0.13 rad, hence the bound `COMMANDED`.
         margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3)) if len(t) > 1 else 0
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
     if quantity == "tau":

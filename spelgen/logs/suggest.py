@@ -86,9 +86,9 @@ class ColumnName(NamedTuple):
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
-    commands: True if the log contains commanded positions instead of torques. Raises LogError if the file cannot be
-    read, if it has only positions or only torques, or if it has commanded positions and no torques, but `commands` is
-    False.
+    commands: True if the log contains commanded positions instead of torques. Raises LogError for a file that cannot be
+    read, is a ROS bag, has joint names in a column, or has only torques or only commands. If `commands` is False, the
+    error is also raised for a file with only positions, or with commanded positions and no torques.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -286,10 +286,10 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: number in the names of its columns, such as 2 in `q[2]`}, from joint names in the first row.
+    """Return {joint: number of its columns}, such as 2 for the column `q[2]`, from joint names in the first row.
 
-    Joint names are in columns `name0`, `name1`, ..., or in a column of lists of names. Joints without a cell are
-    omitted.
+    The names are cells of columns `name0`, `name1`, ..., or elements of a list: "elbow" in the column `name2` gives
+    {"elbow": 2}. Joints whose names are not in the row are omitted.
     """
     order: dict[str, int] = {}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):

@@ -170,10 +170,10 @@ def list_element(name: str, columns: Collection[str]) -> tuple[str, int] | None:
 
 
 def stored_names(name: str, columns: Collection[str]) -> list[str]:
-    """Return the file's columns from which a column of a mapping is computed; [] if one of them is absent.
+    """Return the file's columns from which the column `name` of a mapping is computed; [] if one of them is absent.
 
-    The result is the column itself, a column of lists (see `list_element`), or for a name "sec + nsec" both columns.
-    columns: names of the table's columns.
+    Examples: ["q"] for "q", ["position"] for "position[2]" (element of a list), ["sec", "nsec"] for "sec + nsec".
+    columns: names of the file's columns.
     """
     element = list_element(name, columns)
     names = [name] if name in columns else [element[0]] if element else name.split(" + ")

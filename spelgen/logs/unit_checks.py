@@ -87,14 +87,14 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
-    # Commands have the unit of q by default, unless they move much less: then they are in the SI unit.
+    # The unit advised for q also applies to commands, unless the commands move much less than q: they are then SI.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     return Advice(f"{message}: {units}", keys) if keys else None
 
 
 def _knows_ratio(signals: JointSignals) -> bool:
-    """Return True if velocities were logged and are proportional to dq/dt, so that their ratio shows units."""
+    """Return True if velocities qd were logged and are proportional to dq/dt: the ratio qd : dq/dt then shows units."""
     is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     return is_known and "qd" in signals.trajectory.mapping.quantities
 

@@ -173,9 +173,9 @@ def _numbers(texts: Column) -> np.ndarray:
 def _column(table: pa.Table, name: str) -> Column:
     """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
-    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is the sum of these two columns. If
-    the log has no times and the mapping has a `sample_rate`, row numbers are returned as the column of times, and the
-    caller converts them to times.
+    A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is a time: seconds plus nanoseconds.
+    If the log has no times and the mapping has a `sample_rate`, row numbers are returned as the column of times, and
+    the caller converts them to times.
     """
     stored = stored_names(name, table.schema.names)
     if len(stored) != 1:
