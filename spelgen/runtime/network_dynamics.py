@@ -207,7 +207,7 @@ class JointFriction(NetworkFriction):
     def forward(
         self, encoded: Tensor, qd: Tensor, parameters: JointFrictionParameters, right: Tensor
     ) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``, (..., n, columns).
+        """Return D(q, qd) times ``right``, (..., n, columns), with the dissipation matrix D, (..., n, n).
 
         encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s].
         """
@@ -251,7 +251,7 @@ class DenseFriction(NetworkFriction):
         return self.network.prepare(output_map, (size * self.initial).flatten())
 
     def forward(self, encoded: Tensor, qd: Tensor, layers: Layers, right: Tensor) -> Tensor:
-        """Return the product of D(q, qd) and the matrix ``right``, (..., n, columns).
+        """Return D(q, qd) times ``right``, (..., n, columns), with the dissipation matrix D, (..., n, n).
 
         encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s]. layers: parameter cache.
         """
