@@ -81,8 +81,7 @@ def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
     weights = exact.prepare()
     constant_mass = array(weights.armature)
     residuals = description.Residuals((), None, None, {}, (), {})
-    # A residual term of M may have a constant part, which is added to the armature, so that exports need not evaluate
-    # it.
+    # The constant part of a residual term of M is added to the armature: exports evaluate only the varying part.
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)

@@ -137,9 +137,10 @@ class LossScales(NamedTuple):
 
 
 def loss_scales(windows: Windows, joint_types: Sequence[str]) -> LossScales:
-    """Return the `LossScales` of windows of logs: RMS changes of q and qd, and standard deviations of tau.
+    """Return the `LossScales`, by which the errors in the loss are divided.
 
-    A divisor is at least 1 % of the largest one of all joints, also for a joint that hardly moves. Raises LogError if
+    The scales of q and qd are their RMS changes from the start of a window, the scale of tau its standard deviation. A
+    scale is at least 1 % of the largest one of all joints, also for a joint that moves little. Raises LogError if
     no joint moves, since windows at rest do not determine a model. joint_types: see `position_difference`.
     """
     moved = position_difference(windows.q[:, 1:], windows.q[:, :1], joint_types)

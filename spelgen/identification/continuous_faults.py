@@ -225,8 +225,9 @@ class JointClock(Fault):
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield at most three least-squares fits in which the delay of some signals changes linearly with time.
 
-        Initial guesses are all pairs of a set of signals (`_delayed_signals`) and a delay at the end of the recordings
-        [s] from `GEOMETRY.clock_starts`; the three of lowest cost are refined. unchanged: fit of the unchanged log.
+        The delay is 0 at the start of a recording. An initial guess has a set of delayed signals (from
+        `_delayed_signals`) and a delay at the end [s] (from `GEOMETRY.clock_starts`). All combinations are tried, and
+        the three of lowest cost are refined. unchanged: fit of the unchanged log.
         """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():

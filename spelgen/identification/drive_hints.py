@@ -131,7 +131,9 @@ class DriveProblem:
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Squared torque residual of each joint, summed over each block, divided by the joint's `size`, (B, n) [1].
+        """Squared torque residual of each of n joints, summed over each of B blocks of samples, (B, n) [1].
+
+        It is divided by `size`, the mean squared torque of the joint per block.
 
         The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """

@@ -166,7 +166,7 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
     correlations, tracking_rms = [], []
     for delay in DELAYS.tolist():
         u = np.concatenate([delayed_commands(x, slice(0, len(x)), delay, 1)[:, 0] for x in pieces])
-        # the means of u and q are subtracted, since the static error of a servo shifts them
+        # The means of u and of q are subtracted, since they differ by the static error of the servo.
         covariance = (u - u.mean(axis=0)).T @ (q - q.mean(axis=0)) / len(u)
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))

@@ -123,12 +123,12 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin: int = 0) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
-    Stale values form a block of equal values that is more than 20 times as long as the median block, and within which
-    the signal `changes` changes by more than `min_change`. A quantised signal has genuine blocks of equal values: in
-    such a signal, the step at the end of a stale block must also be larger than four typical steps.
+    A block is a run of equal values. It is stale if it is more than 20 times as long as the median block, and if a
+    reference signal changes by more than `min_change` within it. A quantised signal has genuine blocks: in such a
+    signal, the step at the end of a stale block must also be larger than four times the typical step (see the module).
 
-    values: the signal (T,). changes: another signal (T,), which shows that the measured quantity must have changed.
-    margin: number of samples at both ends of a block in which changes of `changes` do not count.
+    values: the signal (T,). changes: the reference signal (T,), for example the position for a torque. margin: number
+    of samples at both ends of a block in which a change of the reference signal does not count.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))

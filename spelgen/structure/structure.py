@@ -40,8 +40,9 @@ class Structure:
             valid for the values of the URDF.
         joints: names of the coordinates.
         entries: entries of the lower triangle of M.
-        outputs: varying terms f_j(q) B_j of the minimal form of M (see the module).
-        constants: constant terms c_k A_k of the minimal form of M.
+        outputs: varying terms of M(q) = sum_j f_j(q) B_j + sum_k c_k A_k: functions f_j of q, and constant matrices
+            B_j. The sum has the smallest number of functions.
+        constants: constant terms of this sum: inertial constants c_k, and constant matrices A_k.
         base_parameter_count: number of base inertial parameters.
     """
 

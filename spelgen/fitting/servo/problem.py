@@ -147,7 +147,7 @@ class ServoProblem:
     def normal_equations(self, x: ServoParameters, errors: Tensor) -> NormalEquations:
         """Return the Gauss-Newton Hessian (k, k) and the negative gradient (k,) of the cost at x.
 
-        errors: position errors at x, (W, K', n) [rad, m].
+        errors: position errors of W windows at x, at the K' samples after the burn-in, (W, K', n) [rad, m].
         """
         return self.with_prior(self.window_equations(x, errors), x)
 

@@ -120,8 +120,8 @@ class TorqueJacobian:
     def logged_scale(self, x: torch.Tensor) -> torch.Tensor:
         """Return initial / current motor gain per joint, (n,) [1]; 1 for fixed gains.
 
-        G (tau - offset) of the measured joint torque is proportional to the gain: multiplied by this factor, it does
-        not depend on the current gain. Friction compensation is not proportional to the gain.
+        The measured joint torque is logged torque times motor gain, plus friction compensation. Multiplied by the
+        returned factor, the first term does not depend on the current gain.
         """
         return self._logged_scale(self.rigid.unflatten(x)).detach()
 

@@ -210,9 +210,10 @@ def joint_functions(
 ) -> Iterator[JointFunction]:
     """Yield the candidate terms of each joint (smooth torque, friction factor, ripple), or only the selected ones.
 
-    The spline coefficients of a smooth torque or of a friction factor have one common prior precision. The mean and the
-    slope of the coefficients of a smooth torque are additional weights, each with its own prior precision: a line,
-    unlike splines, extrapolates to positions without samples (torque of a spring). Ripple is a sum of sines and cosines
+    A smooth torque is a spline over the position of the joint. A friction factor, which multiplies the friction of the
+    joint, is the exponential of such a spline. The coefficients of a spline have one common prior precision. A smooth
+    torque also has a line over the position, whose mean and slope have prior precisions of their own: the torque of a
+    spring continues at positions without samples, where the spline is near zero. Ripple is a sum of sines and cosines
     of the position, with one precision per frequency. Frequencies with less than two periods within the samples are
     omitted: they would fit a trend, and be wrong at other positions.
 
