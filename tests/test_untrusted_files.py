@@ -173,8 +173,8 @@ def test_a_name_of_a_megabyte_on_every_row_is_kept_once(tmp_path, arm):
 
 
 def test_a_line_break_in_a_name_is_shown_as_one():
-    arm = SimpleNamespace(chain=SimpleNamespace(name="a\nb", joint_names=["j\r1", "j\u20282"]))
-    trained = SimpleNamespace(arm=arm, tip="t\n3", intervals=())
+    arm = SimpleNamespace(chain=SimpleNamespace(name="a\nb", joint_names=["j\r1", "j\u20282"]), tip="t\n3")
+    trained = SimpleNamespace(arm=arm, intervals=())
     exported = with_readme(trained, "casadi", {}, use="use\nit", about="as it is", summary=["checked"])
     ((_, content),) = exported.files.items()
     title, use, joints, units, _ = content.decode().splitlines()

@@ -129,7 +129,8 @@ class PinocchioDynamics:
         # Pinocchio represents a continuous joint by (cos q, sin q). Planar and floating joints are not coordinates and
         # remain at the neutral configuration.
         neutral = pin.neutral(self.model)
-        return self._batched(lambda model, _, position: pin.integrate(model, neutral, position), q)
+        found = self._batched(lambda model, _, position: pin.integrate(model, neutral, position), q)
+        return found.reshape(*q.shape[:-1], self.model.nq)
 
     def _batched(self, algorithm: Callable[..., np.ndarray], *states: np.ndarray) -> np.ndarray:
         """Return the results of an algorithm of Pinocchio, such as `rnea`, for each state of a batch.

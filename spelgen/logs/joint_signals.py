@@ -289,7 +289,8 @@ def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
     that removes the jumps of this joint. name: signal, "q", "qd", "tau" or "u".
     """
     present, raw = _reading(signals, name), signals.raw(name)
-    if not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
+    # Two samples have a single step, which is their whole range.
+    if len(raw) < 3 or not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
         return present
     numbers = [k for k in range(len(signals.joints)) if k != signals.number]
     readings = Counter([present, *(_reading(signals._replace(number=k), name) for k in numbers)])

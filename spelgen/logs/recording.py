@@ -235,10 +235,13 @@ def stale_rows(
         qd: (T,) velocities of the joint [rad/s, m/s]; empty if they were not logged.
         u: (T,) commanded positions of the joint [rad, m]; empty for joints without position servo.
     """
+    # Stale blocks have more than 20 samples (see `is_stale`). Data sets may have thousands of shorter recordings.
+    if len(t) <= 20:
+        return np.zeros(len(t), bool)
     if u.size:
         # Positions lag behind their commands by less than 0.25 s, hence the margin. Dry friction holds servos of an
         # SO-101 while their commands change by up to 0.13 rad, hence the bound `COMMANDED`.
-        margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3)) if len(t) > 1 else 0
+        margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3))
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
