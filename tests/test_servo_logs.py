@@ -258,7 +258,7 @@ def test_whole_numbers_without_velocities_are_not_called_degrees(arm, logs):
 def test_commands_that_are_later_positions_are_reported(arm, logs):
     shifted = changed(logs, u=lambda x: np.concatenate([x.q[1:], x.q[-1:]]))
     (finding,) = (x for x in spelgen.check_logs(shifted, arm).findings if x.code == "commands-are-positions")
-    assert "u is q, 1 rows later" in finding.message and finding.where == "joint 'shoulder', 'elbow'"
+    assert "u is q, 1 row later" in finding.message and finding.where == "joint 'shoulder', 'elbow'"
 
 
 def test_periodic_commands_are_no_increments_and_have_no_opposite_sense(arm):

@@ -15,7 +15,7 @@ from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog
 from spelgen.identification.tuning import GEOMETRY, HINTS
-from spelgen.labels import UNITS
+from spelgen.labels import UNITS, counted
 from spelgen.listing import Listing, number
 from spelgen.log_checks.geometry_finding import geometry_finding, stated_hypothesis
 from spelgen.log_checks.report import JointFollowing, JointReport, percent, signal_tables
@@ -488,7 +488,7 @@ def _command_warning(
     if shift is not None:
         # commands equal to positions: the logger wrote measured positions in place of commands
         code = "commands-are-positions"
-        late = f", {abs(shift)} rows {'later' if shift > 0 else 'earlier'}" * bool(shift)
+        late = f", {counted(abs(shift), 'row')} {'later' if shift > 0 else 'earlier'}" * bool(shift)
         message = f"u is q{late}, to the last bit: are they the commands that were sent?"
     elif not following.moves[k]:
         # a constant command contains no information on the servo
