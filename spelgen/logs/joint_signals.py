@@ -8,7 +8,7 @@ locked motor. A rigid joint has H(f) = J + c / f^2, where the constant c is due 
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -19,6 +19,7 @@ from spelgen.logs.jumps import decoded, is_lost, is_outlier, jump_count, jumps, 
 from spelgen.logs.recording import COMMANDED, listed_times, outlier_rows, stale_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
+from spelgen.settings.log_mapping import Decoding
 
 
 class Advice(NamedTuple):
@@ -204,6 +205,20 @@ def find_dropouts(signals: JointSignals) -> str | None:
     return None
 
 
+class WordReading(NamedTuple):
+    """Decoding of the register words of a signal.
+
+    Attributes:
+        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
+        size: value of this setting, in the unit of the log.
+        in_degrees: True if the mapping states no unit, and the size is a number of revolutions in degrees.
+    """
+
+    key: Decoding
+    size: float
+    in_degrees: bool
+
+
 def find_words(signals: JointSignals) -> Advice | None:
     """Return a finding if signals of the joint consist of undecoded register words or of wrapped angles.
 
@@ -211,48 +226,52 @@ def find_words(signals: JointSignals) -> Advice | None:
     decode all such signals of the joint.
     """
     mapping, joint, q = signals.trajectory.mapping, signals.joint, signals.q
-    message, keys, found = "", dict[str, dict[str, object]](), list[WordReading]()
+    readings, units = dict[str, WordReading](), dict[str, str]()
     for name in signals.trajectory.quantities:
-        reading, raw = _shared_reading(signals, name), signals.raw(name)
+        reading = _shared_reading(signals, name)
         if reading is None:
             continue
-        values = decoded(raw, reading.key, reading.size)
+        values = decoded(signals.raw(name), reading.key, reading.size)
         in_si = values * mapping.scale(name, joint) + mapping.offset(name, joint)
         # Commands may have genuine jumps. A decoding of commands is therefore accepted only if it brings the commands
         # closer to the measured positions.
         if name == "u" and np.std(in_si - q) > 0.3 * np.std(signals.signal("u") - q):
             continue
         q = in_si if name == "q" else q
-        found.append(reading)
-        keys.setdefault(reading.key, {})[name] = plain_number(reading.size, 9)
+        readings[name] = reading
         if reading.in_degrees:
-            keys.setdefault("units", {})[name] = "deg"
+            units[name] = "deg"
             speed = float(np.std(np.diff(values))) / signals.step
             if name == "q" and is_factor(speed, float(np.std(signals.qd)) or np.inf):
-                keys["units"]["qd"] = "deg/s"
-        if message:
-            message = f"{message.partition(':')[0]}, and {name}:{message.partition(':')[2]}"
-            continue
-        is_signed = reading.key == "sign_bit"
-        what = "words with a sign bit" if is_signed else "a register or an angle that starts again"
-        # Jumps of the logged words are counted without the samples that are outliers of the decoded signal. Outliers of
-        # the logged words are not removed: among words with a sign bit, a genuine 0 looks like a lost sample.
-        continued = values if is_signed else unwrapped(raw, reading.size)
-        count = jump_count(raw[~is_outlier(continued, smooth=name == "q")], reading.size)
-        is_angle = name in ("q", "u") and signals.kind != "prismatic"
-        unit = (
-            "deg" if reading.in_degrees else mapping.unit(name, joint) or ("rad" if is_angle else "as logged")
-        )
-        message = f"{name} that jumps by {reading.size:.6g} ({unit}), {counted(count, 'time')}: {what}"
-    if not message:
+                units["qd"] = "deg/s"
+    if not readings:
         return None
+    keys: dict[str, object] = {"units": units} if units else {}
     # The advised line, such as `period: {...}`, replaces the joint's line of the same key in the mapping. It therefore
     # repeats the sign bits or periods that the mapping states for other signals of the joint.
-    for key in {reading.key for reading in found}:
+    for key in dict.fromkeys(reading.key for reading in readings.values()):
         stated = {name: mapping.word(key, name, joint) for name in signals.trajectory.quantities}
-        keys[key] = {x: plain_number(y, 9) for x, y in stated.items() if y} | keys[key]
-    units = {"units": keys.pop("units")} if "units" in keys else {}
-    return Advice(message, units | keys)
+        sizes = {name: size for name, size in stated.items() if size}
+        sizes |= {name: reading.size for name, reading in readings.items() if reading.key == key}
+        keys[key] = {name: plain_number(size, 9) for name, size in sizes.items()}
+    return Advice(_words_text(signals, readings), keys)
+
+
+def _words_text(signals: JointSignals, readings: Mapping[str, WordReading]) -> str:
+    """Return the text of the finding of `find_words`. readings: decoding of each signal of register words, by name."""
+    (name, reading), *others = readings.items()
+    raw = signals.raw(name)
+    values, what = unwrapped(raw, reading.size), "a register or an angle that starts again"
+    if reading.key == "sign_bit":
+        values, what = decoded(raw, reading.key, reading.size), "words with a sign bit"
+    # Jumps of the logged words are counted without the samples that are outliers of the decoded signal. Outliers of the
+    # logged words are not removed: among words with a sign bit, a genuine 0 looks like a lost sample.
+    count = jump_count(raw[~is_outlier(values, smooth=name == "q")], reading.size)
+    is_angle = name in ("q", "u") and signals.kind != "prismatic"
+    unit = signals.trajectory.mapping.unit(name, signals.joint) or ("rad" if is_angle else "as logged")
+    size = f"{reading.size:.6g} ({'deg' if reading.in_degrees else unit})"
+    also = "".join(f", and {other}" for other, _ in others)
+    return f"{name} that jumps by {size}, {counted(count, 'time')}{also}: {what}"
 
 
 def find_jumps(signals: JointSignals) -> str | None:
@@ -265,20 +284,6 @@ def find_jumps(signals: JointSignals) -> str | None:
     size = q[rows[0] + 1] - q[rows[0]]
     count = counted(len(rows), "time")
     return f"q that jumps by {size:.4g} between two samples, {count}, at t = {listed_times(t[rows])}"
-
-
-class WordReading(NamedTuple):
-    """Decoding of the register words of a signal.
-
-    Attributes:
-        key: setting of the mapping that decodes the signal, "period" or "sign_bit".
-        size: value of this setting, in the unit of the log.
-        in_degrees: True if the mapping states no unit, and the size is a number of revolutions in degrees.
-    """
-
-    key: Literal["period", "sign_bit"]
-    size: float
-    in_degrees: bool
 
 
 def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:

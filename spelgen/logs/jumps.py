@@ -6,11 +6,12 @@ are the raw integers of a drive's register: they overflow at a period, or have a
 """
 
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.logs.tuning import TUNING
+from spelgen.settings.log_mapping import Decoding
 
 # Smallest step of register words, as a fraction of the signal's range: words have at most 18 bits, and 2^-18 is 4e-6.
 FINEST_WORD = 4e-6
@@ -45,7 +46,7 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
     return np.where(words >= sign_bit, sign_bit - words, words)
 
 
-def decoded(words: np.ndarray, key: str, size: float) -> np.ndarray:
+def decoded(words: np.ndarray, key: Decoding, size: float) -> np.ndarray:
     """Return the numbers (T,) that register words (T,) represent.
 
     key: "sign_bit" or "period", the type of the words. size: sign bit or period, in the unit of the words.
@@ -213,7 +214,7 @@ class Word(NamedTuple):
         values: (T,) decoded signal in the unit of the log.
     """
 
-    key: Literal["period", "sign_bit"]
+    key: Decoding
     value: float
     values: np.ndarray
 

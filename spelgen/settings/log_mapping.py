@@ -49,6 +49,8 @@ Time = Literal["s", "ms", "us", "ns"]
 Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
 Effort = Literal["Nm", "mNm", "N", "A", "mA", "percent", "permille"]
+Decoding = Literal["period", "sign_bit"]
+"""Settings of the raw values of registers and wrapped angles."""
 
 
 class LogColumns(Group):
@@ -333,7 +335,7 @@ class LogMapping(Group):
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
-    def word(self, key: Literal["period", "sign_bit"], quantity: str, joint: str) -> float | None:
+    def word(self, key: Decoding, quantity: str, joint: str) -> float | None:
         """Return the period or the sign bit of logged values of a quantity of a joint; None if it is not set.
 
         The result is in the unit of the log. key: name of the setting; a period is the interval after which logged
