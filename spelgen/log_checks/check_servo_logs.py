@@ -296,7 +296,7 @@ class ServoLogs:
         Nothing is tested if a servo's residual with the unchanged log is above `GEOMETRY.no_advice`, for example due to
         backlash. The hypothesis must explain the position errors of all joints.
         """
-        problems = [x for x in map(self._geometry_problem, COMMAND_DELAYS) if x is not None]
+        problems = self._geometry_problems()
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
         logarithms = [float(np.log(errors + GEOMETRY.error_floor).sum()) for errors in fits]
         best = int(np.argmin(logarithms)) if fits else -1
@@ -312,22 +312,28 @@ class ServoLogs:
             return
         summary.extend([geometry_finding(problems[best], self._logs[0].mapping, unchanged, better)])
 
-    def _geometry_problem(self, delay: float) -> GeometryProblem | None:
-        """Return the least-squares problem of the torques kp (u - q), with an unknown gain kp of each servo.
+    def _geometry_problems(self) -> list[GeometryProblem]:
+        """Return the least-squares problems of the torques kp (u - q), with an unknown gain kp of each servo.
 
-        Its friction terms include the damping of the servos. delay: delay [s] of the positions q after the commands u.
-        None is returned for too few samples, or if u = q in all of them.
+        There is a problem for each of `COMMAND_DELAYS`, and none for too few samples, or if u = q in all of them. The
+        friction terms include the damping of the servos.
         """
         chain, alone = self._arm.chain, np.eye(len(self._names))
         collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())
         for log in self._logs:
-            u = np.stack([np.interp(log.t - delay, log.t, x) for x in require_commands(log).T], axis=1)
-            collected.add(replace(log, tau=u - log.q, u=None))
+            collected.add(replace(log, tau=require_commands(log), u=None))
         samples, seconds = collected.samples(), sum(log.duration for log in self._logs)
-        if samples is None or len(samples.values) < HINTS.fewest_samples / 4 or not samples.tau.any():
-            return None
-        stated = stated_hypothesis(chain, self._logs[0].mapping)
-        return GeometryProblem(chain, samples, alone, seconds, stated, free_gains=True)
+        if samples is None or len(samples.values) < HINTS.fewest_samples / 4:
+            return []
+        stated, problems = stated_hypothesis(chain, self._logs[0].mapping), []
+        for delay in COMMAND_DELAYS:
+            # The fourth signal is the command until it is replaced by the position error.
+            signals = samples.at(np.tile([0.0, 0.0, 0.0, -delay], (len(self._names), 1))).copy()
+            signals[..., 3] -= signals[..., 0]
+            if signals[..., 3].any():
+                delayed = samples._replace(values=signals[..., None])
+                problems.append(GeometryProblem(chain, delayed, alone, seconds, stated, free_gains=True))
+        return problems
 
     def _check_units(self, summary: Findings) -> None:
         """Add an error to `summary` if positions of one or of all recordings have another unit than the mapping states.
