@@ -1,20 +1,14 @@
-"""Pose and Jacobian of the tip of an arm, by pytorch-kinematics."""
-
-from __future__ import annotations
+"""Pose and Jacobian of the tip of an arm, by the kinematics of the runtime (``BodyChain``)."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import torch
-from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from spelgen.dynamics.constraint import mimic_constraint
-from spelgen.urdf.read import read_urdf
-from spelgen.urdf.robot import Robot, UrdfJoint
-
-if TYPE_CHECKING:
-    from pytorch_kinematics import SerialChain
+from spelgen.arm.configured_arm import Arm, load_arm
+from spelgen.dynamics.regressor_dynamics import body_chain
+from spelgen.dynamics.tip_frame import Tip, tip_frame
 
 
 class TipKinematics:
@@ -23,78 +17,52 @@ class TipKinematics:
     Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
     rounded to it, unlike in a `Chain`. Results have the dtype of q.
 
-    Args:
-        robot: the URDF.
-        joints: names of the coordinates, in the order of q.
-        link: name of the link.
+    tip: frame of the link. Raises ValueError for a coordinate that does not move the link.
     """
 
-    def __init__(self, robot: Robot, joints: Sequence[str], link: str) -> None:
-        self.link = link
-        path = robot.path_to(link)
-        # A chain of pytorch-kinematics has a fixed dtype. There is a chain per dtype: results have the dtype of q.
-        self._chains = {
-            dtype: _serial_chain(robot.root, path, dtype) for dtype in (torch.float64, torch.float32)
-        }
-        constraint = mimic_constraint(robot, joints)
-        rows = [constraint.names.index(joint.name) for joint in path if joint.moves]
-        # The J moving joints on the path to the link include mimic joints. Their positions are _jacobian q + _offset,
-        # with _jacobian (J, n) and _offset (J,).
-        self._jacobian = torch.from_numpy(constraint.jacobian[rows])
-        self._offset = torch.from_numpy(constraint.offset[rows])
+    def __init__(self, tip: Tip) -> None:
+        self.link = tip.link
+        self._carrier, self._pose = tip.carrier, torch.from_numpy(tip.pose)
+        # A module of torch has a fixed dtype. There is a chain per dtype: results have the dtype of q.
+        self._chains = {dtype: body_chain(tip.chain).to(dtype) for dtype in (torch.float64, torch.float32)}
+        chain = self._chains[torch.float64]
+        # `_joints`, (bodies, n): displacement per coordinate of each joint that carries the link; other rows are zero.
+        carrying = chain.carriers[:, tip.carrier] if tip.carrier >= 0 else torch.zeros(len(chain.parents)).double()
+        self._joints = carrying.unsqueeze(-1) * chain.ratios
         # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
-        missing = [name for name, column in zip(joints, self._jacobian.T, strict=True) if not column.any()]
+        names = zip(tip.chain.joint_names, self._joints.T, strict=True)
+        missing = [name for name, column in names if not column.any()]
         if missing:
-            raise ValueError(f"the joints {', '.join(missing)} do not lead to {link}")
+            raise ValueError(f"the joints {', '.join(missing)} do not lead to {tip.link}")
 
-    def pose(self, q: torch.Tensor) -> torch.Tensor:
+    def pose(self, q: Tensor) -> Tensor:
         """Return the pose of the link at q: the homogeneous transform from the link to the root frame, (..., 4, 4)."""
-        poses: torch.Tensor = self._chains[q.dtype].forward_kinematics_tensor(
-            self._positions(q), analytical_grad=False
-        )[-1]
-        return poses.reshape(*q.shape[:-1], 4, 4)
+        return self._pose_and_axes(q)[0]
 
-    def position(self, q: torch.Tensor) -> torch.Tensor:
+    def position(self, q: Tensor) -> Tensor:
         """Return the position of the link's origin in the root frame, (..., 3) [m]."""
         return self.pose(q)[..., :3, 3]
 
-    def jacobian(self, q: torch.Tensor) -> torch.Tensor:
+    def jacobian(self, q: Tensor) -> Tensor:
         """Return the Jacobian of the link, (..., 6, n): its linear, then its angular velocity per qd, in root axes."""
-        jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(
-            self._positions(q)
-        ) @ self._jacobian.to(q)
-        return jacobian.reshape(*q.shape[:-1], 6, q.shape[-1])
+        pose, axes = self._pose_and_axes(q)
+        # `linear` is the velocity of the point of the link at the origin of the root frame.
+        angular, linear = (axes @ self._joints.to(q)).chunk(2, dim=-2)
+        moment = torch.linalg.cross(angular, pose[..., :3, 3:], dim=-2)
+        return torch.cat([linear + moment, angular], dim=-2)
 
-    def _positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the positions of all joints on the path to the link, (S, joints) [rad, m], of S states q, (..., n)."""
-        return (q @ self._jacobian.to(q).mT + self._offset.to(q)).reshape(-1, len(self._offset))
-
-
-def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> SerialChain:
-    """Return the chain of pytorch-kinematics for a path of joints from the root link.
-
-    The frames are built from spelgen's values of the URDF, since the URDF parser of pytorch-kinematics rounds to
-    float32.
-    """
-    import pytorch_kinematics as pk  # pytorch_kinematics is imported here: it imports matplotlib, which takes long.
-    from pytorch_kinematics.frame import Frame, Joint, Link
-
-    first = last = Frame(root, Link(root), Joint())
-    for joint in path:
-        kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
-        axis = torch.tensor(joint.axis, dtype=torch.float64)
-        rotation = Rotation.from_euler("xyz", joint.rpy).as_matrix()
-        offset = pk.Transform3d(rot=rotation, pos=joint.xyz, dtype=dtype)
-        frame = Frame(
-            joint.child, Link(joint.child), Joint(joint.name, offset, kind, axis / axis.norm(), dtype)
-        )
-        last.add_child(frame)
-        last = frame
-    return pk.SerialChain(pk.Chain(first, dtype=dtype), last.name, dtype=dtype)
+    def _pose_and_axes(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pose of the link, (..., 4, 4), and the twists of all joints per unit rate, (..., 6, bodies)."""
+        chain = self._chains[q.dtype]
+        # `chain.forward` returns the frames of the bodies times four given points; the columns of the identity as
+        # points give the frames.
+        configuration = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
+        frames = torch.cat([configuration.place, configuration.mass], dim=-3)
+        return frames[..., self._carrier, :] @ self._pose.to(q), configuration.axes
 
 
 def tip_kinematics(
-    arm: Any, link: str | None = None, *, joints: Sequence[str] | None = None
+    arm: Arm | Path | str, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
     """Return the kinematics of a link, by default the tip of the arm.
 
@@ -106,11 +74,8 @@ def tip_kinematics(
     Raises:
         ValueError: a joint does not move the link, or no joints are named.
     """
-    if isinstance(arm, str | Path):
-        robot, names = read_urdf(Path(arm)), list(joints or ())
-    else:
-        robot, names = arm.robot, arm.chain.joint_names
-        link = link or arm.tip
-    if not names:
-        raise ValueError("no joints are named")
-    return TipKinematics(robot, names, link or robot.last_link(names))
+    if not isinstance(arm, Arm):
+        if not joints:
+            raise ValueError("no joints are named")
+        arm = load_arm(arm, joints)
+    return TipKinematics(tip_frame(arm, link))
