@@ -16,14 +16,13 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.emission.build import build
 from spelgen.errors import RunError
-from spelgen.exporting import model_expressions, parity
+from spelgen.exporting import model_expressions
 from spelgen.exporting.c_export import c_files, called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
-from spelgen.exporting.casadi_export import called_by_state, export_casadi
+from spelgen.exporting.casadi_export import export_casadi
 from spelgen.exporting.describe import Trained, identifier
 from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.export import export
-from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.parity import check_parity, random_inputs, require_parity
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
@@ -41,7 +40,7 @@ def compiled(tmp_path_factory):
     """Return, per robot and preset, the exported model, the folder of its C files, and the compiled library."""
     found = {}
     for robot, preset in BOTH:
-        trained = Trained(moved_model(robot, preset), arm_of(robot), NAMES)
+        trained = Trained(moved_model(robot, preset), arm_of(robot))
         folder = tmp_path_factory.mktemp(f"{robot}_{preset}")
         files, told = c_files(trained)
         for name, content in files.items():
@@ -70,30 +69,11 @@ def test_c_equals_the_model(case, program, flags, compiled):
     assert set(found.differences) == set(NAMES)
 
 
-def test_derivatives_at_right_angles_are_the_models(monkeypatch):
-    """At angles that are multiples of pi/2, derivatives of the exports equal the model's.
-
-    Gravity torques vanish there up to rounding, and the sign of the rounding must not decide on derivatives of
-    load-dependent friction.
-    """
-
-    def at_right_angles(*arguments):
-        inputs = random_inputs(*arguments)
-        corners = np.pi / 2 * np.round(2 * inputs["q"] / np.pi)
-        return inputs | {"q": corners, "z": 1e-4 * np.sign(inputs["z"])}
-
-    monkeypatch.setattr(parity, "random_inputs", at_right_angles)
-    trained = Trained(moved_model("six_dof", "closed-form"), arm_of("six_dof"))
-    name = "inverse_dynamics_derivatives"
-    functions = expression_functions(trained.described, {name: ENTRY_POINTS[name]})
-    check_parity(called_by_state(functions), trained, [name], 1e-9)
-
-
 @needs_gcc
 def test_the_header_states_operations_and_the_readme_the_check(compiled):
     _, folder, told = compiled["rpr", "hybrid"]
     header = (folder / "rpr.h").read_text()
-    assert re.search(r"At most \d\d+ operations, in forward_dynamics_derivatives", header)
+    assert re.search(r"At most \d\d+ operations, in forward_dynamics", header)
     assert "from the torch module" in told
     assert max(map(len, header.splitlines())) < 130
 
@@ -102,7 +82,7 @@ def test_the_header_states_operations_and_the_readme_the_check(compiled):
 @pytest.mark.parametrize("robot", ["rpr", "scara"])
 def test_casadi_equals_the_model(robot, preset):
     found = export_casadi(Trained(moved_model(robot, preset), arm_of(robot)))
-    assert len(found.files) == len(NAMES) - 2 + 1  # without the derivatives of C, with a README
+    assert len(found.files) == len(NAMES) + 1  # with a README
     assert len(found.files["README.md"].decode().splitlines()) == 5
 
 
@@ -118,8 +98,8 @@ def test_followers_motors_and_passive_joints_go_along(preset, tmp_path):
         for parameter in model.parameters():
             parameter += 0.1
         model.raw_friction_compensation += 0.3
-    trained = Trained(model, arm, NAMES)
-    assert export_casadi(replace(trained, entries=())).summary
+    trained = Trained(model, arm)
+    assert export_casadi(trained).summary
     assert trained.described.name == "arm_2_fast_int_main"
     if shutil.which("gcc"):
         files, told = c_files(trained)
@@ -131,8 +111,8 @@ def test_a_matrix_of_one_joint_is_a_scalar(tmp_path):
     urdf = tmp_path / "one.urdf"
     urdf.write_text(ONE_JOINT)
     arm = load_arm(urdf)
-    trained = Trained(build(arm, "closed-form"), arm, NAMES)
-    assert export_casadi(replace(trained, entries=())).summary
+    trained = Trained(build(arm, "closed-form"), arm)
+    assert export_casadi(trained).summary
     if shutil.which("gcc"):
         assert c_files(trained)
 
@@ -166,9 +146,9 @@ def test_a_wrong_export_is_refused():
 
 
 def test_parity_names_the_worst_entry_point():
-    parity = require_parity({"bias": 5e-13, "tip_pose": 1e-14}, 1e-12, 9)
-    assert parity.differences["tip_pose"] == 1e-14
-    assert "at most 5.0e-13 (bias)" in parity.summary and "; 1e-12 is allowed" in parity.summary
+    found = require_parity({"bias": 5e-13, "tip_pose": 1e-14}, 1e-12, 9)
+    assert found.differences["tip_pose"] == 1e-14
+    assert "at most 5.0e-13 (bias)" in found.summary and "; 1e-12 is allowed" in found.summary
     for wrong in (2e-12, float("nan")):
         with pytest.raises(RunError, match="tip_pose differs"):
             require_parity({"bias": 0.0, "tip_pose": wrong}, 1e-12, 9)
@@ -309,13 +289,7 @@ def test_functions_are_chosen():
     model, arm = moved_model("two_link", "closed-form"), arm_of("two_link")
     files = export(model, "casadi", arm=arm).files
     assert "forward_dynamics.casadi" in files
-    assert not any("derivatives" in name for name in files)
     assert set(export(model, "casadi", arm=arm, entries=["bias"]).files) == {"bias.casadi", "README.md"}
-    # CasADi differentiates functions itself, so its export has none of the derivatives of C.
-    with pytest.raises(
-        RunError, match="the function 'inverse_dynamics_derivatives', expected one of inverse_"
-    ):
-        export(model, "casadi", arm=arm, entries=["inverse_dynamics_derivatives"])
     with pytest.raises(RunError, match="the function 'inverse', expected one of inverse_dynamics, forward"):
         export(model, "c", arm=arm, entries=["inverse"])
     with pytest.raises(RunError, match="functions for --to urdf, expected --to c, casadi, onnx and torch"):

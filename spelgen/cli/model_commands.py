@@ -106,7 +106,7 @@ def export(
     to: Format | None = option("", "Export format. Default: by the extension of the output."),
     entry: list[str] | None = option(
         "NAME",
-        "A function to export, for c, casadi, onnx and torch; repeatable. Default: all but derivatives.",
+        "A function to export, for c, casadi, onnx and torch; repeatable. Default: all.",
     ),
     float32: bool = flag("--float32", "Numbers of onnx and torch programs; otherwise float64."),
     force: bool = options.FORCE,

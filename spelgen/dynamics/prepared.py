@@ -187,7 +187,7 @@ class PreparedModel:
         batch, elements = q.shape[:-1], z.shape[-1]
         states = torch.cat([q, qd], dim=-1).reshape(-1, 2 * n)
         rows = states, tau.reshape(-1, n), z.reshape(len(states), n, elements)
-        by_state, by_input = batched_jacobians(function, 2, *rows)
+        by_state, by_input = _state_and_input_jacobians(function, *rows)
         return by_state.reshape(*batch, 2 * n, 2 * n), by_input.reshape(*batch, 2 * n, n)
 
     def pose(self, q: Tensor) -> Tensor:
@@ -223,20 +223,20 @@ class PreparedModel:
         return self._tip
 
 
-def batched_jacobians(function: Callable[..., Tensor], variables: int, *states: Tensor) -> tuple[Tensor, ...]:
-    """Return the Jacobians, (batch, m, n), of a function with respect to each of its first ``variables`` arguments.
+def _state_and_input_jacobians(function: Callable[..., Tensor], *arguments: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the Jacobians, (batch, m, k), of a function of (state, input, ...) with respect to state and input.
 
     Args:
-        function: function of vectors, (n,) each, without batch dimension, that returns a vector, (m,).
-        variables: number of arguments with respect to which the function is differentiated.
-        states: all arguments of the function, (batch, n) each.
+        function: function of arguments without batch dimension; state and input are vectors, (k,) each. It returns a
+            vector, (m,).
+        arguments: all arguments of the function, (batch, ...) each.
     """
     if not torch.is_grad_enabled():
-        states = tuple(x.detach() for x in states)
+        arguments = tuple(x.detach() for x in arguments)
     # In torch 2.13, vmap of a derivative of linalg.solve is wrong in forward mode and, if autograd is disabled, in
     # reverse mode. Reverse mode is therefore used, with autograd enabled.
     with torch.inference_mode(False), torch.enable_grad():
-        jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=tuple(range(variables))))
+        jacobian = torch.func.vmap(torch.func.jacrev(function, argnums=(0, 1)))
         # Tensors of inference mode cannot be differentiated, so the arguments are cloned.
-        derivatives: tuple[Tensor, ...] = jacobian(*(x.clone() for x in states))
-    return derivatives
+        by_state, by_input = jacobian(*(x.clone() for x in arguments))
+    return by_state, by_input

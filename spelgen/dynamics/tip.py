@@ -27,7 +27,9 @@ class TipKinematics:
         self._chains = {dtype: body_chain(tip.chain).to(dtype) for dtype in (torch.float64, torch.float32)}
         chain = self._chains[torch.float64]
         # `_joints`, (bodies, n): displacement per coordinate of each joint that carries the link; other rows are zero.
-        carrying = chain.carriers[:, tip.carrier] if tip.carrier >= 0 else torch.zeros(len(chain.parents)).double()
+        carrying = (
+            chain.carriers[:, tip.carrier] if tip.carrier >= 0 else torch.zeros(len(chain.parents)).double()
+        )
         self._joints = carrying.unsqueeze(-1) * chain.ratios
         # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
         names = zip(tip.chain.joint_names, self._joints.T, strict=True)

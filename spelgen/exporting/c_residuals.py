@@ -19,17 +19,15 @@ from spelgen.templates import render
 _WIDTH = 112  # maximum number of characters in a line of a C table
 
 _CALLS = (
-    (("first", "second"), "mass_jets(q", ("mass", "first", "second")),
-    (("rate", "kinetic"), "mass_rates(encoded, qd", ("mass", "rate", "kinetic")),
-    (("mass",), "mass_values(encoded", ("mass",)),
-    (("stiffness",), "potential_jets(q", ("gravity", "stiffness")),
-    (("gravity",), "potential_gradient(encoded", ("gravity",)),
-    (("energy",), "potential_value(encoded", ("energy",)),
-    (("torque", "torque_slope"), "joint_torques(q", ("torque", "torque_slope")),
-    (("torque_energy",), "joint_energies(q", ("torque_energy",)),
-    (("factor", "factor_slope"), "friction_factors(q", ("factor", "factor_slope")),
+    ("mass_rates(encoded, qd", ("mass", "rate", "kinetic")),
+    ("mass_values(encoded", ("mass",)),
+    ("potential_gradient(encoded", ("gravity",)),
+    ("potential_value(encoded", ("energy",)),
+    ("joint_torques(q", ("torque",)),
+    ("joint_energies(q", ("torque_energy",)),
+    ("friction_factors(q", ("factor",)),
 )
-"""Symbols that need a call, the call, and the symbols that it computes; the first row with a symbol is used."""
+"""Calls, and the symbols that each computes. A call is needed if no call before it computes its last symbol."""
 
 
 def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -42,8 +40,8 @@ def residual_calls(model: TrainedModel, names: Sequence[str]) -> tuple[list[str]
     symbols = residual_symbols(model)
     variables = []
     calls = []
-    for needed, call, computed in _CALLS:
-        if not uncomputed.intersection(needed):
+    for call, computed in _CALLS:
+        if computed[-1] not in uncomputed:
             continue
         uncomputed.difference_update(computed)
         arguments = []
@@ -78,7 +76,6 @@ def network_source(model: TrainedModel) -> list[str]:
         # All networks use the same buffers, so the buffers have the size of the widest layer.
         width=max(max(shape) for layers in shapes.values() for shape in layers),
         encoded=3 * n,
-        lanes=1 + n + n * (n + 1) // 2,
         tables=tables,
         networks=shapes,
         entries=residuals.entries,

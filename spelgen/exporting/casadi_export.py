@@ -14,14 +14,11 @@ from spelgen.exporting.description import (
     Residuals,
     SigmoidNetwork,
     TrainedModel,
-    entry_points,
-    select_names,
     spline_energy,
 )
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
 from spelgen.exporting.parity import Called, Values, check_parity
-from spelgen.exporting.residual_expressions import in_kinetic_energy
 from spelgen.exporting.rigid_expressions import constant
 from spelgen.exporting.tuning import TUNING
 
@@ -32,10 +29,7 @@ def export_casadi(trained: Trained) -> Exported:
     Raises RunError if results of a function and of the model differ.
     """
     model = trained.described
-    # The derivatives of C are not exported, since CasADi differentiates its functions itself.
-    entries = entry_points(model)
-    names = select_names(trained.entries, entries)
-    functions = casadi_functions(model, {name: entries[name] for name in names})
+    functions = casadi_functions(model, trained.entry_points)
     parity = check_parity(called_by_state(functions), trained, list(functions), TUNING.tolerance)
     checked = f"Checked when exported, by CasADi {ca.CasadiMeta.version()}: {parity.summary}"
     use = (
@@ -115,7 +109,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
         mass = values["mass"] = _network(residuals.mass, encoded)
         if qd is not None:
             values["rate"] = ca.jtimes(mass, q, qd)
-            values["kinetic"] = ca.jtimes(mass, q, in_kinetic_energy(model, qd), True)
+            values["kinetic"] = ca.jtimes(mass, q, _in_kinetic_energy(model, qd), True)
     if residuals.potential is not None:
         values["energy"] = _network(residuals.potential, encoded)
         # The gradient of V in reverse mode takes about as long as one evaluation of the network.
@@ -129,6 +123,19 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
         factors = [_spline(spline, q[joint]) for joint, spline in residuals.friction.items()]
         values["factor"] = ca.vertcat(*factors)
     return values
+
+
+def _in_kinetic_energy(model: TrainedModel, qd: ca.MX) -> ca.MX:
+    """Return the coefficients c, (m, 1), with which the residual term R of M gives 1/2 qd^T R qd = c^T r.
+
+    r, (m, 1): the m nonzero entries in the lower triangle of R. qd: (n, 1) [rad/s, m/s].
+    """
+    products = []
+    for row, column in model.residuals.entries:
+        # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.
+        weight = 0.5 if row == column else 1.0
+        products.append(weight * qd[row] * qd[column])
+    return ca.vertcat(*products)
 
 
 def _network(network: SigmoidNetwork, encoded: ca.MX) -> ca.MX:

@@ -33,7 +33,7 @@ class Trained:
     Attributes:
         model: the trained model.
         arm: arm of the model.
-        entries: names of the functions to export, for formats that consist of functions; empty: all except derivatives.
+        entries: names of the functions to export, for formats that consist of functions; empty: all.
         intervals: tables of the fitted parameters with 95 % intervals, for the README.
         float32: whether ONNX and torch programs compute in float32; otherwise in float64.
         levels: noise levels of the estimator of payload and external torques; None: the estimator is not exported.

@@ -196,14 +196,6 @@ _ENTRY_POINTS = (
         jacobian="m, 1",
     ),
     entry_point(
-        "inverse_dynamics_derivatives", "the derivatives of inverse_dynamics; its derivative by qdd is the mass matrix",
-        "q qd qdd z", dtau_dq="Nm/rad", dtau_dqd="Nm s/rad",
-    ),
-    entry_point(
-        "forward_dynamics_derivatives", "the derivatives of forward_dynamics", "q qd tau z",
-        dqdd_dq="1/s^2", dqdd_dqd="1/s", dqdd_dtau="1/(kg m^2)",
-    ),
-    entry_point(
         "servo_torque", "the torques of position servos under a command u, which the caller delays", "u q qd",
         tau=TORQUE,
     ),
@@ -216,14 +208,11 @@ ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
     """Return {name: entry point}, the functions of a model that an export contains. Raises RunError for unknown names.
 
-    names: names of entry points, such as inverse_dynamics; empty: all that the model has, except derivatives.
+    names: names of entry points, such as inverse_dynamics; empty: all that the model has.
     """
     available = list(ENTRY_POINTS)
     if model.servos is None:
         available.remove("servo_torque")
-    if not names:
-        # Derivatives are omitted by default: they are rarely needed, but would be two thirds of the code.
-        names = [name for name in available if not name.endswith("_derivatives")]
     return {name: ENTRY_POINTS[name] for name in select_names(names, available)}
 
 

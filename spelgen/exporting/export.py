@@ -38,7 +38,7 @@ def export(
         path: file or folder to write; None: nothing is written.
         arm: result of ``load_arm``, or the path of a URDF; default: the arm of the fit.
         force: replace existing files.
-        entries: names of the functions for c, casadi, onnx and torch; default: all except derivatives.
+        entries: names of the functions for c, casadi, onnx and torch; default: all.
         float32: whether onnx and torch programs compute in float32, for accelerators; default: float64.
 
     Raises RunError without an arm, for a model or a path that the format does not allow, if the comparison fails, and

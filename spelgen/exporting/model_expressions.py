@@ -10,19 +10,11 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.description import EntryPoint, Servos, TrainedModel
-from spelgen.exporting.residual_expressions import (
-    Symbols,
-    coriolis,
-    residual_symbols,
-    symbol_jacobians,
-    symmetric,
-)
+from spelgen.exporting.residual_expressions import Symbols, residual_symbols, symmetric
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics, mass_and_potential
 
 RESIDUAL = "residual_"
 """Prefix of the names of residual terms among the inputs of a function."""
-
-Outputs = dict[str, tuple[ca.SX, ...]]
 
 
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
@@ -37,12 +29,9 @@ def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint])
     # The expressions of all entry points are built together, since they share subexpressions.
     residuals = residual_symbols(model)
     expressions = _expressions(model, inputs, residuals)
-    # Derivatives take most of the time of an export and are built only if selected.
-    if any(name.endswith("_derivatives") for name in entries):
-        expressions |= _derivatives(model, inputs, residuals)
     functions = {}
     for name, entry in entries.items():
-        functions[name] = named_function(entry, expressions[name], inputs, residuals)
+        functions[name] = named_function(entry, (expressions[name],), inputs, residuals)
     return functions
 
 
@@ -74,21 +63,17 @@ def residuals_needed(function: ca.Function) -> list[str]:
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
 
 
-def _expressions(
-    model: TrainedModel, inputs: Symbols, residuals: Symbols, *, derivatives: bool = False
-) -> Outputs:
-    """Return {name: expressions} of ``force`` and of all entry points that are not derivatives of other entry points.
+def _expressions(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> dict[str, ca.SX]:
+    """Return {name of an entry point: expression} for all entry points of the model.
 
     The model is M(q) qdd + h(q, qd) + friction = G (tau - offset) + compensation, with the input matrix G, the
-    measured torque ``offset`` at zero torque, and the torque ``compensation`` that the drives add. ``force`` is M qdd +
-    h + friction - compensation, (n, 1).
+    measured torque ``offset`` at zero torque, and the torque ``compensation`` that the drives add.
 
     Args:
         model: the model as NumPy arrays.
         inputs: symbols q, qd, qdd, tau, dq (displacement), u (command of servos), (n, 1) each, and z, (n K, 1), the
             friction state of K bristles per joint.
         residuals: symbols of the residual terms, see ``residual_symbols``.
-        derivatives: True if the caller differentiates the expressions for other entry points; passed to `coriolis`.
     """
     q, qd, qdd, tau, dq, u, z = inputs.values()
     standstill = ca.SX(model.n, 1)
@@ -100,7 +85,8 @@ def _expressions(
     rigid_gravity = bodies.torque(standstill, standstill)
     added_gravity = added_bias = residuals["gravity"] + residuals["torque"]
     if model.residuals.mass is not None:
-        added_bias = added_gravity + coriolis(model, residuals, qd, derivatives=derivatives)
+        # Coriolis torque of R, the residual term of M: dR/dt qd - d/dq (1/2 qd^T R qd)
+        added_bias = added_gravity + symmetric(model, residuals["rate"]) @ qd - residuals["kinetic"]
     bias = bodies.torque(qd, standstill) + added_bias
     friction = drive_friction(model, residuals, qd, rigid_gravity, z)
     compensation = constant(model.friction_compensation) * qd
@@ -114,7 +100,6 @@ def _expressions(
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
     pose, jacobian = frame_kinematics(model.tip.chain.bodies, model.tip.carrier, model.tip.pose, q)
     outputs = {
-        "force": force,
         "inverse_dynamics": to_inputs @ force + model.torque_offset,
         "forward_dynamics": _solve(mass, applied + compensation - bias - friction),
         "mass_matrix": mass,
@@ -130,7 +115,7 @@ def _expressions(
     }
     if model.servos is not None:
         outputs["servo_torque"] = _servo_torque(model.servos, u, q, qd)
-    return {name: (output,) for name, output in outputs.items()}
+    return outputs
 
 
 def joint_mass(model: TrainedModel, residuals: Symbols) -> ca.SX:
@@ -232,37 +217,6 @@ def _servo_torque(servos: Servos, u: ca.SX, q: ca.SX, qd: ca.SX) -> ca.SX:
         limit = servos.limit[joint]
         torque[joint] = ca.fmin(ca.fmax(torque[joint], -limit), limit)
     return torque
-
-
-def _derivatives(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> Outputs:
-    """Return {entry point: Jacobians, (n, n) each} for the derivatives of inverse and forward dynamics.
-
-    Inverse dynamics are differentiated with respect to q and qd, forward dynamics with respect to q, qd and tau. Let
-    ``force`` be the joint force M qdd + h + friction - compensation (see ``_expressions``). The Jacobian of forward
-    dynamics with respect to q or qd is -M^-1 times the Jacobian of ``force`` at the acceleration that forward dynamics
-    returns (Carpentier and Mansard, RSS 2018); the Jacobian with respect to tau is M^-1 G.
-    """
-    expressions = _expressions(model, inputs, residuals, derivatives=True)
-    (force,), (mass,) = expressions["force"], expressions["mass_matrix"]
-    symbols = [inputs["q"]]
-    jacobians = [ca.SX.eye(model.n)]
-    # The chain rule is applied explicitly: a residual term is a symbol, and its Jacobian with respect to q is another
-    # symbol.
-    for symbol, jacobian in symbol_jacobians(model, residuals):
-        symbols.append(symbol)
-        jacobians.append(jacobian)
-    by_position = ca.jtimes(force, ca.vertcat(*symbols), ca.vertcat(*jacobians))
-    # The derivative of `force` with respect to qd needs no chain rule: the symbols of residual terms in `force` depend
-    # on q only, and `coriolis` is an explicit expression in qd.
-    by_velocity = ca.jacobian(force, inputs["qd"])
-    right = ca.horzcat(-by_position, -by_velocity, constant(model.inputs))
-    # The Jacobians of the force are evaluated at the accelerations of the forward dynamics.
-    right = ca.substitute(right, inputs["qdd"], *expressions["forward_dynamics"])
-    to_inputs = constant(model.input_inverse)
-    return {
-        "inverse_dynamics_derivatives": (to_inputs @ by_position, to_inputs @ by_velocity),
-        "forward_dynamics_derivatives": tuple(ca.horzsplit(_solve(mass, right), model.n)),
-    }
 
 
 def _solve(matrix: ca.SX, right: ca.SX) -> ca.SX:

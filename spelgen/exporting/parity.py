@@ -3,14 +3,13 @@
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.arm.arm import Coordinate
-from spelgen.dynamics.prepared import PreparedModel, batched_jacobians
+from spelgen.dynamics.prepared import PreparedModel
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.excitation.bounds import SPEEDS
@@ -53,7 +52,7 @@ _REFERENCES = PROGRAMS | {
     "energy": _energy,
     "servo_torque": lambda prepared, u, q, qd: prepared.model.servo(u, q, qd),
 }
-"""The torch model's functions of entry points, by name, except for derivatives."""
+"""The torch model's functions of entry points, by name."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +116,14 @@ def check_parity(
     inputs["z"] = inputs["z"].reshape(states, exact.n, exact.elements)
     differences = {}
     for name in names:
-        outputs = called(name, inputs)
-        expected = _expected(exact, name, inputs)
-        # The outputs of the export are reshaped, since for an arm of one joint some formats return a vector in place of
-        # a matrix.
-        errors = [relative(outputs[key].reshape(value.shape), value) for key, value in expected.items()]
-        differences[name] = float(np.max(errors))  # np.max returns NaN if any error is NaN
+        entry = ENTRY_POINTS[name]
+        (output,) = entry.outputs
+        arguments = [torch.from_numpy(inputs[key]) for key in entry.inputs]
+        expected = _REFERENCES[name](exact, *arguments).detach().numpy()
+        # The output of the export is reshaped, since for an arm of one joint some formats return a vector in place of a
+        # matrix.
+        values = called(name, inputs)[output].reshape(expected.shape)
+        differences[name] = relative(values, expected)
     return require_parity(differences, tolerance, states)
 
 
@@ -166,22 +167,3 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
     size = np.abs(expected).max() or 1.0
     with np.errstate(invalid="ignore"):
         return float(np.abs(values - expected).max() / size)
-
-
-def _expected(model: PreparedModel, name: str, inputs: Values) -> Values:
-    """Return {output: array (states, ...)} of one function of the torch model, such as inverse_dynamics, as reference.
-
-    Args:
-        model: the torch model in double precision.
-        name: name of the function (entry point).
-        inputs: {input: array (states, n)}, and (states, n, K) for the friction state z of K bristles per joint.
-    """
-    entry = ENTRY_POINTS[name]
-    arguments = [torch.from_numpy(inputs[key]) for key in entry.inputs]
-    function = partial(_REFERENCES[name.removesuffix("_derivatives")], model)
-    if name.endswith("_derivatives"):
-        outputs = batched_jacobians(function, len(entry.outputs), *arguments)
-    else:
-        outputs = (function(*arguments),)
-    arrays = [output.detach().numpy() for output in outputs]
-    return dict(zip(entry.outputs, arrays, strict=True))
