@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-import yaml
 from emitted import ROBOTS
 from exported_runs import saved_run
 from typer.testing import CliRunner
@@ -83,7 +82,6 @@ def test_residual_terms_are_reported(tmp_path):
     loaded, told = exported(run, tmp_path / "bodies.urdf")
     assert max(differences(model, loaded)) < 1e-8
     assert "bodies are those of the model" in told
-    assert "position_factor" not in (tmp_path / "bodies.urdf.friction.yaml").read_text().split("joints:")[1]
     functions = model.residuals
     with torch.no_grad():
         model.residuals.raw_constants += 0.5
@@ -97,8 +95,6 @@ def test_residual_terms_are_reported(tmp_path):
     assert projection.mass_error > 1e-3
     assert projection.gravity_error > 1e-3
     assert (projection.friction.error > 0.05).all()
-    law = yaml.safe_load(found.files[".urdf.friction.yaml"])["joints"]["joint1"]["law"]
-    assert law["position_factor"][0] < 0.9 < 1.1 < law["position_factor"][1]
 
 
 def test_networks_go_back_as_the_nearest_bodies(tmp_path):
@@ -110,12 +106,9 @@ def test_networks_go_back_as_the_nearest_bodies(tmp_path):
     assert "bodies are the rigid bodies nearest to the model; M differs by" in told
 
 
-def test_the_friction_model_is_exported(tmp_path):
-    run, model = run_of("rpr", tmp_path, "closed-form", heavier)
+def test_the_readme_of_a_model_without_intervals_has_five_lines(tmp_path):
+    run, _ = run_of("rpr", tmp_path, "closed-form", heavier)
     exported(run, tmp_path / "learned.urdf")
-    told = yaml.safe_load((tmp_path / "learned.urdf.friction.yaml").read_text())
-    law = [told["joints"][name]["law"]["coulomb"] for name in model.joint_names]
-    np.testing.assert_allclose(law, model.coulomb.detach().numpy(), rtol=1e-10)
     assert len((tmp_path / "learned.urdf.README.md").read_text().splitlines()) == 5
 
 
@@ -161,7 +154,7 @@ def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
     assert found.files[".urdf"].startswith(b"<?xml")
     assert "bodies are those of the model" in repr(found)
     written = [x.name for x in found.write(tmp_path / "arm.urdf")]
-    assert written == ["arm.urdf", "arm.yaml", "arm.urdf.friction.yaml", "arm.urdf.README.md"]
+    assert written == ["arm.urdf", "arm.yaml", "arm.urdf.README.md"]
     with pytest.raises(RunError, match="this output exists already"):
         found.write(tmp_path / "arm.urdf")
     with pytest.raises(RunError, match=r"no robot\.urdf"):

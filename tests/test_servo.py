@@ -9,7 +9,6 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 import torch
-import yaml
 from emitted import import_source
 from servo_arm import (
     COM,
@@ -355,9 +354,6 @@ def test_exports_contain_the_servos(fitted, arm, tmp_path, monkeypatch):
     xml = spelgen.export(fitted, to="mjcf").files[".xml"].decode()
     found = re.findall(r'<position name="\w+" joint="\w+" kp="([^"]+)" kv="([^"]+)" forcerange="-6 6"', xml)
     assert np.array(found, dtype=float) == pytest.approx(np.stack([kp, kd], axis=1))
-    held = yaml.safe_load(spelgen.export(fitted, to="urdf").files[".urdf.friction.yaml"])
-    assert held["delay"] == pytest.approx(float(fitted.model.servo.delay))
-    assert held["joints"]["elbow"]["servo"]["kp"] == pytest.approx(kp[1])
     monkeypatch.setattr(fitted.model.servo, "dead_zone", torch.tensor([0.01, 0.0]).double())
     assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()
     files = spelgen.export(
