@@ -1,4 +1,4 @@
-"""Parsers of written closed forms (text, LaTeX), and their comparison with Pinocchio."""
+"""Parsers of written closed forms (text), and their comparison with Pinocchio."""
 
 from __future__ import annotations
 
@@ -62,22 +62,3 @@ def read_back(told: str) -> dict[str, str]:
         elif line.startswith("    "):
             found[list(found)[-1]] += line
     return found
-
-
-def without_latex(told: str) -> dict[str, str]:
-    """Return the expressions of the first ``align*`` of LaTeX closed forms as Python, by name (M11, ..., V)."""
-    body = told.partition(r"\begin{align*}")[2].partition(r"\end{align*}")[0]
-    for pattern, plain in (
-        (r"\\\\\n\s*&\\quad", " "),
-        (r" \\cdot 10\^\{(-?\d+)\}", r"e\1"),
-        (r"\\[,]|\\\\", lambda match: "*" if match[0] == r"\," else ""),
-        (r"\\(cos|sin)(?:\^\{(\d)\})?\{\\bigl(\([^()]*)\\bigr\)\}", lambda m: f"{m[1]}{m[3]})**{m[2] or 1}"),
-        (r"\\(?:bigl|bigr)", ""),
-        (r"([mhI])_\{(?:([xyz]+),)?(\w+)\}", r"\1\2\3"),
-        (r"([Mq])_\{(\d+)\}", r"\1\2"),
-        (r"\^\{(\d)\}", r"**\1"),
-    ):
-        body = re.sub(pattern, plain, body)
-    assert "\\" not in body
-    rows = [line.split("&=") for line in body.strip().splitlines()]
-    return {name.strip(): expression.strip() for name, expression in rows}

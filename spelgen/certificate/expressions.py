@@ -1,10 +1,10 @@
-"""SymPy expressions of closed forms from polynomials of an arm, and their output as text, LaTeX and Python.
+"""SymPy expressions of closed forms from polynomials of an arm, and their output as text and Python.
 
 The polynomials are entries of M, or the potential energy V, in sines, cosines and positions of joints. For consecutive
 joints with parallel axes, products of cosines and sines are expressed as cosines and sines of sums of angles. Other
 simplifications (powers of single angles, common factors of several terms) are not used: they shorten long formulas by
-20 %, but not the formulas that are short enough to be read. Decimals in text and LaTeX have at most twelve digits.
-Python for SymPy has exact fractions, except for fractions with more than 17 digits.
+20 %, but not the formulas that are short enough to be read. Decimals in text have at most twelve digits. Python for
+SymPy has exact fractions, except for fractions with more than 17 digits.
 """
 
 import re
@@ -15,7 +15,6 @@ from functools import cache, lru_cache
 from flint import fmpq, fmpq_mpoly, fmpq_mpoly_ctx
 from sympy import Add, Expr, Float, Integer, Rational, Symbol, cos, sin
 from sympy.core.parameters import distribute
-from sympy.printing.latex import LatexPrinter
 from sympy.printing.str import StrPrinter
 
 from spelgen.arm.arm import Chain
@@ -174,14 +173,6 @@ def text(expression: Expr) -> str:
     return result
 
 
-def latex(expression: Expr) -> str:
-    r"""Return an expression in LaTeX, in which brackets are \bigl(, since \left( must be closed in the same line."""
-    names = {symbol: _latex_name(symbol.name) for symbol in expression.free_symbols}
-    printer = LatexPrinter({"full_prec": False, "mul_symbol": r" \, ", "symbol_names": names})
-    formula: str = printer.doprint(_rounded(expression, 1, 12))
-    return formula.replace(r"\left(", r"\bigl(").replace(r"\right)", r"\bigr)")
-
-
 def python(expression: Expr) -> str:
     """Return an expression as Python code for SymPy, with exact fractions up to 17 digits; longer ones are decimals."""
     result: str = _PythonPrinter({"sympy_integers": True}).doprint(
@@ -200,7 +191,7 @@ def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
     formula = re.sub(r"([+-]) ", rf"\1{_FIXED}", formula)
     brackets = re.findall(r"\((?:[^()]|\([^()]*\))+\)", formula)
     angles = re.findall(r"(?:cos|sin)\b.*?\)", formula)
-    for text in dict.fromkeys([*brackets, *angles, r" \, "]):
+    for text in dict.fromkeys([*brackets, *angles]):
         if len(text) < width // 2 or text in angles:
             formula = formula.replace(text, text.replace(" ", _FIXED))
     wrapped = textwrap.fill(
@@ -230,10 +221,3 @@ def _rounded(expression: Expr, largest: int, digits: int) -> Expr:
     # Without `distribute(False)`, SymPy expands products of numbers and sums.
     with distribute(False):
         return expression.xreplace(decimals)
-
-
-def _latex_name(name: str) -> str:
-    """Return the name of a parameter in LaTeX, for example ``I_{zz,1R}`` for ``Izz1R``."""
-    letter, axes, number = re.findall(r"(.)([a-z]*)(.*)", name)[0]
-    index = ",".join(filter(None, [axes, number]))
-    return f"{letter}_{{{index}}}" if index else str(letter)

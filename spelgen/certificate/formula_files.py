@@ -1,4 +1,4 @@
-"""Output of closed forms of M and the potential energy V: text, a JSON object, LaTeX with amsmath, SymPy code.
+"""Output of closed forms of M and the potential energy V: text, a JSON object, and code for SymPy.
 
 Names of symbols consist of letters and numbers of joints. Names from the URDF occur in files only in comments, as JSON
 strings without line ends and control characters.
@@ -16,7 +16,6 @@ from spelgen.certificate.expressions import python
 from spelgen.certificate.formulas import WRITABLE, Formulas
 from spelgen.labels import printable, short_name
 
-_LATEX_WIDTH = 140
 _PYTHON_WIDTH = 100
 
 # A Python file of closed forms starts with the docstring `_HEAD`. Comments with names from the URDF are below it, since
@@ -101,25 +100,6 @@ def _legend(formulas: Formulas) -> str:
     )
 
 
-def latex(formulas: Formulas) -> str:
-    """Return closed forms in LaTeX: formulas, and definitions of base parameters, in two ``align*`` environments."""
-    rows = {Symbol(row.name): row.expression for row in formulas.written}
-    # A base parameter that is a single inertial parameter has the same name as it, so no definition is printed.
-    definitions = {name: x for name, x in formulas.base_parameters.items() if not x.is_Symbol}
-    result = ["% Closed forms of a serial arm's mass matrix and potential energy, by spelgen; needs amsmath."]
-    result += _comments(formulas, "%")
-    for equations in (rows, definitions):
-        aligned = []
-        for name, expression in equations.items():
-            start = f"{expressions.latex(name)} &= "
-            aligned += expressions.lines(expressions.latex(expression), start, _LATEX_WIDTH)
-        if aligned:
-            # All lines of a formula except the first are indented by \quad.
-            body = " \\\\\n".join(re.sub("^ +", r"    &\\quad ", line) for line in aligned)
-            result += [r"\begin{align*}", body, r"\end{align*}"]
-    return "\n".join(result) + "\n"
-
-
 def sympy_source(formulas: Formulas) -> str:
     """Return the source of a Python file that defines closed forms as SymPy expressions."""
     n = len(formulas.q)
@@ -149,25 +129,25 @@ def _beginning(formulas: Formulas, body: str) -> list[str]:
     inertial = {symbol.name for x in formulas.base_parameters.values() for symbol in x.free_symbols}
     positions = [symbol.name for symbol in formulas.q]
     bases = [base.name for base in formulas.base]
-    lines = [*_comments(formulas, "#"), "", f"from sympy import {', '.join(imported)}", ""]
+    lines = [*_comments(formulas), "", f"from sympy import {', '.join(imported)}", ""]
     for name in dict.fromkeys([*positions, *sorted(inertial), *bases]):
         lines.append(f'{name} = Symbol("{name}", real=True)')
     # A tuple of one element needs a trailing comma in Python.
     return [*lines, f"q = ({', '.join(positions)}{',' * (len(positions) == 1)})", ""]
 
 
-def _comments(formulas: Formulas, mark: str) -> list[str]:
-    """Return comments that begin with ``mark``: names of robot, joints and bodies, and entries without expression.
+def _comments(formulas: Formulas) -> list[str]:
+    """Return the comments of a Python file: names of robot, joints and bodies, and entries without expression.
 
     Entries of M, or V, have no expression if their closed forms have too many terms.
     """
     arm = formulas.arm
-    lines = [f"{mark} Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
+    lines = [f"# Robot {json.dumps(arm.name)}, for {formulas.trusted}."]
     for number, coordinate in enumerate(arm.coordinates, start=1):
-        lines.append(f"{mark} q{number}: {json.dumps(coordinate.name)}")
+        lines.append(f"# q{number}: {json.dumps(coordinate.name)}")
     if tuple(body.name for body in arm.bodies) != arm.joint_names:
         for number, body in enumerate(arm.bodies, start=1):
-            lines.append(f"{mark} body {number}: {json.dumps(body.name)}")
+            lines.append(f"# body {number}: {json.dumps(body.name)}")
     for row in formulas.unwritten:
-        lines.append(f"{mark} {row.name}: {row.omission}")
+        lines.append(f"# {row.name}: {row.omission}")
     return lines

@@ -18,8 +18,8 @@ from spelgen.certificate.expressions import (
     PolynomialWriter,
     coordinate,
     grouped,
-    latex,
     parameter,
+    text,
     weighted_sum,
 )
 from spelgen.errors import SpelgenError
@@ -151,10 +151,10 @@ class Formulas:
         return f"<Formulas of {self.arm.name!r}: {counts}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of the closed forms in LaTeX, for a notebook."""
+        """Return a table of the closed forms, for a notebook."""
         rows = []
         for row in self.rows:
-            rows.append((row.name, row.omission if row.expression is None else f"${latex(row.expression)}$"))
+            rows.append((row.name, row.omission if row.expression is None else text(row.expression)))
         return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
 
 

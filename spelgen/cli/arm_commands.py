@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from spelgen.certificate.inspection import Inspection
     from spelgen.certificate.verify import Verification
 
-InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
+InspectionFormat = Literal["text", "json", "html", "sympy"]
 IdentificationFormat = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
 FRICTION_HELP = (
@@ -51,11 +51,11 @@ def inspect(
 
         proof = verified(arm.robot, arm.chain, inspection.structure)
     closed = None
-    if formulas or chosen_entry is not None or chosen in ("latex", "sympy"):
+    if formulas or chosen_entry is not None or chosen == "sympy":
         from spelgen.certificate.formulas import WRITABLE
 
         # JSON and SymPy files are read by programs, so they contain formulas up to the largest length that can be
-        # written. Text and LaTeX contain formulas up to the default length.
+        # written. Text contains formulas up to the default length.
         longest = WRITABLE if chosen in ("json", "sympy") else None
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
@@ -91,14 +91,14 @@ def _text(
         if proof:
             data["verification"] = proof.to_dict()
         return json.dumps(data, indent=2) + "\n"
-    if closed and format in ("latex", "sympy"):
-        # A LaTeX or SymPy file contains only formulas, so the proof and the names of omitted formulas go to stderr.
+    if closed and format == "sympy":
+        # A SymPy file contains only formulas, so the proof and the names of omitted formulas go to stderr.
         names = [formula.name for formula in closed.unwritten]
         if names:
             note(f"too long to be written: {', '.join(names)}")
         if proof:
             note(proof.text())
-        return formula_files.latex(closed) if format == "latex" else formula_files.sympy_source(closed)
+        return formula_files.sympy_source(closed)
     paragraphs = [formula_files.text(closed) if closed else inspection.text()]
     paragraphs += [proof.text()] if proof else []
     return "\n\n".join(paragraphs) + "\n"

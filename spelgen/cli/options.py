@@ -64,7 +64,7 @@ def output_option(metavar: str, text: str, default: object = None) -> Declared:
     return option(metavar, text, "-o", "--output", default=default)
 
 
-SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".html": "html", ".tex": "latex", ".py": "sympy"}
+SUFFIXES = {"": "text", ".txt": "text", ".json": "json", ".html": "html", ".py": "sympy"}
 """{suffix of an output file: format of its content}; a name without a suffix means text."""
 
 TextOrJson = Literal["text", "json"]
