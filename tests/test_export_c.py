@@ -165,11 +165,10 @@ int main(void)
     int k, i;
     for (k = 0; k < 8; k++) {{
         R q[{n}], qd[{n}], x[{n}], z[{memory} + 1] = {{0}}, out[{memory} + 16];
-        R more[{square}], most[{square}], last[{square}];
+        R more[{square}];
         for (i = 0; i < {n}; i++) q[i] = size[k] * (i + 1), qd[i] = size[7 - k], x[i] = -size[k];
-        for (i = 0; i < {square}; i++) last[i] = 0;
 {calls}
-        if (k == 7) printf("%d %d\n", isnan(out[0]), isnan(last[0]));
+        if (k == 7) printf("%d\n", isnan(out[0]));
     }}
     return 0;
 }}
@@ -188,9 +187,8 @@ def test_c_is_sound_for_all_inputs(case, compiled):
     calls = []
     for entry in ENTRIES.values():
         given = [{"q": "q", "qd": "qd", "z": "z"}.get(each, "x") for each in entry.inputs]
-        outputs = ["more", "most", "last"][: len(entry.outputs)] if len(entry.outputs) > 1 else ["out"]
-        outputs = ["more"] if entry.name in ("tip_jacobian", "mass_matrix", "tip_pose") else outputs
-        calls.append(f"        {name}_{entry.name}({', '.join([*given, *outputs])});")
+        output = "more" if entry.name in ("tip_jacobian", "mass_matrix", "tip_pose") else "out"
+        calls.append(f"        {name}_{entry.name}({', '.join([*given, output])});")
     calls.append(f"        {name}_forward_dynamics(q, qd, x, z, out);")
     text = DRIVER.format(
         name=name, n=n, memory=trained.described.memory, square=max(n * n, 6 * n, 16), calls="\n".join(calls)
@@ -208,7 +206,7 @@ def test_c_is_sound_for_all_inputs(case, compiled):
     assert not built.returncode, built.stderr
     done = subprocess.run([program], capture_output=True, text=True, check=False)
     assert not done.returncode, done.stderr
-    assert done.stdout == "1 1\n"
+    assert done.stdout == "1\n"
 
 
 REACH = np.array([[0.01, 0.1], [0.02, 0.3]])
