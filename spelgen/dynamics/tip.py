@@ -1,72 +1,67 @@
-"""Pose and Jacobian of the tip of an arm, by the kinematics of the runtime (``BodyChain``)."""
+"""Frames of the links of an arm relative to the bodies that carry them, and the kinematics of its tip."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
+import numpy as np
 
+from spelgen.arm.arm import Chain, lump_links, make_arm
+from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.dynamics.tip_frame import Tip, tip_frame
+from spelgen.dynamics.tip_kinematics import TipKinematics
 
 
-class TipKinematics:
-    """Pose and Jacobian of a link in the frame of the root link, as functions of q, (..., n) [rad, m].
+@dataclass(frozen=True, eq=False)
+class Tip:
+    """The tip link, and its frame relative to the body that carries it.
 
-    Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
-    rounded to it, unlike in a `Chain`. Results have the dtype of q.
-
-    tip: frame of the link. Raises ValueError for a coordinate that does not move the link.
+    Attributes:
+        link: name of the tip link.
+        carrier: index of the body that carries the link; -1: the root link.
+        pose: pose of the link in the frame of this body, (4, 4).
+        chain: the arm with the unrounded angles of the URDF, so that poses are equal to the results of other URDF
+            parsers.
     """
 
-    def __init__(self, tip: Tip) -> None:
-        self.link = tip.link
-        self._carrier, self._pose = tip.carrier, torch.from_numpy(tip.pose)
-        # A module of torch has a fixed dtype. There is a chain per dtype: results have the dtype of q.
-        self._chains = {dtype: body_chain(tip.chain).to(dtype) for dtype in (torch.float64, torch.float32)}
-        chain = self._chains[torch.float64]
-        # `_joints`, (bodies, n): displacement per coordinate of each joint that carries the link; other rows are zero.
-        carrying = (
-            chain.carriers[:, tip.carrier] if tip.carrier >= 0 else torch.zeros(len(chain.parents)).double()
-        )
-        self._joints = carrying.unsqueeze(-1) * chain.ratios
-        # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
-        names = zip(tip.chain.joint_names, self._joints.T, strict=True)
-        missing = [name for name, column in names if not column.any()]
-        if missing:
-            raise ValueError(f"the joints {', '.join(missing)} do not lead to {tip.link}")
+    link: str
+    carrier: int
+    pose: np.ndarray
+    chain: Chain
 
-    def pose(self, q: Tensor) -> Tensor:
-        """Return the pose of the link at q: the homogeneous transform from the link to the root frame, (..., 4, 4)."""
-        return self._pose_and_axes(q)[0]
 
-    def position(self, q: Tensor) -> Tensor:
-        """Return the position of the link's origin in the root frame, (..., 3) [m]."""
-        return self.pose(q)[..., :3, 3]
+def tip_frame(loaded: Arm, link: str | None = None) -> Tip:
+    """Return the frame of a link of an arm, by default the tip link, with the unrounded angles of the URDF."""
+    names = loaded.chain.joint_names
+    link = link or loaded.tip or loaded.robot.last_link(names)
+    # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.
+    chain = make_arm(loaded.robot, joints=names, angle_tolerance=0.0, gravity=loaded.settings.gravity)
+    return Tip(link, *link_poses(loaded)[link], chain)
 
-    def jacobian(self, q: Tensor) -> Tensor:
-        """Return the Jacobian of the link, (..., 6, n): its linear, then its angular velocity per qd, in root axes."""
-        pose, axes = self._pose_and_axes(q)
-        # `linear` is the velocity of the point of the link at the origin of the root frame.
-        angular, linear = (axes @ self._joints.to(q)).chunk(2, dim=-2)
-        moment = torch.linalg.cross(angular, pose[..., :3, 3:], dim=-2)
-        return torch.cat([linear + moment, angular], dim=-2)
 
-    def _pose_and_axes(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pose of the link, (..., 4, 4), and the twists of all joints per unit rate, (..., 6, bodies)."""
-        chain = self._chains[q.dtype]
-        # `chain.forward` returns the frames of the bodies times four given points; the columns of the identity as
-        # points give the frames.
-        configuration = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
-        frames = torch.cat([configuration.place, configuration.mass], dim=-3)
-        return frames[..., self._carrier, :] @ self._pose.to(q), configuration.axes
+def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:
+    """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
+
+    The body is an index in `Chain.bodies`, or -1 for the root link. The pose is in the frame of this body. Angles of
+    the URDF are rounded with ``angle_tolerance`` [rad].
+    """
+    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
+    poses: dict[str, tuple[int, np.ndarray]] = {}
+    for link, frame in lump_links(loaded.robot, chain, angle_tolerance).frames.items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+        poses[link] = frame.body, pose
+    return poses
 
 
 def tip_kinematics(
     arm: Arm | Path | str, link: str | None = None, *, joints: Sequence[str] | None = None
 ) -> TipKinematics:
     """Return the kinematics of a link, by default the tip of the arm.
+
+    Mimic joints move with their coordinates; all other joints are at zero. Angles near a multiple of pi/2 are not
+    rounded to it, unlike in a `Chain`.
 
     Args:
         arm: result of ``load_arm``, or the path of a URDF, together with ``joints``.
@@ -80,4 +75,11 @@ def tip_kinematics(
         if not joints:
             raise ValueError("no joints are named")
         arm = load_arm(arm, joints)
-    return TipKinematics(tip_frame(arm, link))
+    tip = tip_frame(arm, link)
+    kinematics = TipKinematics(tip.link, body_chain(tip.chain), tip.carrier, tip.pose)
+    # A coordinate that does not move the link is an error: it is probably a mistake of the caller.
+    names = zip(tip.chain.joint_names, kinematics.joints.T, strict=True)
+    missing = [name for name, column in names if not column.any()]
+    if missing:
+        raise ValueError(f"the joints {', '.join(missing)} do not lead to {tip.link}")
+    return kinematics
