@@ -42,10 +42,6 @@ from spelgen.logs.trajectory import Trajectory, delayed_commands
 from spelgen.render.report_page import render_report
 
 TRUTH = Servos(stribeck=(0.0, 0.08), dead_zone=(0.006, 0.0))
-SLIDER = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>
-<limit lower="-1" upper="1" effort="6" velocity="5"/></joint>"""
-LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
-</inertial></link>"""
 
 
 @pytest.fixture(scope="module")

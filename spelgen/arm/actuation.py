@@ -4,6 +4,8 @@ tau are the logged torques: joint torques, or motor torques if the settings spec
 case G contains the gear ratios and the couplings of motors that drive several joints, as in many wrists.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -43,6 +45,11 @@ class Drives(NamedTuple):
 
     inputs: np.ndarray
     speeds: np.ndarray
+
+    @classmethod
+    def direct(cls, joints: int) -> Drives:
+        """Return the matrices of motors that move only their own joints: two identity matrices."""
+        return cls(np.eye(joints), np.eye(joints))
 
 
 @dataclass(frozen=True)

@@ -82,10 +82,9 @@ class RegressorDynamics:
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*pseudo_inertia(by_body))
         self.armature = torch.tensor(armature, dtype=torch.float64)
-        alone = np.eye(len(armature))
-        reach = alone[:, :0] if bristle_reach is None else bristle_reach
+        reach = np.zeros((len(armature), 0)) if bristle_reach is None else bristle_reach
         self.bristle_reach = torch.from_numpy(reach)
-        inputs, motors = drives or Drives(alone, alone)
+        inputs, motors = drives or Drives.direct(len(armature))
         self.inputs, self.motors = torch.from_numpy(inputs), torch.from_numpy(motors)
 
     @property

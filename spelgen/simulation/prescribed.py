@@ -88,9 +88,10 @@ def prescribed(
             f"the passive joint {passive[0]!r}", element="simulation.protocol", expected="a motor at every joint",
             do="use the protocol random-inputs: no torque moves this joint along a path",
         )  # fmt: skip
-    friction = make_friction(arm, settings, drives and drives.speeds)
+    drives = drives or Drives.direct(len(arm.coordinates))
+    friction = make_friction(arm, settings, drives.speeds)
     dynamics = arm_dynamics(arm, settings)
-    to_motors = np.eye(len(arm.coordinates)) if drives is None else np.linalg.inv(drives.inputs)
+    to_motors = np.linalg.inv(drives.inputs)
     if not motions:
         motions = paths(arm, settings, sample_times(protocol))
     logs = []

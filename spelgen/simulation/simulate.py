@@ -47,7 +47,8 @@ def random_inputs(
         progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
-    dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives and drives.speeds))
+    drives = drives or Drives.direct(len(arm.coordinates))
+    dynamics = arm_dynamics(arm, settings, make_friction(arm, settings, drives.speeds))
     lowest, highest = initial_range(arm, settings)
     torques = []
     for coordinate in arm.coordinates:
@@ -62,9 +63,7 @@ def random_inputs(
     for number, random in enumerate(randoms):
         start = np.concatenate([random.uniform(lowest, highest), np.zeros(lowest.size)])
         tau = np.stack([random.choice(choices, size=t.size) for choices in torques], axis=1)
-        effect = tau if drives is None else tau @ drives.inputs.T
-        states = rollout(dynamics, start, t, effect)
-        q, qd = np.split(states, 2, axis=1)
+        q, qd = np.split(rollout(dynamics, start, t, tau @ drives.inputs.T), 2, axis=1)
         trajectories.append(Trajectory(t, q, qd, tau, f"traj_{number:02d}"))
         progress(number + 1, protocol.trajectories)
     # The number of test trajectories is bounded, so that at least one trajectory remains for training.

@@ -60,9 +60,9 @@ def track(
         progress: Function called after each trajectory with the number of finished and the number of all trajectories.
     """
     protocol = settings.simulation
-    friction = make_friction(arm, settings, drives and drives.speeds)
+    drives = drives or Drives.direct(len(arm.coordinates))
+    friction = make_friction(arm, settings, drives.speeds)
     dynamics = arm_dynamics(arm, settings, friction)
-    inputs = np.eye(len(arm.coordinates)) if drives is None else drives.inputs
     middle = np.mean(initial_range(arm, settings), axis=0)
     samples = round(protocol.duration * protocol.sample_rate)
     count = -(-samples // _samples_of_a_tick(settings))
@@ -72,7 +72,7 @@ def track(
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
         # 1 / (M^-1)_jj is the inertia at joint j while all other joints move freely.
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
-        recording = record(dynamics, friction, inputs, path, settings, inertia, 2 * np.pi * bandwidth)
+        recording = record(dynamics, friction, drives.inputs, path, settings, inertia, 2 * np.pi * bandwidth)
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
         cut = max(1, len(log) - round(protocol.test_fraction * len(log)))
         train.append(log[:cut])
