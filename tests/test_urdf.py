@@ -402,7 +402,7 @@ class TestLint:
             ("zero-inertia", INERTIAL.replace("1.5", "0").replace('"1"', '"0"').replace('"0"', '"1"', 1)),
             ("inertial-without-inertia", '<inertial><mass value="1"/></inertial>'),
             ("inertial-without-mass", '<inertial><inertia ixx="1" iyy="1" izz="1"/></inertial>'),
-            ("several-inertials", INERTIAL + INERTIAL),
+            ("repeated-element", INERTIAL + INERTIAL),
             ("millimetres", INERTIAL.replace('"1"', '"0.001"', 1)),
             ("millimetres", INERTIAL.replace("<mass", '<origin xyz="0 -150 0"/><mass')),
         ],

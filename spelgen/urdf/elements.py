@@ -22,22 +22,18 @@ def read_name(notes: Notes, xml: etree._Element) -> str | None:
 def read_link(notes: Notes, xml: etree._Element) -> UrdfLink | None:
     """Return the link of a <link> element; if it has no name, add an error to ``notes`` and return None.
 
-    notes: list of the defects of the file. Of several <inertial> elements the first is used, with a warning.
+    notes: list of the defects of the file.
     """
     name = read_name(notes, xml)
     if name is None:
         return None
     link = Element(notes, xml, f"link {name!r}")
-    # URDF allows one <inertial> per link. Of several, the first is used, as the parsers of ROS do.
-    inertials = xml.findall("inertial")
-    if len(inertials) > 1:
-        message = f"{len(inertials)} <inertial> elements: the first is taken, the others are ignored"
-        notes.warn(inertials[1].sourceline, "several-inertials", link.where, message)
-    inertial = _read_inertial(Element(notes, inertials[0], f"{link.where} inertial")) if inertials else None
-    return UrdfLink(name, inertial, link.line)
+    return UrdfLink(name, _read_inertial(link.child("inertial")), link.line)
 
 
 def _read_inertial(inertial: Element) -> Inertial | None:
+    if inertial.xml is None:
+        return None
     mass_element = inertial.child("mass")
     # Origin and tensor are read before the mass is checked, so that their defects are reported also if the mass is
     # absent.
@@ -61,7 +57,7 @@ def _read_tensor(inertial: Element) -> Tensor:
     All are zero if <inertia> is absent, which is a warning, or incomplete, which is an error.
     """
     inertia = inertial.child("inertia")
-    if inertial.xml is not None and inertia.xml is None:
+    if inertia.xml is None and inertial.xml is not None:
         # Some URDFs of vendors contain an unexpanded xacro macro in place of <inertia>: the warning names the macro.
         instead = next((e.tag for e in inertial.xml.iterchildren(etree.Element) if "inertia" in e.tag), None)
         hint = f" (<{instead}> is a xacro macro that was not expanded)" if instead else ""
