@@ -49,10 +49,6 @@ class ModelTuning:
     # [1] Typical friction, divided by the joint's typical torque for gravity and unit acceleration, for joints without
     # an effort limit.
     friction_of_torque: float = 0.1
-    # [Nm, N] A larger effort limit in a URDF is regarded as a placeholder for an unknown limit.
-    largest_effort: float = 1e4
-    # [rad/s, m/s] A larger velocity limit in a URDF is regarded as a placeholder for an unknown limit.
-    largest_speed: float = 100.0
     # [1] Significant digits of inertial parameters: more than a URDF has, but fewer than the 16 of float64, so that
     # decimals of a URDF are reproduced without rounding errors of float64.
     inertia_digits: int = 12
@@ -194,8 +190,7 @@ def _joint(
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
     lower, upper = (None if x is None else rounded(x) for x in (coordinate.lower, coordinate.upper))
-    effort = _plausible(coordinate.effort, TUNING.largest_effort)
-    speed = _plausible(coordinate.velocity, TUNING.largest_speed)
+    effort, speed = coordinate.effort, coordinate.velocity
     # If the rotor inertia is unknown, the armature is such that full effort accelerates it to full speed in ``rise``
     # seconds.
     armature = TUNING.rise * effort / speed if effort and speed else 0.0
@@ -225,18 +220,9 @@ def _servo(coordinate: Coordinate, drive: JointSettings) -> ServoSpec:
 
     An unknown kp is initially such that the servo has its full effort at the position error `full_effort_at`.
     """
-    effort = _plausible(coordinate.effort, TUNING.largest_effort)
     # A known kp stays constant; a guessed kp is trained.
-    kp = drive.kp or rounded((effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
-    return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), effort)
-
-
-def _plausible(limit: float | None, largest: float) -> float | None:
-    """Return a limit of the URDF, or None if it is a placeholder: some tools write 0 or 1e16 for an unknown limit.
-
-    largest: largest value that is not regarded as a placeholder.
-    """
-    return limit if limit and limit <= largest else None
+    kp = drive.kp or rounded((coordinate.effort or TUNING.servo_effort) / TUNING.full_effort_at, 3)
+    return ServoSpec(kp, drive.kp is not None, rounded(TUNING.servo_lag * kp, 3), coordinate.effort)
 
 
 def _entries(weights: Weights) -> Entries:
