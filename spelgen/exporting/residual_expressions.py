@@ -23,21 +23,22 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
     has_potential = residuals.potential is not None
+    # {name: (whether the model has this term, number of rows)}
     sizes = {
-        "mass": (entries, entries, 1),
+        "mass": (entries, entries),
         # `rate` and `kinetic` are directional derivatives of the network. Each is computed in one pass through the
         # network; the Jacobian of `mass` would take n passes.
-        "rate": (entries, entries, 1),
-        "kinetic": (entries, n, 1),
-        "energy": (has_potential, 1, 1),
-        "gravity": (has_potential, n, 1),
-        "torque": (residuals.has_torque, n, 1),
-        "torque_energy": (residuals.has_torque, 1, 1),
-        "factor": (factors, factors, 1),
+        "rate": (entries, entries),
+        "kinetic": (entries, n),
+        "energy": (has_potential, 1),
+        "gravity": (has_potential, n),
+        "torque": (residuals.has_torque, n),
+        "torque_energy": (residuals.has_torque, 1),
+        "factor": (factors, factors),
     }
     symbols = {}
-    for name, (exists, *size) in sizes.items():
-        symbols[name] = ca.SX.sym(name, *size) if exists else ca.SX(*size)
+    for name, (exists, rows) in sizes.items():
+        symbols[name] = ca.SX.sym(name, rows) if exists else ca.SX(rows, 1)
     return symbols
 
 
