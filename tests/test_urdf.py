@@ -96,7 +96,7 @@ class TestValues:
         )
         robot = read_urdf(write(LINKS + JOINT + transmission))
         kind = "transmission_interface/SimpleTransmission"
-        assert robot.transmissions == (Transmission("t", kind, (("j", 2.0, 0.1),), (("m", -50.0),), 5),)
+        assert robot.transmissions == (Transmission(kind, (("j", 2.0),), (-50.0,)),)
 
     def test_the_digest_is_that_of_the_bytes(self, write):
         path = write(LINKS + JOINT)

@@ -171,7 +171,7 @@ def _reduction(robot: Robot, name: str) -> float | None:
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
-            reductions = [reduction for _, reduction in transmission.actuators if reduction]
+            reductions = [reduction for reduction in transmission.actuators if reduction]
             # A joint with two actuators has no known reduction: URDF does not specify how they share the load.
             if len(reductions) == 1:
                 return reductions[0]
@@ -216,8 +216,8 @@ def _differential(transmission: Transmission) -> tuple[tuple[float, float], ...]
 
     Source: ROS transmission_interface, DifferentialTransmission. A reduction that is absent or 0 is replaced by 1.
     """
-    first, second = (reduction or 1.0 for _, reduction, _ in transmission.joints)
-    a, b = (reduction or 1.0 for _, reduction in transmission.actuators)
+    first, second = (reduction or 1.0 for _, reduction in transmission.joints)
+    a, b = (reduction or 1.0 for reduction in transmission.actuators)
     return ((first * a, first * b), (second * a, -second * b))
 
 

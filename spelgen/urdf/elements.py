@@ -177,8 +177,7 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
         xml: the element.
         joints: names of all joints of the URDF.
     """
-    name = xml.get("name") or ""
-    where = f"transmission {name!r}"
+    where = f"transmission {xml.get('name', '')!r}"
     # Errors in a transmission become warnings, because most logs contain joint torques, for which no transmission is
     # needed.
     optional = Notes(notes.path)
@@ -189,15 +188,11 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
             message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
             notes.warn(joint.line, "unknown-transmission-joint", where, message)
             continue
-        driven.append(
-            (joint_name, joint.number_in_text("mechanicalReduction"), joint.number_in_text("offset"))
-        )
+        driven.append((joint_name, joint.number_in_text("mechanicalReduction")))
     actuators = []
     for element in xml.findall("actuator"):
-        reduction = Element(optional, element, where).number_in_text("mechanicalReduction")
-        actuators.append((element.get("name") or "", reduction))
+        actuators.append(Element(optional, element, where).number_in_text("mechanicalReduction"))
     notes.add_as_warnings(optional)
     # The type of a transmission is an element in ROS 1, and an attribute in the files of some exporters.
     kind = (xml.findtext("type") or xml.get("type") or "").strip()
-    errors = tuple(optional.errors)
-    return Transmission(name, kind, tuple(driven), tuple(actuators), xml.sourceline, errors)
+    return Transmission(kind, tuple(driven), tuple(actuators), tuple(optional.errors))

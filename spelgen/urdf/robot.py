@@ -84,21 +84,19 @@ class UrdfJoint(NamedTuple):
 class Transmission(NamedTuple):
     """A transmission: actuators that drive joints.
 
-    ``actuators`` are pairs (name, reduction), ``joints`` are tuples (name, reduction, offset [rad, m]); an absent
-    number is None. ``errors`` are the defects of the numbers; a step that needs the transmission raises them.
+    ``joints`` are pairs (name, reduction), ``actuators`` reductions; an absent number is None. ``errors`` are the
+    defects of the numbers; a step that needs the transmission raises them.
     """
 
-    name: str
     type: str
-    joints: tuple[tuple[str, float | None, float | None], ...]
-    actuators: tuple[tuple[str, float | None], ...]
-    line: int
+    joints: tuple[tuple[str, float | None], ...]
+    actuators: tuple[float | None, ...]
     errors: tuple[UrdfError, ...] = ()
 
     @property
     def joint_names(self) -> list[str]:
         """Names of the joints that the transmission drives."""
-        return [name for name, _, _ in self.joints]
+        return [name for name, _ in self.joints]
 
 
 @dataclass(frozen=True)
