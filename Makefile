@@ -70,11 +70,14 @@ golden: $(TOOLS) ## rewrite the golden files after an intended change; read the 
 # If pip finds no CPU build of torch (UV_FIND_LINKS), the packages of NVIDIA are locked, too.
 LOCK = .lock-venv/bin/uv pip compile --quiet --upgrade --generate-hashes --no-annotate --no-header \
     --constraints requirements-torch.txt --no-emit-package torch
+# yourdfpy requires these packages for parts of trimesh that spelgen does not use.
+UNUSED := anyio certifi charset-normalizer colorlog embreex h11 httpcore httpx idna jsonschema jsonschema-specifications \
+    attrs referencing rpds-py manifold3d mapbox-earcut rtree setuptools shapely svg-path vhacdx xxhash
 
 lock: ## update the pinned versions and hashes to the newest that the ranges of pyproject.toml allow
 	$(PYTHON) -m venv .lock-venv
 	.lock-venv/bin/pip install -qq uv
-	printf 'hatchling\neditables\ncasadi\n' | $(LOCK) --extra simulate pyproject.toml - > .lock-venv/demo
+	printf 'hatchling\neditables\ncasadi\n' | $(LOCK) $(UNUSED:%=--no-emit-package %) --extra simulate pyproject.toml - > .lock-venv/demo
 	$(LOCK) --constraints .lock-venv/demo --all-extras pyproject.toml > .lock-venv/tools
 	sed -n '/^#/p' requirements.txt | cat - .lock-venv/demo > .lock-venv/lock && mv .lock-venv/lock requirements.txt
 	sed -n '/^#/p' requirements-tools.txt | cat - .lock-venv/tools > .lock-venv/lock && mv .lock-venv/lock requirements-tools.txt

@@ -120,7 +120,8 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
 
 def test_the_jacobian_is_the_velocity_of_the_tip(arm):
     """The estimator's Jacobian of the tip equals the one of `TipKinematics`."""
-    from spelgen.dynamics.tip import tip_frame, tip_kinematics
+    from spelgen.dynamics.tip import tip_kinematics
+    from spelgen.dynamics.tip_frame import tip_frame
 
     model, log, _ = arm
     robot = arm_of("six_dof")

@@ -32,7 +32,7 @@ def frames(links, q):
 
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda", "ur10e"])
-def test_link_poses_equal_the_poses_of_the_kinematics(robots, robot):
+def test_link_poses_equal_the_poses_of_pytorch_kinematics(robots, robot):
     import torch
 
     arm = load_arm(robots / f"{robot}.urdf")

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.constraint import Constraint
+from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
 from spelgen.errors import ArmError, collect
 from spelgen.settings.settings import Settings
@@ -22,15 +22,6 @@ def arm_dynamics(
     friction.
     """
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
-
-
-def body_constraint(arm: Chain) -> Constraint:
-    """Return the joint positions of all bodies, (bodies,) [rad, m], as a function K q + offset of q, (n,) [rad, m]."""
-    jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
-    for row, body in enumerate(arm.bodies):
-        jacobian[row, body.coordinate] = float(body.multiplier)
-    offset = np.array([body.offset for body in arm.bodies], dtype=float)
-    return Constraint(tuple(body.name for body in arm.bodies), jacobian, offset)
 
 
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:

@@ -18,7 +18,7 @@ from spelgen.dynamics.protocol import known_past, memory_after, sliding_memory
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 if TYPE_CHECKING:
-    from spelgen.dynamics.tip_kinematics import TipKinematics
+    from spelgen.dynamics.tip import TipKinematics
 
 
 class State(NamedTuple):

@@ -22,7 +22,7 @@ from spelgen.spec import ModelSpec
 
 if TYPE_CHECKING:
     from spelgen.dynamics.prepared import PreparedModel
-    from spelgen.dynamics.tip_kinematics import TipKinematics
+    from spelgen.dynamics.tip import TipKinematics
 
 
 class ArmModel(PortHamiltonian):

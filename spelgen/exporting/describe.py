@@ -13,7 +13,7 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip import tip_frame
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
 from spelgen.exporting import description

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.tip import Tip
+from spelgen.dynamics.tip_frame import Tip
 from spelgen.errors import RunError
 
 

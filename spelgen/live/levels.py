@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.dynamics.tip import tip_frame
+from spelgen.dynamics.tip_frame import tip_frame
 from spelgen.emission.assemble import assemble, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError, RunError

@@ -1,5 +1,6 @@
 """Visual and collision shapes of the links of a URDF: sizes of boxes, cylinders and spheres, triangles of meshes."""
 
+import copy
 import io
 import json
 import os
@@ -22,8 +23,6 @@ from spelgen.urdf.document import read_document
 Mesh = tuple[np.ndarray, np.ndarray]
 COUNTS = {"box": 3, "cylinder": 2, "sphere": 1, "mesh": 3}
 """Number of values in the size of each kind of shape."""
-SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",), "mesh": ("scale",)}
-"""Attributes of the elements of URDF that have the size of a shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,27 +115,38 @@ def mesh_file(urdf: Path, name: str) -> Path:
 
 
 def _shape(link: str, element: etree._Element) -> LinkShape:
-    """Return the shape of a <visual> or <collision> element of a link. Raises ValueError if it is invalid.
+    """Return the shape of a <visual> or <collision> element, read by yourdfpy. Raises ValueError if it is invalid.
 
     link: name of the link. The triangles of a mesh are not read here, but later for all meshes by `_meshes`.
     """
-    # SciPy is imported here, because `spelgen inspect` needs no shapes, and the import takes long.
-    from scipy.spatial.transform import Rotation
+    import yourdfpy  # yourdfpy is imported here, because it imports trimesh, which takes long.
 
-    pose, geometry, origin = np.eye(4), element.find("geometry"), element.find("origin")
+    # Each shape is parsed as a URDF of its own, so that an invalid shape does not affect the others.
+    root = etree.Element("robot", name=link)
+    collision = etree.SubElement(etree.SubElement(root, "link", name=link), "collision")
+    collision.extend(copy.deepcopy(child) for child in element if child.tag in ("origin", "geometry"))
     try:
-        (form,) = (child for child in geometry if child.tag in SIZES)
-        texts = [form.get(key, "1" if key == "scale" else "") for key in SIZES[form.tag]]
-        numbers = np.broadcast_to(np.array(" ".join(texts).split(), dtype=float), COUNTS[form.tag])
-        if origin is not None:
-            xyz, rpy = (np.array(origin.get(key, "0 0 0").split(), dtype=float) for key in ("xyz", "rpy"))
-            pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", rpy).as_matrix(), xyz.reshape(3)
-    except (TypeError, ValueError) as error:
+        file = io.BytesIO(etree.tostring(root))
+        model = yourdfpy.URDF.load(file, build_scene_graph=False, load_meshes=False)
+        (shape,) = model.robot.links[0].collisions
+        geometry = shape.geometry
+        pose = np.eye(4) if shape.origin is None else np.asarray(shape.origin)
+        kind, file_name = "mesh", ""
+        if geometry.box is not None:
+            kind, size = "box", geometry.box.size
+        elif geometry.cylinder is not None:
+            kind, size = "cylinder", (geometry.cylinder.radius, geometry.cylinder.length)
+        elif geometry.sphere is not None:
+            kind, size = "sphere", geometry.sphere.radius
+        else:
+            scale, file_name = geometry.mesh.scale, geometry.mesh.filename
+            size = 1.0 if scale is None else scale
+        numbers = np.broadcast_to(np.asarray(size, dtype=float), COUNTS[kind])
+    except Exception as error:  # yourdfpy raises errors of many types, so all are caught.
         raise ValueError("a shape that is not valid") from error
-    kind = form.tag
     if not (np.isfinite(pose).all() and np.isfinite(numbers).all()) or (kind != "mesh" and numbers.min() < 0):
         raise ValueError(f"a {kind} of negative or infinite size or place")
-    return LinkShape(link, kind, tuple(numbers.tolist()), pose, form.get("filename", ""))
+    return LinkShape(link, kind, tuple(numbers.tolist()), pose, file_name or "")
 
 
 def _meshes(urdf: Path, shapes: Sequence[LinkShape], faces: int) -> dict[tuple[str, tuple[float, ...]], Mesh]:

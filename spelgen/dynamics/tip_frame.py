@@ -1,0 +1,51 @@
+"""Frames of the tip link and of all links of an arm, relative to the bodies that carry them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from spelgen.arm.arm import Body, lump_links, make_arm
+from spelgen.arm.chain import choose_chain
+from spelgen.arm.configured_arm import Arm
+
+
+@dataclass(frozen=True, eq=False)
+class Tip:
+    """The tip link, and its frame relative to the body that carries it.
+
+    Attributes:
+        link: name of the tip link.
+        carrier: index of the body that carries the link; -1: the root link.
+        pose: pose of the link in the frame of this body, (4, 4).
+        bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the results of other
+            URDF parsers.
+    """
+
+    link: str
+    carrier: int
+    pose: np.ndarray
+    bodies: tuple[Body, ...]
+
+
+def tip_frame(loaded: Arm) -> Tip:
+    """Return the frame of the tip link of an arm, with the unrounded angles of the URDF."""
+    names = loaded.chain.joint_names
+    link = loaded.tip or loaded.robot.last_link(names)
+    # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.
+    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
+    return Tip(link, *link_poses(loaded)[link], bodies)
+
+
+def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:
+    """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
+
+    The body is an index in `Chain.bodies`, or -1 for the root link. The pose is in the frame of this body. Angles of
+    the URDF are rounded with ``angle_tolerance`` [rad].
+    """
+    chain = choose_chain(loaded.robot, loaded.chain.joint_names, None)
+    poses: dict[str, tuple[int, np.ndarray]] = {}
+    for link, frame in lump_links(loaded.robot, chain, angle_tolerance).frames.items():
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
+        poses[link] = frame.body, pose
+    return poses
