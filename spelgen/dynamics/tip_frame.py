@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spelgen.arm.arm import Body, lump_links, make_arm
+from spelgen.arm.arm import Chain, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
 
@@ -17,14 +17,14 @@ class Tip:
         link: name of the tip link.
         carrier: index of the body that carries the link; -1: the root link.
         pose: pose of the link in the frame of this body, (4, 4).
-        bodies: bodies of the arm with the unrounded angles of the URDF, so that poses are equal to the results of other
-            URDF parsers.
+        chain: the arm with the unrounded angles of the URDF, so that poses are equal to the results of other URDF
+            parsers.
     """
 
     link: str
     carrier: int
     pose: np.ndarray
-    bodies: tuple[Body, ...]
+    chain: Chain
 
 
 def tip_frame(loaded: Arm) -> Tip:
@@ -32,8 +32,8 @@ def tip_frame(loaded: Arm) -> Tip:
     names = loaded.chain.joint_names
     link = loaded.tip or loaded.robot.last_link(names)
     # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.
-    bodies = make_arm(loaded.robot, joints=names, angle_tolerance=0.0).bodies
-    return Tip(link, *link_poses(loaded)[link], bodies)
+    chain = make_arm(loaded.robot, joints=names, angle_tolerance=0.0, gravity=loaded.settings.gravity)
+    return Tip(link, *link_poses(loaded)[link], chain)
 
 
 def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal
 
 import mujoco
@@ -10,20 +9,18 @@ import numpy as np
 import torch
 from lxml import etree
 
-from spelgen.arm.arm import Chain, Coordinate, make_arm
+from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.dynamics.tip_frame import link_poses, tip_frame
-from spelgen.emission.assemble import ArmModel
-from spelgen.emission.build import build
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.description import Servos
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection
 from spelgen.exporting.tuning import TUNING
-from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.urdf.geometry import LinkShape, link_shapes
 
 _SECTIONS = ("worldbody", "equality", "tendon", "actuator", "asset")
@@ -92,7 +89,8 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     q = torch.from_numpy(random["q"])
     # The MJCF file has the angles of the URDF. The reference must have the same angles: the model has angles rounded to
     # multiples of pi/2, which would change M.
-    bodies = _with_exact_angles(projection)
+    bodies = copy.deepcopy(projection.bodies)
+    bodies.chain = body_chain(tip_frame(projection.arm).chain)
     mass = bodies.mass_matrix(q)
     bias = bodies.nonlinear_effects(q, torch.from_numpy(random["qd"]))
     force = torch.from_numpy(torques @ projection.inputs.T) - bias
@@ -100,22 +98,6 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     simulated = _simulated(text, arm, random["q"], random["qd"], controls)
     differences = {name: relative(values, expected[name].numpy()) for name, values in simulated.items()}
     return require_parity(differences, TUNING.mujoco_tolerance, states)
-
-
-def _with_exact_angles(projection: RigidBodyProjection) -> ArmModel:
-    """Return the rigid-body model with the angles of joint origins in the URDF, not rounded to multiples of pi/2.
-
-    The exported MJCF has these angles, too.
-    """
-    arm, bodies = projection.arm, copy.deepcopy(projection.bodies)
-    chain = make_arm(
-        arm.robot, joints=arm.chain.joint_names, angle_tolerance=0.0, gravity=arm.settings.gravity
-    )
-    if chain.bodies != arm.chain.bodies and isinstance(bodies, RigidBodyDynamics):
-        exact = build(replace(arm, chain=chain, angle_tolerance=0.0), "closed-form")
-        assert isinstance(exact, RigidBodyDynamics)
-        bodies.chain = exact.chain
-    return bodies
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:
@@ -178,7 +160,7 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     # joint.
     is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
-    for body, inertia in zip(tip.bodies, projection.inertias, strict=True):
+    for body, inertia in zip(tip.chain.bodies, projection.inertias, strict=True):
         name = projection.arm.robot.joint[body.name].child
         pose = {"pos": body.translation, "quat": quaternion(body.rotation)}
         element = _add(elements[body.parent + 1], "body", name=name, **pose)

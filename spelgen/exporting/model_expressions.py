@@ -98,7 +98,7 @@ def _expressions(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> di
     # The kinetic energy is 1/2 qd . momentum, so that the product with M is computed once.
     momentum = mass @ qd
     potential = rigid_potential + residuals["energy"] + residuals["torque_energy"]
-    pose, jacobian = frame_kinematics(model.tip.bodies, model.tip.carrier, model.tip.pose, q)
+    pose, jacobian = frame_kinematics(model.tip.chain.bodies, model.tip.carrier, model.tip.pose, q)
     outputs = {
         "inverse_dynamics": to_inputs @ force + model.torque_offset,
         "forward_dynamics": _solve(mass, applied + compensation - bias - friction),
