@@ -40,8 +40,15 @@ from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, delayed_commands
 from spelgen.render.report_page import render_report
+from spelgen.structure.servo_rank import servo_rank
 
 TRUTH = Servos(stribeck=(0.0, 0.08), dead_zone=(0.006, 0.0))
+SLIDER = """<joint name="{0}" type="prismatic"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/>
+<limit lower="-1" upper="1" effort="6" velocity="5"/></joint>"""
+LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>
+</inertial></link>"""
+SLIDERS = f"""<robot name="sliders"><link name="base"/>{LINK.format("a")}{LINK.format("b")}
+{SLIDER.format("x", "base", "a", "1 0 0")}{SLIDER.format("y", "a", "b", "0 1 0")}</robot>"""
 
 
 @pytest.fixture(scope="module")
@@ -310,6 +317,26 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
     text = "".join(table.text() for table in posterior.listings)
     assert f"ratios to kp of {posterior.scale_joint}" in " ".join(text.split())
     assert "Delay of the commands" in text
+
+
+@pytest.mark.parametrize(
+    ("robot", "groups", "left"),
+    [
+        ("two_link", ((0, 1),), {("armature", 0)}),
+        (
+            "ur10e",
+            (tuple(range(6)),),
+            {("armature", 0), ("armature", 1)},
+        ),  # the identifiable ratios agree with those for motors of this arm in Khalil and Dombre, ch. 12
+        ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
+    ],
+)
+def test_identifiable_ratios_of_servo_logs(robots, tmp_path, robot, groups, left):
+    path = tmp_path / "sliders.urdf" if robot == "sliders" else robots / f"{robot}.urdf"
+    if robot == "sliders":  # the arm has two prismatic joints at right angles, whose motions do not interact
+        path.write_text(SLIDERS)
+    found = servo_rank(spelgen.load_arm(path).chain)
+    assert found.groups == groups and {*found.open} == left
 
 
 def test_simulated_commands_and_positions(tmp_path):

@@ -17,19 +17,13 @@ from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
 from spelgen.labels import UNITS, counted, joint_ranges, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
+from spelgen.structure.servo_rank import servo_rank
 from spelgen.structure.structure import MassEntry, Structure, derive
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # These modules are not imported at run time, since they import SymPy, which is slow.
     from spelgen.certificate.formulas import Entry as PlaceOfEntry
     from spelgen.certificate.formulas import Formulas
-
-# Logs of positions do not determine the scale of torques: they would be the same if kp, mass and friction of a group of
-# joints were multiplied by a common factor.
-_SERVO_NEEDS = (
-    "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of positions "
-    "determine inertia, weight and friction in ratio to kp only: a known kp, mass or load sets the scale"
-)
 
 
 @dataclass(frozen=True, repr=False)
@@ -139,13 +133,40 @@ class Inspection:
             entries.append({"row": row + 1, "col": column + 1, "kind": kind, "value": value})
         if self.input == "torque":
             return {"entries": entries}
-        return {"input": self.input, "entries": entries}
+        # Logs of torques determine all base parameters. Logs of position servos determine some parameters only in ratio
+        # to kp, or together with the inertial parameters: for such logs the JSON object lists these parameters, too.
+        rank = servo_rank(self.arm)
+        undetermined = [f"{name} of {self.structure.joints[joint]}" for name, joint in rank.open]
+        ratios = list(map(self._names, rank.groups))
+        content = {"input": "position", "kp_in_ratio": ratios, "with_inertia_only": undetermined}
+        return {**content, "entries": entries}
+
+    def _servo_needs(self) -> str:
+        """Return a text for users about the parameters that logs of position servos can and cannot determine."""
+        # Logs of positions do not determine the scale of torques: the logs would be the same if kp, mass and friction
+        # of a group of joints were multiplied by a common factor. One known parameter of the group determines the
+        # factor.
+        rank = servo_rank(self.arm)
+        determined = f"those of {' or of '.join(map(joints_in_ranges, rank.groups))}"
+        if len(rank.groups) == 1:
+            determined = "all"
+        text = (
+            "the springs of position servos: tau = clip(kp (u - q) - kd qd), which store 1/2 kp (q - u)^2; logs of "
+            "positions determine inertia, weight and friction in ratio to kp only: one known kp, mass or load "
+            f"determines {determined}"
+        )
+        undetermined: dict[str, list[int]] = {}
+        for name, joint in rank.open:
+            undetermined.setdefault(name, []).append(joint)
+        for name, joints in undetermined.items():
+            text += f"; {name} of {joints_in_ranges(tuple(joints))} only together with the links' own inertia"
+        return text
 
     def _input_needs(self) -> str:
         """Return a text for users about the input matrix G, the position servos and the passive joints of the model."""
         needs = ["fixed"]
         if self.input == "position":
-            needs = [_SERVO_NEEDS]
+            needs = [self._servo_needs()]
         # G is not the identity if logs contain motor torques, which the model converts to joint torques by G.
         if not self.actuation.direct:
             needs = ["motor torques"]

@@ -102,7 +102,7 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
     Args:
         arm: the arm, with n coordinates.
-        q: positions, (..., n) [rad, m].
+        q: positions, (..., n) [rad, m], real, or complex for complex-step derivatives.
         inertias: ten inertial parameters of each body, numbers or arrays, (...,) each.
 
     Returns:
