@@ -91,6 +91,22 @@ def results(study):
     return {result.preset: result for result in study.results.values()}
 
 
+def losses_of(result):
+    """Return {loss: value} of the model of a simulated arm."""
+    assert all(set(errors) == {"model"} for errors in result.errors.values())
+    return {label: errors["model"] for label, errors in result.errors.items()}
+
+
+def cells(tables):
+    """Return {label of a row: {column: text}} of tables, without the stars."""
+    rows = {}
+    for table in tables:
+        names = [name.strip() for name in table.head[1:]]
+        for label, *texts in table.rows:
+            rows[label] = dict(zip(names, (text.rstrip(" *") for text in texts), strict=True))
+    return rows
+
+
 def trained(job):
     """Return the model of a job with its trained parameters."""
     model = job.build()
@@ -134,15 +150,16 @@ def test_an_estimate_uses_the_time_of_finished_runs_of_the_same_preset(study, ro
 def test_figures_of_a_run_agree_with_one_another(results):
     assert set(results) == set(PRESETS)
     for result in results.values():
-        losses, sizes = result.simulated.losses, result.simulated.sizes
-        loss = losses["prediction loss, 1 s"]
-        assert loss == pytest.approx(losses["position, 1 s"] + losses["velocity, 1 s"])
-        assert result.errors == {"prediction loss, 1 s": {"model": loss}}
+        losses, sizes = losses_of(result), result.sizes
+        assert next(iter(losses)) == "prediction loss, 1 s", "the first loss ranks the models"
+        assert losses["prediction loss, 1 s"] == pytest.approx(
+            losses["position, 1 s"] + losses["velocity, 1 s"]
+        )
         assert sizes["smallest eigenvalue of M / mean"] > 0
     labels = [f"outputs of {matrix}" for matrix in "MDGV"]
-    assert [results["hybrid"].simulated.sizes[label] for label in labels] == [1, 2, 0, 1]
+    assert [results["hybrid"].sizes[label] for label in labels] == [1, 2, 0, 1]
     # phnode has the numbers of outputs and inputs of its paper
-    sizes = results["phnode"].simulated.sizes
+    sizes = results["phnode"].sizes
     assert [sizes[label] for label in labels] == [21, 21, 6, 1]
     assert sizes["inputs of M"] == 4
 
@@ -150,7 +167,7 @@ def test_figures_of_a_run_agree_with_one_another(results):
 def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
     """Losses, recomputed from the logs, are squared errors summed over joints, means over samples and windows."""
     job = next(job for job in study.jobs if job.preset == "hybrid")
-    model, losses = trained(job), results["hybrid"].simulated.losses
+    model, losses = trained(job), losses_of(results["hybrid"])
     for key, role, samples in (
         ("training loss", "train", 5), ("test loss", "test", 5), ("prediction loss, 1 s", "test", 21),
     ):  # fmt: skip
@@ -182,8 +199,8 @@ def test_only_the_run_without_a_result_is_run_again_and_gives_the_same_figures(s
     assert kept.stat().st_mtime_ns == before[1]
     first, second = (json.loads(x) for x in (before[0], lost.read_text()))
     for result in (first, second):
-        del result["simulated"]["sizes"]["training step [ms]"]
-    assert first["simulated"] == second["simulated"]
+        del result["sizes"]["training step [ms]"]
+    assert (first["errors"], first["sizes"]) == (second["errors"], second["sizes"])
 
 
 def test_runs_with_other_steps_are_other_runs(study, robot):
@@ -210,18 +227,18 @@ def test_each_run_has_its_own_seed(robot, monkeypatch, tmp_path):
 
 def test_tables_have_published_figures_and_ratios_to_the_baseline(study, results):
     (section,) = arm_sections(study)
-    rows = {row.label: list(map(row.text, table.columns)) for table in section.tables for row in table.rows}
+    rows = {label: list(row.values()) for label, row in cells(section.tables).items()}
     assert rows["outputs of M"] == ["21", "1"]
-    assert rows["parameters"] == [f"{result.simulated.sizes['parameters']:,}" for result in results.values()]
+    assert rows["parameters"] == [f"{result.sizes['parameters']:,}" for result in results.values()]
     assert rows["published: prediction loss"] == ["0.194", ""]
-    base, ours = (result.simulated.losses["prediction loss, 1 s"] for result in results.values())
+    base, ours = (losses_of(result)["prediction loss, 1 s"] for result in results.values())
     assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     lines = [line for table in section.tables for line in table.text().splitlines()]
     assert all(line == line.rstrip() and len(line) <= 80 for line in lines)
 
 
 def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, results):
-    base, ours = (result.simulated.losses["prediction loss, 1 s"] for result in results.values())
+    base, ours = (losses_of(result)["prediction loss, 1 s"] for result in results.values())
     ratio = f"{base / ours:.3g} times smaller than with phnode" if ours < base else "than with hybrid"
     (section,) = arm_sections(study)
     assert section.sentence.startswith(
@@ -269,11 +286,9 @@ def test_the_page_opens_with_the_sentence_and_the_table(study):
 
 def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
     result = results["hybrid"]
-    losses = dict.fromkeys(result.simulated.losses)
-    figures = replace(result.simulated, losses=losses)
-    broken = replace(result, seed=1, simulated=figures, errors={"prediction loss, 1 s": {"model": None}})
-    table = arm_tables([result, broken, broken], {})[0]
-    assert {row.label: row.text("hybrid") for row in table.rows}["prediction loss, 1 s"] == "-"
+    broken = replace(result, seed=1, errors={label: {"model": None} for label in result.errors})
+    tables = arm_tables([result, broken, broken], {})
+    assert cells(tables)["prediction loss, 1 s"]["hybrid"] == "-"
     assert arm_sentence([result, broken, broken]) == "No model has a finite prediction loss, 1 s."
 
 
@@ -396,11 +411,11 @@ def test_models_on_logs_are_ranked_with_the_baselines(listed_arms, tmp_path):
     study = compared(listed_arms("ab"), tmp_path / "out")
     sections = arm_sections(study)
     assert [section.name for section in sections] == ["a", "b"]
-    (table,) = sections[0].tables
-    assert {"spel", "URDF", "URDF and drives", "velocity stays constant"} <= set(table.columns)
-    assert table.rows[0].label == "relative RMS, 1 s"
-    errors = [table.rows[0].values[name] for name in table.columns]
-    assert errors == sorted(errors)
+    rows = cells(sections[0].tables)
+    assert next(iter(rows)) == "relative RMS, 1 s"
+    errors = rows["relative RMS, 1 s"]
+    assert {"spel", "URDF", "URDF and drives", "velocity stays constant"} <= set(errors)
+    assert list(errors.values()) == sorted(errors.values(), key=float)
     page = write_comparison(study, sections).read_text()
     assert "The preset with the smallest error is spel on 2 arms." in page
 

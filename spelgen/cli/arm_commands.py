@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from spelgen.certificate.verify import Verification
 
 InspectionFormat = Literal["text", "json", "html", "latex", "sympy"]
-IdentificationFormat = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
 FRICTION_HELP = (
     "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
@@ -115,7 +114,7 @@ def identify(
     ),
     friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
     accept: list[str] | None = options.ACCEPT,
-    format: IdentificationFormat | None = options.result_format(),
+    format: options.TextOrJson | None = options.result_format(),
     output: Path | None = options.OUTPUT,
 ) -> None:
     """Identify base parameters and friction by least squares."""
@@ -144,11 +143,5 @@ def identify(
     for diagnostic in result.diagnostics:
         note(diagnostic)
 
-    def page() -> str:
-        # Pages and charts are slow to import, so they are imported only for the format html.
-        from spelgen.render.arm_pages import identification_page
-
-        return identification_page(result, arm)
-
-    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2)}
     options.write_result(format, output, forms)

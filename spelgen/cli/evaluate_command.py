@@ -14,7 +14,7 @@ from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
 from spelgen.evaluation.tables import LIMITS, limit_figures, summary
-from spelgen.files import write_json, write_text
+from spelgen.files import write_json
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
@@ -153,31 +153,22 @@ def estimate(
 
 
 def report(
-    runs: list[Path] = argument("RUN", "Run folders; several are compared on one page."),
-    output: Path | None = output_option(
-        "FILE",
-        "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
-    ),
+    run: Path = options.RUN,
+    output: Path | None = output_option("FILE", "HTML file; default: report.html in the run folder."),
     robot: Path | None = option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm."),
 ) -> None:
-    """Write an HTML page about one run or several."""
-    if robot is not None and len(runs) > 1:
-        raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
-    if output is not None:
-        options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
+    """Write an HTML page about a run."""
+    options.choose_format(None, output, ["html"])
     from spelgen.evaluation.results import Results
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.render.report_page import render_runs, write_report
+    from spelgen.render.report_page import write_report
 
-    if len(runs) > 1:
-        say(f"wrote {write_text(output or 'runs.html', render_runs(runs))}")
-        return
-    path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
+    path, folder = write_report(run, output, robot), RunFolder(run)
     if folder.evaluation.exists():
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
         if listing is not None:
             say(listing.text() + "\n")
-    say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
+    say(f"wrote {path}: the report, for any browser")
 
 
 def compare(

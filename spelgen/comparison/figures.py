@@ -56,28 +56,17 @@ NETWORKS = {"mass": "M", "friction": "D", "input_network": "G", "potential": "V"
 """{part of the name of a network: the matrix or the potential energy that the network computes}."""
 
 
-@dataclass(frozen=True)
-class SimulatedFigures:
-    """Results of one model of a simulated arm, for the comparison with other models.
-
-    Attributes:
-        losses: {row of a table: squared prediction error (see `prediction_loss`), or relative error of M
-            (`mass_error`)}.
-        sizes: {row of a table: any other figure}: numbers of network outputs, inputs and parameters, duration of a
-            training step [ms], relative smallest eigenvalue of M, and relative rise of energy (see
-            `evaluation.rollout`).
-    """
-
-    losses: Figures
-    sizes: Figures
-
-
 def simulated_figures(
     fit: Fit, training: Sequence[Trajectory], testing: Sequence[Trajectory], truth: Path
-) -> SimulatedFigures:
-    """Return the results of a model of a simulated arm, whose true parameters are in the URDF ``truth``.
+) -> tuple[Figures, Figures]:
+    """Return the losses and the sizes of a model of a simulated arm, for the comparison with other models.
 
-    training: logs for the training loss and the duration of a step. testing: logs for all other results.
+    Losses are squared prediction errors (see `prediction_loss`), and the relative error of M (`mass_error`). Sizes are
+    the numbers of network outputs, inputs and parameters, the duration of a training step [ms], the relative smallest
+    eigenvalue of M, and the relative rise of energy (see `evaluation.rollout`).
+
+    truth: URDF with the true parameters of the arm. training: logs for the training loss and the duration of a step.
+    testing: logs for all other results.
     """
     model, substeps = fit.model, int(fit.substeps)
     decimation = fit.preprocessing.decimation or 1
@@ -103,7 +92,7 @@ def simulated_figures(
     with torch.no_grad():
         rows["smallest eigenvalue of M / mean"] = smallest_eigenvalue(model, low, high)
         rows["rise of energy, no input"] = energy_rise(model, far)
-    return SimulatedFigures(losses, rows)
+    return losses, rows
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:

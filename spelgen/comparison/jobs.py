@@ -10,7 +10,7 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 
 from spelgen.comparison.arms import ArmInputs
-from spelgen.comparison.figures import SimulatedFigures, simulated_figures
+from spelgen.comparison.figures import Figures, simulated_figures
 from spelgen.design import load_design
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
@@ -40,7 +40,7 @@ class RunResult:
 
     key: hash of all inputs of the run, see `Job.key`. seconds: duration of the training [s]. parameters: number of
     trained parameters that the model uses. errors: {measure: {predictor: error}}; the first measure ranks the models.
-    simulated: further figures for a simulated arm, whose true parameters are known.
+    sizes: further figures of the model of a simulated arm, see `simulated_figures`; {} for logs of the user.
     """
 
     key: str
@@ -51,7 +51,7 @@ class RunResult:
     seconds: float
     parameters: int
     errors: Errors
-    simulated: SimulatedFigures | None
+    sizes: Figures
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -181,18 +181,18 @@ def run_job(job: Job) -> RunResult:
     seconds = time.monotonic() - start
     # Gradients are switched off for the evaluation to save memory.
     model.requires_grad_(False).eval()
-    simulated = None
+    sizes: Figures = {}
     if job.inputs.truth is None:
         results = evaluate(trained, testing)
         write_json(run.evaluation, results.to_dict())
         errors = _errors(results)
     else:
-        simulated = simulated_figures(trained, training, testing, job.inputs.truth)
-        # Models of a simulated arm are ranked by the first loss, the prediction loss over 1 s, so no other is returned.
-        errors = {label: {MODEL: loss} for label, loss in list(simulated.losses.items())[:1]}
+        losses, sizes = simulated_figures(trained, training, testing, job.inputs.truth)
+        # The first loss, the prediction loss over 1 s, ranks the models of a simulated arm.
+        errors = {label: {MODEL: loss} for label, loss in losses.items()}
     result = RunResult(
         key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
-        parameters=trained.parameters, errors=errors, simulated=simulated,
+        parameters=trained.parameters, errors=errors, sizes=sizes,
     )  # fmt: skip
     write_json(job.folder / "result.json", record(result))
     return result

@@ -119,7 +119,7 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
     figures = list(map(record, results.values()))
-    write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
+    write_json(study.folder / "comparison.json", {"schema": 2, "failures": failures, "results": figures})
     return finished
 
 
