@@ -398,7 +398,7 @@ def test_finished_runs_are_kept_and_changed_runs_are_run_again(listed_arms, tmp_
     again = compared(listed_arms("a"), folder)
     assert again.results == first.results
     stored = json.loads((folder / "comparison.json").read_text())["results"]
-    assert [x["key"] for x in stored] == [x.key for x in first.results.values()]
+    assert [x["parameters"] for x in stored] == [x.parameters for x in first.results.values()]
     assert files == {x: x.stat().st_mtime_ns for x in folder.glob("runs/*/*/result.json")}
     more = compared(listed_arms("a", seeds=2), folder)
     assert [x.seed for x in more.results.values()] == [0, 1]

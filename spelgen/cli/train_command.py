@@ -14,7 +14,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_options, read_assignments
+from spelgen.cli.train_settings import TIME_LIMIT, UsageError, fit_options, read_assignments, selected
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
@@ -55,14 +55,18 @@ def train(
     """
     start_time = time.monotonic()  # The limit `max_minutes` includes reading the logs.
     # Keys of --set are checked before any file is read, so that a misspelt key costs no time.
-    request = Request(objective, read_assignments(assignments or []))
+    values = read_assignments(assignments or [])
     if source is not None:
         if module is not None:
             # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
         robot = robot or _urdf_of_run(source)
-        request = _warm_start(request)
-    elif "adapt" in request.values:
+        objective = objective or "torque"
+        if objective == "torque":
+            values.setdefault("adapt", "load")
+        elif "adapt" in values:
+            raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
+    elif "adapt" in values:
         raise UsageError("--set adapt: belongs to --from")
     elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
@@ -85,9 +89,9 @@ def train(
     from spelgen.fitting.train import train as train_files
 
     # The options device and threads are not recorded in the run, because they describe the machine and not the result.
-    machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
+    machine = {"progress": True} | selected(values, ("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
-    config = fit_options(request, None if resume else settings)
+    config = fit_options(objective, values, None if resume else settings, warm_start=source is not None)
     of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
     try:
         fit = train_files(
@@ -97,7 +101,7 @@ def train(
             config,
             urdf=urdf,
             source=source,
-            of_logs=of_logs | request.values_of(OF_LOGS),
+            of_logs=of_logs | selected(values, OF_LOGS),
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
@@ -105,7 +109,10 @@ def train(
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
-    _report(fit, request, folder, format, _payload(fit, source))
+    payload = _payload(fit, source)
+    if TIME_LIMIT in values and TIME_LIMIT not in type(fit.config).model_fields:
+        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {fit.config.objective}")
+    _report(fit, folder, format, payload)
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
@@ -141,11 +148,8 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     return carried_payload(original, fit.logs) if is_load else None
 
 
-def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payload | None) -> None:
+def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> None:
     """Print the outcome of the fit; exit with 130 if it was interrupted. payload: payload in the logs, or None."""
-    if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
-        objective = fit.config.objective
-        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
     posterior = fit.posterior if fit.checkpoint.posterior else None
     record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
     record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
@@ -192,20 +196,6 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         reason = ": all epochs are run" if fit.epochs >= config.epochs else ": no way further down"
     end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
     return end, f"best {result}, at epoch {fit.best_epoch}"
-
-
-def _warm_start(request: Request) -> Request:
-    """Return the request of a fit that starts from a fitted model, with default values for keys that are not set.
-
-    The default objective is "torque" and, for this objective only, the default of `adapt` is "load". Raises UsageError
-    if `adapt` is set with another objective.
-    """
-    objective, values = request.objective or "torque", dict(request.values)
-    if objective == "torque":
-        values.setdefault("adapt", "load")
-    elif "adapt" in request.values:
-        raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
-    return Request(objective, values, warm_start=True)
 
 
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:

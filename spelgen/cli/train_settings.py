@@ -6,7 +6,6 @@ A value given by `--set KEY=VALUE` takes precedence over the value in the settin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -45,23 +44,6 @@ class Assignments(TrainingSettings):
     progress: bool = True
 
 
-@dataclass(frozen=True)
-class Request:
-    """The options of the command `train`.
-
-    objective: value of `--objective`; None: the logs determine the objective. values: {key of `--set`: value}.
-    warm_start: whether the fit starts from the parameters of an earlier run.
-    """
-
-    objective: str | None
-    values: Mapping[str, Any]
-    warm_start: bool = False
-
-    def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return {key: value} for each of `keys` that `--set` has set."""
-        return {name: self.values[name] for name in keys if name in self.values}
-
-
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     """Return {key: checked value} for texts `KEY=VALUE`.
 
@@ -95,19 +77,34 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     return {name: values[name] for name in texts}
 
 
-def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptions:
-    """Return the options of a fit; the command line takes precedence over the robot's settings, `defaults`.
+def selected(values: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """Return {key: value} for each of `keys` that is in `values`, the values of `--set`."""
+    return {name: values[name] for name in keys if name in values}
 
-    defaults: None for a resumed run, whose record has all options.
+
+def fit_options(
+    objective: str | None,
+    values: Mapping[str, Any],
+    defaults: TrainingSettings | None,
+    *,
+    warm_start: bool,
+) -> FitOptions:
+    """Return the options of a fit; the command line takes precedence over the robot's settings.
+
+    Args:
+        objective: value of `--objective`; None: the settings or the logs determine the objective.
+        values: {key of `--set`: value}.
+        defaults: the robot's settings; None for a resumed run, whose record has all options.
+        warm_start: whether the fit starts from the parameters of an earlier run.
     """
     from spelgen.fitting.fit import FitOptions
 
-    options = request.values_of(OWNERS)
+    options = selected(values, OWNERS)
     if defaults is None:
-        return FitOptions(request.objective, options)
+        return FitOptions(objective, options)
     settings = dict(defaults.options)
-    objective = request.objective or defaults.objective
-    if request.warm_start and objective == "rollout":
+    objective = objective or defaults.objective
+    if warm_start and objective == "rollout":
         # In a warm start no torque fit precedes the rollout fit: a torque fit would discard the source run's
         # parameters.
         settings["torque_first"] = False
