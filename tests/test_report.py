@@ -87,6 +87,12 @@ def write_model(folder: Path, model) -> None:
     torch.save(model.state_dict(), folder / "model.pt")
 
 
+def write_progress(folder: Path, best_epoch: int) -> None:
+    """Write the file checkpoint.pt of a run of 30 epochs."""
+    progress = {"epoch": 30, "step": 600, "best_loss": 0.3, "seconds": 75.0, "substeps": 4}
+    torch.save({**progress, "best_epoch": best_epoch, "best_weights": {}}, folder / "checkpoint.pt")
+
+
 @pytest.fixture
 def run(robots, tmp_path) -> Path:
     """Return a run folder with all files of a run, written without a training."""
@@ -110,8 +116,7 @@ def run(robots, tmp_path) -> Path:
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "evaluation.json").write_text(json.dumps(EVALUATION))
-    progress = {"epoch": 30, "step": 600, "best_epoch": 30, "best_loss": 0.3, "seconds": 75.0, "substeps": 4}
-    torch.save({**progress, "best_weights": {}}, folder / "checkpoint.pt")
+    write_progress(folder, best_epoch=30)
     return folder
 
 
@@ -176,6 +181,7 @@ def test_long_trainings_are_reported_in_minutes_and_hours(run):
 
 
 def test_a_run_without_improvement_is_reported(run):
+    write_progress(run, best_epoch=0)
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[0]) | {"best": 0.001}
     (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
     assert "the model of the start: no epoch was better, validation loss 0.001" in render_report(run)

@@ -1,6 +1,6 @@
 """Charts of the report on a run: training losses, curves of the evaluation, and ranges of motion of the logs."""
 
-from collections import defaultdict
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,38 +10,16 @@ from spelgen.evaluation.plain import array
 from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
-from spelgen.labels import (
-    CONSTANT_VELOCITY,
-    LEAST_SQUARES,
-    LEAST_SQUARES_WITH_MEMORY,
-    MODEL,
-    UNITS,
-    URDF,
-    URDF_WITH_DRIVES,
-    NamedJoint,
-    entry_name,
-    named_joints,
-    observed,
-    thousandths,
-)
+from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, NamedJoint, entry_name, named_joints, thousandths
 from spelgen.listing import number
 from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
 from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.spec import ModelSpec
 
-STYLES = defaultdict(
-    lambda: "c6",
-    {
-        MODEL: "model",
-        URDF: "urdf",
-        URDF_WITH_DRIVES: "drives",
-        LEAST_SQUARES: "squares",
-        LEAST_SQUARES_WITH_MEMORY: "remembering",
-        CONSTANT_VELOCITY: "hold",
-        observed(MODEL): "going-on",
-    },
-)
-"""Predictor -> CSS class of its lines."""
+
+def style(predictor: str) -> str:
+    """Return the CSS class of the lines of a predictor: its name in lower case, with hyphens."""
+    return re.sub(r"\W+", "-", predictor.lower())
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
@@ -83,11 +61,11 @@ def growth_chart(growth: Growth) -> Chart:
     """Return the chart of the relative error over the prediction horizon; growth: errors of all predictors."""
     marks: list[Mark] = []
     for name, error in growth.relative.items():
-        marks.append(Line(name, growth.seconds, error.median, STYLES[name]))
+        marks.append(Line(name, growth.seconds, error.median, style(name)))
         # Only the model and least squares have bands of quantiles, since bands of all predictors would overlap.
         if name in (MODEL, LEAST_SQUARES):
             label = f"{name}, 10 to 90 %"
-            marks.append(Band(label, growth.seconds, error.low, error.high, STYLES[name]))
+            marks.append(Band(label, growth.seconds, error.low, error.high, style(name)))
     return line_chart(
         marks, "Relative error: error by horizon", "horizon [s]", "error / motion", log=True, log_x=True,
         limits=_error_limits(growth), width=520, height=260,
@@ -148,7 +126,7 @@ def mass_panels(trace: MassTrace, joint_types: Sequence[str]) -> list[Panel]:
     # An entry of M whose magnitude never exceeds `zero` is zero except for rounding errors, and gets no chart.
     zero = TUNING.zero * max(np.nanmax(np.abs(entries)) for entries in trace.by.values())
     for index, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
-        lines = [Line(name, trace.t, entries[index], STYLES[name]) for name, entries in trace.by.items()]
+        lines = [Line(name, trace.t, entries[index], style(name)) for name, entries in trace.by.items()]
         if np.nanmax(np.abs([line.heights for line in lines])) > zero:
             name = entry_name(i, j)
             # An entry between a revolute and a prismatic joint has the unit of a first moment.
@@ -220,7 +198,7 @@ def friction_panels(
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
-            marks.append(Line(name, friction.qd[k], curves[k], STYLES[name]))
+            marks.append(Line(name, friction.qd[k], curves[k], style(name)))
         limits, axis = _friction_limits(np.concatenate(values), curve), joint.axis("torque", "friction")
         title = f"Friction of {joint.name}"
         chart = line_chart(marks, title, joint.axis("velocity"), axis, limits=limits, height=220)

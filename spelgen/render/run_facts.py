@@ -9,7 +9,7 @@ from spelgen.errors import shortened
 from spelgen.evaluation.results import Results
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.run_folder import RunFolder
-from spelgen.fitting.run_record import Content, Record
+from spelgen.fitting.run_record import Record
 from spelgen.fitting.torque.report import terms_in_use
 from spelgen.labels import MODEL, counted, share
 from spelgen.listing import duration, number
@@ -37,16 +37,6 @@ def outlier_note(results: Results) -> str:
     return f"{text}{share(rms, 'the motion')}: few starts dominate it."
 
 
-def best_epoch(metrics: Sequence[Content]) -> int:
-    """Return the epoch of the best model (validation loss); 0 if no epoch was better than the initial model.
-
-    metrics: records of the training, one per epoch.
-    """
-    # "best" of the last record is the smallest validation loss of the fit, including the loss of the initial model.
-    best = metrics[-1]["best"]
-    return next((epoch["epoch"] for epoch in metrics if epoch["validation"] == best), 0)
-
-
 def training_facts(fit: Fit) -> dict[str, str]:
     """Return {label: text} about the logs, the preprocessing and the duration of a fit."""
     record, preprocessing = fit.record, fit.preprocessing
@@ -61,8 +51,8 @@ def training_facts(fit: Fit) -> dict[str, str]:
         facts["residual terms"] = "; ".join(terms_in_use(fit.model)) or "none selected"
     # Only fits with epochs have metrics; fits to torques have none.
     if fit.history:
-        last, best = fit.history[-1], best_epoch(fit.history)
-        origin = f"epoch {best}" if best else "the start: no epoch was better"
+        last = fit.history[-1]
+        origin = f"epoch {fit.best_epoch}" if fit.best_epoch else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":
