@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
-from spelgen.cli.options import flag, option
+from spelgen.cli.console import FAILED, answer, deliver, note, refuse_warnings
+from spelgen.cli.options import flag, option, output_option
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
@@ -31,8 +31,10 @@ def inspect(
     assume: Assume = options.ASSUMPTION,
     formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
     entry: str | None = options.ENTRY,
-    format: InspectionFormat | None = options.result_format(),
-    output: Path | None = options.OUTPUT,
+    format: InspectionFormat | None = option(
+        "", "Format of the result; default: that of the suffix of -o, else text."
+    ),
+    output: Path | None = output_option("FILE", "Write the result to a file."),
     strict: bool = options.STRICT,
     verify: bool = flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples."),
 ) -> None:
@@ -114,8 +116,7 @@ def identify(
     ),
     friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
     accept: list[str] | None = options.ACCEPT,
-    format: options.TextOrJson | None = options.result_format(),
-    output: Path | None = options.OUTPUT,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
@@ -143,5 +144,4 @@ def identify(
     for diagnostic in result.diagnostics:
         note(diagnostic)
 
-    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2)}
-    options.write_result(format, output, forms)
+    answer(format, result.to_dict(), result.text())
