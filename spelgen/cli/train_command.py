@@ -60,7 +60,6 @@ def train(
         if module is not None:
             # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
-        robot = robot or _urdf_of_run(source)
         objective = objective or "torque"
         if objective == "torque":
             values.setdefault("adapt", "load")
@@ -73,9 +72,9 @@ def train(
     paths = options.logs(data, extra_logs)
     # With --resume the first argument may be the run folder, and `folder` is then this argument.
     folder = output or _default_folder(module, source, resume=resume)
-    spec, recorded = _specification(module, folder if resume else source)
+    spec, recorded, found = _specification(module, folder if resume else source)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
-    urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
+    urdf = None if resume else robot or found
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
@@ -213,28 +212,21 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     return folder
 
 
-def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None]:
-    """Return the specification of the model, and the recorded mapping of the logs.
+def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None, Path | None]:
+    """Return the specification of the model, the recorded mapping of the logs, and the URDF if it is known.
 
-    Both are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, and
-    there is no mapping.
+    They are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, the
+    URDF is the file in the folder of the module, and there is no mapping.
     """
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     if run is None and module is not None:
-        return read_spec(module), None
+        spec = read_spec(module)
+        return spec, None, _unchanged_urdf(module, spec)
     folder = RunFolder(run or Path())
-    return folder.read_spec(), folder.read_record().mapping
-
-
-def _urdf_of_run(folder: Path) -> Path | None:
-    """Return the URDF in a run folder, if there is one. Raises RunError if the folder is not a run."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    run = RunFolder(folder)
-    run.read_record()
-    return run.urdf if run.urdf.exists() else None
+    record, urdf = folder.read_record(), folder.urdf
+    return folder.read_spec(), record.mapping, urdf if urdf.exists() else None
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:
