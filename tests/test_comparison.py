@@ -24,11 +24,8 @@ from spelgen.comparison.arms import ComparedArm, Comparison, arm_inputs, load_co
 from spelgen.comparison.figures import spread_windows
 from spelgen.comparison.study import prepare_study, run_study
 from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
-from spelgen.emission.build import build
 from spelgen.errors import RunError, SettingsError, SpelgenError
-from spelgen.evaluation import rollout
 from spelgen.evaluation.rollout import mass_error, true_mass
-from spelgen.evaluation.tuning import EvaluationTuning
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.rollout import roll_out
 from spelgen.listing import duration
@@ -45,13 +42,6 @@ QUICK = {"presets": ["spel"], "width": 4, "depth": 1, "training": {"epochs": 2, 
 
 def silent(text):
     """Print nothing: the output of comparisons is not tested."""
-
-
-@pytest.fixture(scope="module")
-def quick():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "TUNING", EvaluationTuning(sampled_positions=100, free_steps=50))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +70,7 @@ def notes():
 
 
 @pytest.fixture(scope="module")
-def study(robot, quick, notes, tmp_path_factory):
+def study(robot, notes, tmp_path_factory):
     prepared = prepare_study(simulated(robot), tmp_path_factory.mktemp("study"))
     notes.append(prepared.announcement(1))
     return run_study(prepared, notes.append)
@@ -150,12 +140,11 @@ def test_an_estimate_uses_the_time_of_finished_runs_of_the_same_preset(study, ro
 def test_figures_of_a_run_agree_with_one_another(results):
     assert set(results) == set(PRESETS)
     for result in results.values():
-        losses, sizes = losses_of(result), result.sizes
+        losses = losses_of(result)
         assert next(iter(losses)) == "prediction loss, 1 s", "the first loss ranks the models"
         assert losses["prediction loss, 1 s"] == pytest.approx(
             losses["position, 1 s"] + losses["velocity, 1 s"]
         )
-        assert sizes["smallest eigenvalue of M / mean"] > 0
     labels = [f"outputs of {matrix}" for matrix in "MDGV"]
     assert [results["hybrid"].sizes[label] for label in labels] == [1, 2, 0, 1]
     # phnode has the numbers of outputs and inputs of its paper
@@ -225,14 +214,12 @@ def test_each_run_has_its_own_seed(robot, monkeypatch, tmp_path):
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-def test_tables_have_published_figures_and_ratios_to_the_baseline(study, results):
+def test_tables_have_published_figures(study, results):
     (section,) = arm_sections(study)
     rows = {label: list(row.values()) for label, row in cells(section.tables).items()}
     assert rows["outputs of M"] == ["21", "1"]
     assert rows["parameters"] == [f"{result.sizes['parameters']:,}" for result in results.values()]
     assert rows["published: prediction loss"] == ["0.194", ""]
-    base, ours = (losses_of(result)["prediction loss, 1 s"] for result in results.values())
-    assert rows["phnode's prediction loss / this"] == ["1", f"{base / ours:.3g}"]
     lines = [line for table in section.tables for line in table.text().splitlines()]
     assert all(line == line.rstrip() and len(line) <= 80 for line in lines)
 
@@ -304,24 +291,6 @@ def test_decimated_windows_start_at_a_multiple_of_the_decimation():
     windows = spread_windows([log], 5, 4)
     assert not (windows.q % 4).any()
     assert torch.equal(windows.tau, windows.q[:, :-1] / 4)
-
-
-def test_invariants_show_a_model_that_gains_energy_or_has_an_indefinite_mass_matrix(robots, quick):
-    model = build(robots / "two_link.urdf", "hybrid", width=8)
-    logs = simulate(load_arm(robots / "two_link.urdf"), trajectories=4).test
-    still = spread_windows(logs, 21, 1)
-    windows = replace(still, qd=0.5 + still.qd)
-    low, high = (torch.full((2,), bound, dtype=torch.float64) for bound in (-math.pi, math.pi))
-    with torch.no_grad():
-        assert rollout.energy_rise(model, windows) <= 1e-12
-        assert rollout.smallest_eigenvalue(model, low, high) > 1e-12
-    # negative friction, which adds energy
-    model.friction_torque = lambda pose, qd, *state: -5.0 * qd
-    with torch.no_grad():
-        assert rollout.energy_rise(model, windows) > 1e-3
-    model.mass_matrix = lambda q: torch.diag_embed(torch.cat([q.cos()[..., :1], 1 + 0 * q[..., :1]], dim=-1))
-    with torch.no_grad():
-        assert rollout.smallest_eigenvalue(model, low, high) < -1
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Results of a model on the simulated protocol of Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 
-The results are losses, numbers of parameters and outputs, invariants of the motion, and the error of M.
+The results are losses, numbers of parameters and outputs, and the error of M.
 """
 
 import statistics
@@ -12,11 +12,10 @@ from typing import cast
 
 import torch
 
-from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.parameters import parameter_count
 from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.plain import finite
-from spelgen.evaluation.rollout import energy_rise, mass_error, smallest_eigenvalue, true_mass
+from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.fitting.fitted import Fit
 from spelgen.fitting.rollout import loss_scales, position_difference, roll_out, rollout_loss
 from spelgen.logs.trajectory import Trajectory
@@ -62,8 +61,7 @@ def simulated_figures(
     """Return the losses and the sizes of a model of a simulated arm, for the comparison with other models.
 
     Losses are squared prediction errors (see `prediction_loss`), and the relative error of M (`mass_error`). Sizes are
-    the numbers of network outputs, inputs and parameters, the duration of a training step [ms], the relative smallest
-    eigenvalue of M, and the relative rise of energy (see `evaluation.rollout`).
+    the numbers of network outputs, inputs and parameters, and the duration of a training step [ms].
 
     truth: URDF with the true parameters of the arm. training: logs for the training loss and the duration of a step.
     testing: logs for all other results.
@@ -73,26 +71,19 @@ def simulated_figures(
     config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
-    # `low` and `high` are the joint limits, between which M must be positive definite. The error of M is computed only
-    # at logged positions.
-    joints = fit.record.joints
-    ranges = [x.working_range for x in load_arm(truth, joints).chain.coordinates]
-    low, high = torch.tensor(ranges, dtype=torch.float64).T
     visited = far.q[:, 0]
     loss, position, velocity = prediction_loss(model, far, substeps)
     losses = {"prediction loss, 1 s": loss, "velocity, 1 s": velocity, "position, 1 s": position}
-    losses["M, relative error"] = mass_error(model.mass_matrix(visited), true_mass(truth, visited, joints))
+    losses["M, relative error"] = mass_error(
+        model.mass_matrix(visited), true_mass(truth, visited, fit.record.joints)
+    )
     # The training loss is the loss that the fit minimises. The windows of training loss and test loss are therefore as
     # long as the windows of the fit; only the prediction loss is over 1 s.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]
-    rows = sizes(model)
-    rows["training step [ms]"] = 1e3 * step_seconds(model, training, config, decimation)
-    with torch.no_grad():
-        rows["smallest eigenvalue of M / mean"] = smallest_eigenvalue(model, low, high)
-        rows["rise of energy, no input"] = energy_rise(model, far)
-    return losses, rows
+    step = {"training step [ms]": 1e3 * step_seconds(model, training, config, decimation)}
+    return losses, sizes(model) | step
 
 
 def step_seconds(model: ArmModel, logs: Sequence[Trajectory], config: Rollout, decimation: int) -> float:

@@ -13,15 +13,9 @@ from spelgen.labels import MODEL, counted, listed
 from spelgen.listing import Listing, number
 from spelgen.settings.training import PublishedFigures
 
-BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
 """Preset -> results of the runs of an arm with all seeds and splits."""
 Numbers = dict[str, float | None]
-RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""{label of a row of losses: name of this loss in the label of the row below}.
-
-The row below contains the loss of the baseline (`BASELINE`) divided by the loss of each model.
-"""
 
 
 @dataclass(frozen=True)
@@ -141,43 +135,29 @@ def _by_error(medians: Numbers) -> Numbers:
 
 
 def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Listing:
-    """Return a table of the losses and the error of M of a simulated arm, ratios to `BASELINE`, published figures."""
-    losses: dict[str, Numbers] = {}
-    others: list[str] = []
-    for label in next(iter(runs.values()))[0].errors:
-        losses[label] = medians = _medians(runs, label)
-        baseline = medians.get(BASELINE)
-        # A row with the loss of the preset `BASELINE` divided by each preset's loss is added, because absolute losses
-        # depend on units and on the sample rate.
-        if baseline is not None and label in RATIO:
-            others.append(f"{BASELINE}'s {RATIO[label]} / this")
-            losses[others[-1]] = {
-                name: baseline / median if median else None for name, median in medians.items()
-            }
+    """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
+    rows = {label: _medians(runs, label) for label in next(iter(runs.values()))[0].errors}
+    losses = list(rows)
     # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
     records = {name: published[name].model_dump(exclude_none=True) for name in runs if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
         if values:
-            others.append(f"published: {field.replace('_', ' ')}")
-            losses[others[-1]] = values
+            rows[f"published: {field.replace('_', ' ')}"] = values
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the relative error of M; "
         "median over seeds; below, published figures"
     )
-    return table(title, losses, unranked=others)
+    return table(title, rows, unranked=rows.keys() - losses)
 
 
 def _sizes(runs: Runs) -> Listing:
-    """Return a table of the sizes of models of a simulated arm, the time of a training step, and invariants."""
+    """Return a table of the sizes of the models of a simulated arm, and of the time of a training step."""
     rows = {}
     for label in next(iter(runs.values()))[0].sizes:
-        worst = max if label == "rise of energy, no input" else min
-        rows[label] = {name: _combined([run.sizes[label] for run in x], worst) for name, x in runs.items()}
-    title = (
-        "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
-    )
-    return table(title, rows, unranked=rows.keys() - {"parameters", "training step [ms]"})
+        rows[label] = {name: _combined([run.sizes[label] for run in x], min) for name, x in runs.items()}
+    ranked = ("parameters", "training step [ms]")
+    return table("Sizes, and time of a training step", rows, unranked=rows.keys() - ranked)
 
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
