@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, answer, deliver, note, refuse_warnings
+from spelgen.cli.console import FAILED, answer, note, refuse_warnings, say
 from spelgen.cli.options import flag, option, output_option
+from spelgen.files import write_text
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def inspect(
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
     # error.
-    deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
+    text = _text(chosen, inspection, closed, proof, arm.robot.path)
+    say(text.removesuffix("\n") if output is None else f"wrote {write_text(output, text)}")
     if strict:
         refuse_warnings(
             f"{chosen_arm.robot}: ", [x.severity for x in inspection.diagnostics].count("warning")

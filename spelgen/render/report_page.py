@@ -78,7 +78,6 @@ def _rendered(fit: Fit, run: RunFolder, robot: Path | str | None) -> str:
         arm=picture,
         cells=cells,
         training=run_facts.training_facts(fit),
-        settings=run_facts.settings(record),
         losses=losses,
         spec=spec,
         about=description(spec),

@@ -65,12 +65,6 @@ def training_facts(fit: Fit) -> dict[str, str]:
     return facts
 
 
-def settings(record: Record) -> dict[str, str]:
-    """Return {name: value} of the options of a fit, both as text for the page about a run."""
-    options = record.options.items()
-    return {key.replace("_", " "): str(value) for key, value in options if value is not None}
-
-
 def _names(trajectories: Sequence[str]) -> str:
     count = counted(len(trajectories), "trajectory")
     return f"{count}: {shortened(trajectories, 5)}" if trajectories else "none"
