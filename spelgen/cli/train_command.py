@@ -14,7 +14,14 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import TIME_LIMIT, UsageError, fit_options, read_assignments, selected
+from spelgen.cli.train_settings import (
+    TIME_LIMIT,
+    UsageError,
+    adaptation,
+    fit_options,
+    read_assignments,
+    selected,
+)
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
@@ -60,11 +67,7 @@ def train(
         if module is not None:
             # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
-        objective = objective or "torque"
-        if objective == "torque":
-            values.setdefault("adapt", "load")
-        elif "adapt" in values:
-            raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
+        objective = adaptation(objective, values)
     elif "adapt" in values:
         raise UsageError("--set adapt: belongs to --from")
     elif module is None:
@@ -91,7 +94,6 @@ def train(
     machine = {"progress": True} | selected(values, ("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
     config = fit_options(objective, values, None if resume else settings, warm_start=source is not None)
-    of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
     try:
         fit = train_files(
             module,
@@ -100,7 +102,7 @@ def train(
             config,
             urdf=urdf,
             source=source,
-            of_logs=of_logs | selected(values, OF_LOGS),
+            of_logs=settings.model_dump(include=OF_LOGS, exclude_unset=True) | selected(values, OF_LOGS),
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
@@ -108,10 +110,9 @@ def train(
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
-    payload = _payload(fit, source)
     if TIME_LIMIT in values and TIME_LIMIT not in type(fit.config).model_fields:
         note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {fit.config.objective}")
-    _report(fit, folder, format, payload)
+    _report(fit, folder, format, _payload(fit, source))
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:

@@ -82,6 +82,20 @@ def selected(values: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return {name: values[name] for name in keys if name in values}
 
 
+def adaptation(objective: str | None, values: dict[str, Any]) -> str:
+    """Return the objective of a fit that starts from a fitted model, by default "torque".
+
+    For this objective only, the default of `adapt` in `values`, the values of `--set`, is set to "load". Raises
+    UsageError if `adapt` is set with another objective.
+    """
+    objective = objective or "torque"
+    if objective == "torque":
+        values.setdefault("adapt", "load")
+    elif "adapt" in values:
+        raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
+    return objective
+
+
 def fit_options(
     objective: str | None,
     values: Mapping[str, Any],
