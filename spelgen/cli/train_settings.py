@@ -12,7 +12,7 @@ import typer
 from pydantic import ValidationError
 
 from spelgen.errors import suggestion
-from spelgen.settings.fits import OWNERS, Adaptation
+from spelgen.settings.fits import OWNERS, Adaptation, Objective
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.yaml_document import Count, explain
 
@@ -82,7 +82,7 @@ def selected(values: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return {name: values[name] for name in keys if name in values}
 
 
-def adaptation(objective: str | None, values: dict[str, Any]) -> str:
+def adaptation(objective: Objective | None, values: dict[str, Any]) -> Objective:
     """Return the objective of a fit that starts from a fitted model, by default "torque".
 
     For this objective only, the default of `adapt` in `values`, the values of `--set`, is set to "load". Raises
