@@ -132,7 +132,7 @@ def test_an_estimate_uses_the_time_of_finished_runs_of_the_same_preset(study, ro
     more = prepare_study(simulated(robot, seeds=3), study.folder)
     assert len(more.jobs) == 6 and len(more.results) == 2
     first, later = (next(x for x in more.jobs if (x.preset, x.seed) == ("phnode", seed)) for seed in (0, 2))
-    assert more.estimates[later.name] == pytest.approx(more.results[first.name].seconds + 10)
+    assert more.estimates[later.name] == pytest.approx(more.results[first.name].seconds + 1)
     left = sum(more.estimates[x.name] for x in more.jobs if x.seed)
     assert more.announcement(2).endswith(f", 2 finished before; estimated time {duration(left / 2)}")
 

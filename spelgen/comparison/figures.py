@@ -37,7 +37,7 @@ class ComparisonTuning:
     horizon: float = 1.0
     # [s] Duration of the evaluation of a run after its training, for the estimated duration of a comparison. Measured
     # with robots/two_link.urdf, like `momentum_cost` and `run_on_logs`.
-    measuring: float = 10.0
+    measuring: float = 1.0
     # [1] Duration of a training step with the momentum objective, divided by the duration of a step with the rollout
     # objective. A momentum step is shorter, because it needs no numerical integration.
     momentum_cost: float = 0.5
