@@ -182,11 +182,16 @@ class ModelSpec:
         # A specification from a file is untrusted: without this check an index out of range would fail later,
         # during the assembly of a model, with an unclear error.
         n, links = len(self.joints), self.links
-        joints = [*self.potential, *(x.joint for x in links), *(j for x in self.outputs for j in x.joints)]
-        bases = [x.basis for x in self.outputs] + [x.basis for x in self.constants]
-        joints += [index for basis in bases for row in basis for index in row[:2]]
-        joints += [index for x in self.inputs for index in (x.joint, x.motor)]
-        joints += [index for row, column, _, depends in self.entries for index in (row, column, *depends)]
+        joints = [*self.potential, *(link.joint for link in links)]
+        for output in self.outputs:
+            joints += output.joints
+        for part in (*self.outputs, *self.constants):
+            for row, column, _ in part.basis:
+                joints += [row, column]
+        for entry in self.inputs:
+            joints += [entry.joint, entry.motor]
+        for row, column, _, depends in self.entries:
+            joints += [row, column, *depends]
         # Names must be unique, because logs and exports find joints and links by name.
         names = [joint.name for joint in self.joints], [link.name for link in links]
         consistent = (

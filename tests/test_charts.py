@@ -10,7 +10,7 @@ def test_the_legend_has_the_curves_that_are_visible():
         [
             Line("inside", (0, 1, 2), (0.1, 0.5, 0.9), "model"),
             Line("far above", (0, 1, 2), (7, 8, 9), "urdf"),
-            Line("not finite", (0, 1), (float("nan"),) * 2, "squares"),
+            Line("not finite", (0, 1), (float("nan"),) * 2, "least-squares"),
             Band("spread", (0, 2), (0.2, 0.2), (0.4, 0.4), "model"),
         ],
         "title", "t [s]", "torque [Nm]", limits=(0.0, 1.0),

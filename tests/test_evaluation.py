@@ -218,7 +218,7 @@ def test_the_same_run_and_logs_give_the_same_file(run):
     assert files[0] == files[1]
     assert "planar on 4 test trajectories; * marks the best of a row" in shown.stdout
     found = json.loads(files[0], parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert found["schema"] == 11
+    assert found["schema"] == 12
     shown = found["traces"]["trajectories"]
     assert [x["which"] for x in shown] == ["typical", "worst"]
     assert len(shown[0]["q"]) == len(shown[0]["t"]) == 21 and len(shown[0]["q"][0]) == 2

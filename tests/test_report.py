@@ -19,6 +19,7 @@ from spelgen.emission.specify import make_spec
 from spelgen.emission.text import description
 from spelgen.errors import RunError
 from spelgen.evaluation.results import Results
+from spelgen.evaluation.tables import result_tables
 from spelgen.evaluation.verdict import verdict
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.report_page import render_report, write_report
@@ -47,7 +48,7 @@ def traces(name):
         "torques": [{"which": "typical", "trajectory": name, "t": t, "q": wave, "qd": wave, "measured": near,
                      "predicted": both,
                      "parts": dict.fromkeys(("inertia", "Coriolis", "gravity", "friction"), wave)}],
-        "mass": {"trajectory": name, "t": t, "by": {"model": {"entries": entries}}},
+        "mass": {"trajectory": name, "t": t, "by": {"model": entries}},
         "friction": {"qd": [[-1, 0, 1]] * 3, "by": {"model": [[-2, 0, 2]] * 3}},
     }  # fmt: skip
 
@@ -86,6 +87,12 @@ def write_model(folder: Path, model) -> None:
     torch.save(model.state_dict(), folder / "model.pt")
 
 
+def write_progress(folder: Path, best_epoch: int) -> None:
+    """Write the file checkpoint.pt of a run of 30 epochs."""
+    progress = {"epoch": 30, "step": 600, "best_loss": 0.3, "seconds": 75.0, "substeps": 4}
+    torch.save({**progress, "best_epoch": best_epoch, "best_weights": {}}, folder / "checkpoint.pt")
+
+
 @pytest.fixture
 def run(robots, tmp_path) -> Path:
     """Return a run folder with all files of a run, written without a training."""
@@ -109,6 +116,7 @@ def run(robots, tmp_path) -> Path:
     ]  # fmt: skip
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "evaluation.json").write_text(json.dumps(EVALUATION))
+    write_progress(folder, best_epoch=30)
     return folder
 
 
@@ -160,7 +168,7 @@ def test_a_run_of_a_custom_preset_names_the_file_that_it_needs(run, robots, tmp_
     preset = tmp_path / "mine.yaml"
     preset.write_text((PRESETS / "minimal.yaml").read_text())
     spec = make_spec(load_arm(robots / "rpr.urdf", joints=["joint1", "joint2"]), preset)
-    first = commands(RunFolder(run), spec, None)[0]
+    first = commands(RunFolder(run), spec, RunFolder(run).read_record())[0]
     assert first == "spelgen build rpr.urdf --preset mine.yaml --joints joint1,joint2 -o module.py"
 
 
@@ -173,6 +181,7 @@ def test_long_trainings_are_reported_in_minutes_and_hours(run):
 
 
 def test_a_run_without_improvement_is_reported(run):
+    write_progress(run, best_epoch=0)
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[0]) | {"best": 0.001}
     (run / "metrics.jsonl").write_text(json.dumps(line) + "\n")
     assert "the model of the start: no epoch was better, validation loss 0.001" in render_report(run)
@@ -202,8 +211,6 @@ def test_learned_constants_are_those_of_the_weights(run):
 @pytest.mark.parametrize("lacking, said", [
     ("evaluation.json", "Not evaluated yet"),
     ("metrics.jsonl", "No epoch is finished"),
-    ("config.json", "There is no <code>config.json</code>"),
-    ("model.pt", "Not trained yet"),
 ])  # fmt: skip
 def test_missing_parts_are_reported(run, lacking, said):
     assert said not in render_report(run)
@@ -211,11 +218,10 @@ def test_missing_parts_are_reported(run, lacking, said):
     assert said in render_report(run)
 
 
-def test_a_run_of_only_a_specification_has_a_report(run):
-    for path in run.iterdir():
-        if path.name != "spec.json":
-            path.unlink()
-    Page(render_report(run))
+def test_a_run_without_weights_has_no_report(run):
+    (run / "model.pt").unlink()
+    with pytest.raises(RunError, match=r"no model\.pt, expected a run folder; make one with `spelgen train`"):
+        render_report(run)
 
 
 def test_an_incomplete_last_line_of_metrics_is_omitted(run):
@@ -236,7 +242,7 @@ def test_a_folder_without_a_run_is_refused_with_a_remedy(tmp_path):
     with pytest.raises(RunError) as told:
         write_report(tmp_path / "nothing")
     assert str(told.value).endswith(
-        "got no such run, expected a folder with spec.json; make one with `spelgen train`"
+        "got no such run, expected a folder with config.json; make one with `spelgen train`"
     )
     assert not (tmp_path / "nothing").exists()
 
@@ -268,13 +274,6 @@ def test_a_run_of_any_preset_has_its_page(run, robots, preset):
     units = {"Nm": "joint1", "N": "joint2"}
     for unit, joint in units.items():
         assert f"Torque of {joint}" in text and f"torque [{unit}]" in text
-
-
-def test_the_report_is_available_as_json(run, robots):
-    (run / "robot.urdf").write_bytes((robots / "rpr.urdf").read_bytes())
-    found = json.loads(write_report(run, run / "report.json").read_text(encoding="utf-8"))
-    assert found["evaluation"] == EVALUATION and found["least_squares"] is None
-    assert found["verdict"]["sentence"] in " ".join(Page(render_report(run)).text)
 
 
 def test_a_root_mean_square_that_few_starts_dominate_is_stated_beside_the_median(run):
@@ -311,7 +310,26 @@ def test_meshes_are_drawn_where_the_robot_is_named(run, robots, tmp_path):
     assert len(drawn) < 2_000_000
 
 
-def test_only_a_page_is_called_a_page(run, tmp_path):
-    for name, end in (("r.json", "r.json"), ("r.html", "r.html: the report, for any browser")):
-        result = CliRunner().invoke(app, ["report", str(run), "-o", str(tmp_path / name)])
-        assert result.exit_code == 0 and result.stdout.splitlines()[-1].endswith(end)
+def test_the_command_prints_the_path_of_the_page(run, tmp_path):
+    done = CliRunner().invoke(app, ["report", str(run), "-o", str(tmp_path / "r.html")])
+    assert done.exit_code == 0 and done.stdout.splitlines()[-1].endswith(
+        "r.html: the report, for any browser"
+    )
+    refused = CliRunner().invoke(app, ["report", str(run), "-o", str(tmp_path / "r.json")])
+    assert refused.exit_code == 2 and "'r.json' has no suffix of a format of this command" in refused.output
+
+
+def test_the_table_holds_every_figure_once_with_its_unit():
+    rows = [
+        (table.title, row[0], name.strip(), cell.rstrip(" *"))
+        for table in result_tables(Results.from_dict(EVALUATION))
+        for row in table.rows
+        for name, cell in zip(table.head[1:], row[1:], strict=True)
+    ]
+    found = {row[:-1]: row[-1] for row in rows}
+    assert len(found) == len(rows)
+    assert found["Position error after 1 s", "joint2 [m]", "model"] == "0.02"
+    assert found["Error of the tip's position [mm]", "1 s", "velocity stays constant"] == "26"
+    relative = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
+    assert found[relative, "1 s", "URDF"] == "-"
+    assert found["Torque error by joint, RMSE", "joint2 [N]", "model"] == "2"

@@ -11,7 +11,6 @@ from scipy.optimize import minimize
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.emission.build import build
-from spelgen.evaluation import rollout
 from spelgen.evaluation.horizons import end_errors
 from spelgen.exporting.mjcf_export import mjcf_text
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
@@ -446,19 +445,3 @@ def test_the_occam_factor_of_bristle_fractions():
     )
     narrowed = stages.fraction_occam_factor(estimate)
     torch.testing.assert_close(narrowed, torch.tensor([0.0, 2 * np.log(10)]).double())
-
-
-def test_exchange_of_kinetic_and_potential_energy_is_no_rise(robots, monkeypatch):
-    """Exchange of kinetic and potential energy is not counted as a rise of energy.
-
-    Links that swing upwards gain height and lose speed; with friction the sum decreases.
-    """
-    # one of the ten seconds is enough: kinetic or potential energy alone would rise by a thousandth in a step
-    monkeypatch.setattr(rollout, "TUNING", replace(rollout.TUNING, free_steps=1000))
-    model = build(robots / "two_link.urdf", "closed-form")
-    q, qd = torch.full((4, 2, 2), 0.3).double(), torch.full((4, 2, 2), 2.0).double()
-    windows = Windows(
-        torch.full((4, 1), 0.01).double(), q, torch.cat([qd, -qd])[::2], torch.zeros(4, 1, 2).double()
-    )
-    with torch.no_grad():
-        assert rollout.energy_rise(model, windows) < 1e-5

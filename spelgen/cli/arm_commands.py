@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
-from spelgen.cli.options import flag, option
+from spelgen.cli.console import FAILED, answer, note, refuse_warnings, say
+from spelgen.cli.options import flag, option, output_option
+from spelgen.files import write_text
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from spelgen.certificate.verify import Verification
 
 InspectionFormat = Literal["text", "json", "html", "sympy"]
-IdentificationFormat = Literal["text", "json", "html"]
 EFFECTS = ("stribeck", "polynomial", "memory")
 FRICTION_HELP = (
     "Friction terms in addition to viscous and Coulomb friction: Stribeck effect; qd |qd| and qd^3; bristles "
@@ -32,8 +32,10 @@ def inspect(
     assume: Assume = options.ASSUMPTION,
     formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
     entry: str | None = options.ENTRY,
-    format: InspectionFormat | None = options.result_format(),
-    output: Path | None = options.OUTPUT,
+    format: InspectionFormat | None = option(
+        "", "Format of the result; default: that of the suffix of -o, else text."
+    ),
+    output: Path | None = output_option("FILE", "Write the result to a file."),
     strict: bool = options.STRICT,
     verify: bool = flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples."),
 ) -> None:
@@ -60,7 +62,8 @@ def inspect(
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
     # error.
-    deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
+    text = _text(chosen, inspection, closed, proof, arm.robot.path)
+    say(text.removesuffix("\n") if output is None else f"wrote {write_text(output, text)}")
     if strict:
         refuse_warnings(
             f"{chosen_arm.robot}: ", [x.severity for x in inspection.diagnostics].count("warning")
@@ -115,8 +118,7 @@ def identify(
     ),
     friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
     accept: list[str] | None = options.ACCEPT,
-    format: IdentificationFormat | None = options.result_format(),
-    output: Path | None = options.OUTPUT,
+    format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
@@ -144,11 +146,4 @@ def identify(
     for diagnostic in result.diagnostics:
         note(diagnostic)
 
-    def page() -> str:
-        # Pages and charts are slow to import, so they are imported only for the format html.
-        from spelgen.render.arm_pages import identification_page
-
-        return identification_page(result, arm)
-
-    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2), "html": page}
-    options.write_result(format, output, forms)
+    answer(format, result.to_dict(), result.text())

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -13,16 +12,11 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
-from spelgen.evaluation.tables import LIMITS, limit_figures, summary
-from spelgen.files import write_json, write_text
+from spelgen.files import write_json
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
-
-
-LIMIT_EXCEEDED = 3  # Exit code if an error exceeds --limit. Code 2 is used by usage errors.
-LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
 def evaluate(
@@ -31,9 +25,7 @@ def evaluate(
     data: list[Path] | None = options.DATA,
     mapping: Path | None = options.MAPPING_FILE,
     filter: float | None = options.FILTER,
-    format: Literal["text", "json"] | None = options.result_format(),
-    output: Path | None = options.OUTPUT,
-    limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
+    format: options.TextOrJson = options.TEXT_OR_JSON,
     truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
     quick: bool = flag("--quick", "Torque errors only, without rollouts."),
 ) -> None:
@@ -42,9 +34,7 @@ def evaluate(
     The result begins with an assessment of the model. The result is also written to evaluation.json in the run folder,
     and no other file is changed.
     """
-    # Options --limit are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
-    limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
@@ -71,30 +61,7 @@ def evaluate(
     # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
-    options.write_result(format, output, {"text": results.text, "json": lambda: json.dumps(record)})
-    # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
-    values = limit_figures(results)
-    exceeded = []
-    for name, limit_value in limits:
-        value = values[name]
-        if value is None or value > limit_value:
-            text = "not known" if value is None else f"{value:.4g}"
-            exceeded.append(f"limit exceeded: {name} is {text}, expected at most {limit_value:g}")
-    if exceeded:
-        note("\n".join(exceeded))
-        raise typer.Exit(LIMIT_EXCEEDED)
-
-
-def _limit(text: str) -> tuple[str, float]:
-    """Return a text such as `torque.nmse=0.01` as a name and a number. Raises a usage error for any other text."""
-    name, _, value = text.partition("=")
-    try:
-        if name in LIMITS:
-            return name, float(value)
-    except ValueError:
-        pass
-    message = f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}"
-    raise typer.BadParameter(message, param_hint="'--limit'")
+    answer(format, record, results.text())
 
 
 def estimate(
@@ -153,31 +120,23 @@ def estimate(
 
 
 def report(
-    runs: list[Path] = argument("RUN", "Run folders; several are compared on one page."),
-    output: Path | None = output_option(
-        "FILE",
-        "HTML file, or .json for the data. Default: report.html in the run folder, runs.html for several.",
-    ),
+    run: Path = options.RUN,
+    output: Path | None = output_option("FILE", "HTML file; default: report.html in the run folder."),
     robot: Path | None = option("ROBOT.urdf", "URDF with its meshes, for the picture of the arm."),
 ) -> None:
-    """Write an HTML page about one run or several."""
-    if robot is not None and len(runs) > 1:
-        raise typer.BadParameter("belongs to the page of one run", param_hint="'--robot'")
-    if output is not None:
-        options.choose_format(None, output, ["html", "json"] if len(runs) == 1 else ["html"])
+    """Write an HTML page about a run."""
+    options.choose_format(None, output, ["html"])
     from spelgen.evaluation.results import Results
+    from spelgen.evaluation.tables import summary
     from spelgen.fitting.run_folder import RunFolder
-    from spelgen.render.report_page import render_runs, write_report
+    from spelgen.render.report_page import write_report
 
-    if len(runs) > 1:
-        say(f"wrote {write_text(output or 'runs.html', render_runs(runs))}")
-        return
-    path, folder = write_report(runs[0], output, robot), RunFolder(runs[0])
+    path, folder = write_report(run, output, robot), RunFolder(run)
     if folder.evaluation.exists():
         listing = summary(Results.from_dict(folder.read_json(folder.evaluation)))
         if listing is not None:
             say(listing.text() + "\n")
-    say(f"wrote {path}: the report, for any browser" if path.suffix == ".html" else f"wrote {path}")
+    say(f"wrote {path}: the report, for any browser")
 
 
 def compare(

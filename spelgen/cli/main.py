@@ -8,8 +8,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
 
@@ -48,25 +47,13 @@ class Command(TyperCommand):
 class CommandGroup(TyperGroup):
     """The group of all commands. A usage error suggests the nearest command, option or choice."""
 
-    def make_context(self, *arguments: Any, **options: Any) -> Any:
-        """Parse the options that precede the name of a command; a usage error names the nearest option or choice."""
-        with _suggestions():
-            return super().make_context(*arguments, **options)
-
     def invoke(self, ctx: Any) -> Any:
         """Run a command; a usage error names the nearest command, option or choice."""
-        with _suggestions():
+        try:
             return super().invoke(ctx)
-
-
-@contextmanager
-def _suggestions() -> Iterator[None]:
-    """Context manager that adds the nearest option or choice to usage errors that are raised in its block."""
-    try:
-        yield
-    except BaseUsageError as error:
-        _suggest(error)
-        raise
+        except BaseUsageError as error:
+            _suggest(error)
+            raise
 
 
 def _suggest(error: Any) -> None:

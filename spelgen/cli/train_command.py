@@ -14,7 +14,14 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import INTERRUPTED, answer, note
 from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import TIME_LIMIT, Request, UsageError, fit_options, read_assignments
+from spelgen.cli.train_settings import (
+    TIME_LIMIT,
+    UsageError,
+    adaptation,
+    fit_options,
+    read_assignments,
+    selected,
+)
 from spelgen.errors import LogError, ModuleError, OptionError, RunError
 from spelgen.labels import counted
 from spelgen.settings.fits import Objective, Rollout, TorqueFit, WindowConfig
@@ -55,23 +62,22 @@ def train(
     """
     start_time = time.monotonic()  # The limit `max_minutes` includes reading the logs.
     # Keys of --set are checked before any file is read, so that a misspelt key costs no time.
-    request = Request(objective, read_assignments(assignments or []))
+    values = read_assignments(assignments or [])
     if source is not None:
         if module is not None:
             # With --from there is no argument MODULE, so the first argument is also a log.
             extra_logs = [module, *(extra_logs or [])]
-        robot = robot or _urdf_of_run(source)
-        request = _warm_start(request)
-    elif "adapt" in request.values:
+        objective = adaptation(objective, values)
+    elif "adapt" in values:
         raise UsageError("--set adapt: belongs to --from")
     elif module is None:
         raise typer.BadParameter("name a module, or a run with --from", param_hint="'MODULE.py'")
     paths = options.logs(data, extra_logs)
     # With --resume the first argument may be the run folder, and `folder` is then this argument.
     folder = output or _default_folder(module, source, resume=resume)
-    spec, recorded = _specification(module, folder if resume else source)
+    spec, recorded, found = _specification(module, folder if resume else source)
     # A resumed run uses the settings in its record, since the settings file of the robot may have changed.
-    urdf = None if resume else robot or (None if module is None else _unchanged_urdf(module, spec))
+    urdf = None if resume else robot or found
     from spelgen.emission.specify import arm_of_spec
     from spelgen.log_checks.check_logs import require_sound_logs
 
@@ -85,10 +91,9 @@ def train(
     from spelgen.fitting.train import train as train_files
 
     # The options device and threads are not recorded in the run, because they describe the machine and not the result.
-    machine = {"progress": True} | request.values_of(("device", "threads", "progress"))
+    machine = {"progress": True} | selected(values, ("device", "threads", "progress"))
     run_options = RunOptions(**machine, resume=resume, force=force, mapping=log_mapping, began=start_time)
-    config = fit_options(request, None if resume else settings)
-    of_logs = settings.model_dump(include=OF_LOGS, exclude_unset=True)
+    config = fit_options(objective, values, None if resume else settings, warm_start=source is not None)
     try:
         fit = train_files(
             module,
@@ -97,7 +102,7 @@ def train(
             config,
             urdf=urdf,
             source=source,
-            of_logs=of_logs | request.values_of(OF_LOGS),
+            of_logs=settings.model_dump(include=OF_LOGS, exclude_unset=True) | selected(values, OF_LOGS),
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
@@ -105,7 +110,9 @@ def train(
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
-    _report(fit, request, folder, format, _payload(fit, source))
+    if TIME_LIMIT in values and TIME_LIMIT not in type(fit.config).model_fields:
+        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {fit.config.objective}")
+    _report(fit, folder, format, _payload(fit, source))
 
 
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
@@ -141,11 +148,8 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     return carried_payload(original, fit.logs) if is_load else None
 
 
-def _report(fit: Fit, request: Request, folder: Path, format: str, payload: Payload | None) -> None:
+def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> None:
     """Print the outcome of the fit; exit with 130 if it was interrupted. payload: payload in the logs, or None."""
-    if TIME_LIMIT in request.values and TIME_LIMIT not in type(fit.config).model_fields:
-        objective = fit.config.objective
-        note(f"info: {TIME_LIMIT} limits fits to windows; these logs are fitted by {objective}")
     posterior = fit.posterior if fit.checkpoint.posterior else None
     record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
     record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
@@ -194,20 +198,6 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     return end, f"best {result}, at epoch {fit.best_epoch}"
 
 
-def _warm_start(request: Request) -> Request:
-    """Return the request of a fit that starts from a fitted model, with default values for keys that are not set.
-
-    The default objective is "torque" and, for this objective only, the default of `adapt` is "load". Raises UsageError
-    if `adapt` is set with another objective.
-    """
-    objective, values = request.objective or "torque", dict(request.values)
-    if objective == "torque":
-        values.setdefault("adapt", "load")
-    elif "adapt" in request.values:
-        raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
-    return Request(objective, values, warm_start=True)
-
-
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:
     """Return the run folder of a command without -o: runs/NAME of the module, or runs/NAME_adapted of the run `source`.
 
@@ -223,28 +213,21 @@ def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -
     return folder
 
 
-def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None]:
-    """Return the specification of the model, and the recorded mapping of the logs.
+def _specification(module: Path | None, run: Path | None) -> tuple[ModelSpec, LogMapping | None, Path | None]:
+    """Return the specification of the model, the recorded mapping of the logs, and the URDF if it is known.
 
-    Both are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, and
-    there is no mapping.
+    They are read from the run that is resumed or adapted. For a new fit, the specification is read from the module, the
+    URDF is the file in the folder of the module, and there is no mapping.
     """
     from spelgen.emission.text import read_spec
     from spelgen.fitting.run_folder import RunFolder
 
     if run is None and module is not None:
-        return read_spec(module), None
+        spec = read_spec(module)
+        return spec, None, _unchanged_urdf(module, spec)
     folder = RunFolder(run or Path())
-    return folder.read_spec(), folder.read_record().mapping
-
-
-def _urdf_of_run(folder: Path) -> Path | None:
-    """Return the URDF in a run folder, if there is one. Raises RunError if the folder is not a run."""
-    from spelgen.fitting.run_folder import RunFolder
-
-    run = RunFolder(folder)
-    run.read_record()
-    return run.urdf if run.urdf.exists() else None
+    record, urdf = folder.read_record(), folder.urdf
+    return folder.read_spec(), record.mapping, urdf if urdf.exists() else None
 
 
 def _unchanged_urdf(module: Path, spec: ModelSpec) -> Path | None:

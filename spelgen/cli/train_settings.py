@@ -6,14 +6,13 @@ A value given by `--set KEY=VALUE` takes precedence over the value in the settin
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import typer
 from pydantic import ValidationError
 
 from spelgen.errors import suggestion
-from spelgen.settings.fits import OWNERS, Adaptation
+from spelgen.settings.fits import OWNERS, Adaptation, Objective
 from spelgen.settings.training import TrainingSettings
 from spelgen.settings.yaml_document import Count, explain
 
@@ -43,23 +42,6 @@ class Assignments(TrainingSettings):
     device: str = "cpu"
     threads: Count = 1
     progress: bool = True
-
-
-@dataclass(frozen=True)
-class Request:
-    """The options of the command `train`.
-
-    objective: value of `--objective`; None: the logs determine the objective. values: {key of `--set`: value}.
-    warm_start: whether the fit starts from the parameters of an earlier run.
-    """
-
-    objective: str | None
-    values: Mapping[str, Any]
-    warm_start: bool = False
-
-    def values_of(self, keys: Iterable[str]) -> dict[str, Any]:
-        """Return {key: value} for each of `keys` that `--set` has set."""
-        return {name: self.values[name] for name in keys if name in self.values}
 
 
 def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
@@ -95,19 +77,48 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     return {name: values[name] for name in texts}
 
 
-def fit_options(request: Request, defaults: TrainingSettings | None) -> FitOptions:
-    """Return the options of a fit; the command line takes precedence over the robot's settings, `defaults`.
+def selected(values: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """Return {key: value} for each of `keys` that is in `values`, the values of `--set`."""
+    return {name: values[name] for name in keys if name in values}
 
-    defaults: None for a resumed run, whose record has all options.
+
+def adaptation(objective: Objective | None, values: dict[str, Any]) -> Objective:
+    """Return the objective of a fit that starts from a fitted model, by default "torque".
+
+    For this objective only, the default of `adapt` in `values`, the values of `--set`, is set to "load". Raises
+    UsageError if `adapt` is set with another objective.
+    """
+    objective = objective or "torque"
+    if objective == "torque":
+        values.setdefault("adapt", "load")
+    elif "adapt" in values:
+        raise UsageError(f"--set adapt: belongs to the objective torque, this fits {objective}")
+    return objective
+
+
+def fit_options(
+    objective: str | None,
+    values: Mapping[str, Any],
+    defaults: TrainingSettings | None,
+    *,
+    warm_start: bool,
+) -> FitOptions:
+    """Return the options of a fit; the command line takes precedence over the robot's settings.
+
+    Args:
+        objective: value of `--objective`; None: the settings or the logs determine the objective.
+        values: {key of `--set`: value}.
+        defaults: the robot's settings; None for a resumed run, whose record has all options.
+        warm_start: whether the fit starts from the parameters of an earlier run.
     """
     from spelgen.fitting.fit import FitOptions
 
-    options = request.values_of(OWNERS)
+    options = selected(values, OWNERS)
     if defaults is None:
-        return FitOptions(request.objective, options)
+        return FitOptions(objective, options)
     settings = dict(defaults.options)
-    objective = request.objective or defaults.objective
-    if request.warm_start and objective == "rollout":
+    objective = objective or defaults.objective
+    if warm_start and objective == "rollout":
         # In a warm start no torque fit precedes the rollout fit: a torque fit would discard the source run's
         # parameters.
         settings["torque_first"] = False

@@ -3,14 +3,15 @@
 import hashlib
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Self, cast
+from typing import cast
 
 import torch
 from pydantic import TypeAdapter, ValidationError
 
 from spelgen.comparison.arms import ArmInputs
-from spelgen.comparison.figures import SimulatedFigures, simulated_figures
+from spelgen.comparison.figures import Figures, simulated_figures
 from spelgen.design import load_design
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
@@ -38,12 +39,11 @@ Errors = dict[str, dict[str, float | None]]
 class RunResult:
     """Figures of a finished run.
 
-    key: hash of all inputs of the run, see `Job.key`. seconds: duration of the training [s]. parameters: number of
+    seconds: duration of the training [s]. parameters: number of
     trained parameters that the model uses. errors: {measure: {predictor: error}}; the first measure ranks the models.
-    simulated: further figures for a simulated arm, whose true parameters are known.
+    sizes: further figures of the model of a simulated arm, see `simulated_figures`; {} for logs of the user.
     """
 
-    key: str
     arm: str
     preset: str
     seed: int
@@ -51,22 +51,14 @@ class RunResult:
     seconds: float
     parameters: int
     errors: Errors
-    simulated: SimulatedFigures | None
-
-    @classmethod
-    def read(cls, path: Path) -> Self:
-        """Return the result in a file result.json. Raises RunError if the file is malformed."""
-        try:
-            return TypeAdapter(cls).validate_python(read_json(path, RunError))
-        except ValidationError as error:
-            raise RunError("not the values of a result", file=path, do="remove it") from error
+    sizes: Figures
 
 
 class Job(Group):
     """A run of a comparison, finished or not.
 
     design: name of a preset, or path of a YAML file. training: settings of fits to logs of the user. protocol: settings
-    of fits to simulated logs, which are the same for all models.
+    of fits to simulated logs, which are the same for all models. runs: folder of the run folders of the arm.
     """
 
     arm: str
@@ -79,7 +71,7 @@ class Job(Group):
     depth: int
     training: TrainingSettings
     protocol: ComparisonSettings
-    folder: Path
+    runs: Path
 
     @property
     def preset(self) -> str:
@@ -92,18 +84,20 @@ class Job(Group):
         name = f"{self.arm}, {self.preset}, seed {self.seed}"
         return f"{name}, split {self.split}" if self.splits > 1 else name
 
-    @property
-    def key(self) -> str:
-        """Return a hash of all inputs of the run: logs, URDF, settings, design, options and version of spelgen.
+    @cached_property
+    def folder(self) -> Path:
+        """Run folder, whose name ends with a hash of all inputs of the run, so that other inputs have another folder.
 
-        Paths of files do not affect the hash.
+        The inputs are logs, URDF, settings, design, options and version of spelgen. Paths of files do not affect the
+        hash.
         """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
-        options = self.model_dump_json(exclude={"design", "inputs", "protocol", "folder"})
+        options = self.model_dump_json(exclude={"design", "inputs", "protocol", "runs"})
         # The hash contains the content of the design and not its name, since a YAML file may have changed. The hash
         # contains the version of spelgen, since versions may give different results.
         sources = (__version__, load_design(self.design), self.inputs.digest, protocol, options)
-        return hashlib.sha256(repr(sources).encode()).hexdigest()[:16]
+        key = hashlib.sha256(repr(sources).encode()).hexdigest()[:8]
+        return self.runs / f"{self.preset}-seed{self.seed}-split{self.split}-{key}"
 
     def build(self) -> ArmModel:
         """Return the untrained model of the run."""
@@ -111,15 +105,14 @@ class Job(Group):
         return build(arm, self.design, width=self.width, depth=self.depth, seed=self.seed)
 
     def result(self) -> RunResult | None:
-        """Return the result in result.json; None if there is none, or if it is of a run with other inputs.
-
-        The inputs are compared by their hash, `key`. Raises RunError if the file is malformed.
-        """
+        """Return the result in result.json; None if the run is not finished. Raises RunError if it is malformed."""
         path = self.folder / "result.json"
         if not path.is_file():
             return None
-        result = RunResult.read(path)
-        return result if result.key == self.key else None
+        try:
+            return TypeAdapter(RunResult).validate_python(read_json(path, RunError))
+        except ValidationError as error:
+            raise RunError("not the values of a result", file=path, do="remove it") from error
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
         """Return the configuration of the fit of the model.
@@ -167,7 +160,8 @@ def run_job(job: Job) -> RunResult:
     # One thread per worker: there is one worker per core, so more threads would wait for each other.
     torch.set_num_threads(1)
     run = RunFolder(job.folder)
-    resume = _own_checkpoint(job, run)
+    # The folder belongs to these inputs, so an interrupted fit in it is resumed.
+    resume = run.config.exists()
     training, testing = job.inputs.split(job.split, job.splits)
     model, start = job.build(), time.monotonic()
     trained = fit(
@@ -181,36 +175,21 @@ def run_job(job: Job) -> RunResult:
     seconds = time.monotonic() - start
     # Gradients are switched off for the evaluation to save memory.
     model.requires_grad_(False).eval()
-    simulated = None
+    sizes: Figures = {}
     if job.inputs.truth is None:
         results = evaluate(trained, testing)
         write_json(run.evaluation, results.to_dict())
         errors = _errors(results)
     else:
-        simulated = simulated_figures(trained, training, testing, job.inputs.truth)
-        # Models of a simulated arm are ranked by the first loss, the prediction loss over 1 s, so no other is returned.
-        errors = {label: {MODEL: loss} for label, loss in list(simulated.losses.items())[:1]}
+        losses, sizes = simulated_figures(trained, training, testing, job.inputs.truth)
+        # The first loss, the prediction loss over 1 s, ranks the models of a simulated arm.
+        errors = {label: {MODEL: loss} for label, loss in losses.items()}
     result = RunResult(
-        key=job.key, arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
-        parameters=trained.parameters, errors=errors, simulated=simulated,
+        arm=job.arm, preset=job.preset, seed=job.seed, split=job.split, seconds=seconds,
+        parameters=trained.parameters, errors=errors, sizes=sizes,
     )  # fmt: skip
     write_json(job.folder / "result.json", record(result))
     return result
-
-
-def _own_checkpoint(job: Job, run: RunFolder) -> bool:
-    """Return True if the run folder contains an interrupted fit with the same inputs, which can be resumed.
-
-    Otherwise, this function prepares the folder for a new fit: it deletes the config.json of a fit with other inputs,
-    recognized by its key in job.json, and writes the key of this job (see `Job.key`).
-    """
-    owner = job.folder / "job.json"
-    if owner.is_file() and read_json(owner, RunError) == {"key": job.key}:
-        return run.config.exists()
-    # A folder without config.json is not a run folder, so a new fit starts.
-    run.config.unlink(missing_ok=True)
-    write_json(owner, {"key": job.key})
-    return False
 
 
 def _errors(results: Results) -> Errors:

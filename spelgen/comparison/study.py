@@ -81,7 +81,6 @@ def prepare_study(comparison: Comparison, folder: Path, progress: Progress | Non
     if not jobs:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in failures.items())
         raise RunError(f"no arm that can be compared ({reasons})")
-    # A stored result is used only if it was computed from the same options and inputs, which `Job.result` checks.
     results = {}
     for job in jobs:
         result = job.result()
@@ -119,7 +118,7 @@ def run_study(study: Study, note: Callable[[str], None], jobs: int = 1, address:
         note(f"{count}/{len(waiting)} {job.name}: {line}")
     finished = replace(study, results=results, failures=failures, estimates={})
     figures = list(map(record, results.values()))
-    write_json(study.folder / "comparison.json", {"schema": 1, "failures": failures, "results": figures})
+    write_json(study.folder / "comparison.json", {"schema": 2, "failures": failures, "results": figures})
     return finished
 
 
@@ -136,16 +135,14 @@ def _jobs(name: str, inputs: ArmInputs, comparison: Comparison, folder: Path) ->
         name: value for name, value in comparison.training if name in comparison.training.model_fields_set
     }
     shared = {
-        "arm": name, "inputs": inputs, "splits": comparison.splits,
+        "arm": name, "inputs": inputs, "runs": folder, "splits": comparison.splits,
         "width": comparison.width or protocol.width, "depth": comparison.depth or protocol.depth,
         "training": settings.training.model_copy(update=options),
         "protocol": protocol.model_copy(update={"steps": comparison.steps or protocol.steps}),
     }  # fmt: skip
     jobs = []
     for seed, split, design in product(range(seeds), range(comparison.splits), presets):
-        run = {"design": design, "seed": seed, "split": split}
-        run["folder"] = folder / f"{Path(design).stem}-seed{seed}-split{split}"
-        jobs.append(Job.model_validate(shared | run))
+        jobs.append(Job.model_validate(shared | {"design": design, "seed": seed, "split": split}))
     return jobs
 
 

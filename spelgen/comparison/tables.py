@@ -6,23 +6,16 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from spelgen.comparison.figures import Figures
 from spelgen.comparison.jobs import RunResult
 from spelgen.comparison.study import Study
-from spelgen.evaluation.tables import Row, Table
+from spelgen.evaluation.tables import table
 from spelgen.labels import MODEL, counted, listed
-from spelgen.listing import number
+from spelgen.listing import Listing, number
 from spelgen.settings.training import PublishedFigures
 
-BASELINE = "phnode"
 Runs = Mapping[str, Sequence[RunResult]]
 """Preset -> results of the runs of an arm with all seeds and splits."""
 Numbers = dict[str, float | None]
-RATIO = {"prediction loss, 1 s": "prediction loss", "velocity, 1 s": "velocity"}
-"""{label of a row of losses: name of this loss in the label of the row below}.
-
-The row below contains the loss of the baseline (`BASELINE`) divided by the loss of each model.
-"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +28,7 @@ class ArmResults:
     name: str
     best: str
     sentence: str
-    tables: tuple[Table, ...]
+    tables: tuple[Listing, ...]
 
 
 def arm_sections(study: Study) -> list[ArmResults]:
@@ -48,40 +41,28 @@ def arm_sections(study: Study) -> list[ArmResults]:
     sections = []
     for name, results in arms.items():
         runs, measure = _by_preset(results), _main_measure(results)
-        # `_medians` sorts by error and contains baselines, which have no runs.
-        best = next(model for model in _medians(runs, measure) if model in runs)
+        # The errors include baselines, which have no runs.
+        best = next(model for model in _by_error(_medians(runs, measure)) if model in runs)
         tables = tuple(arm_tables(results, published[name]))
         sections.append(ArmResults(name, best, arm_sentence(results), tables))
     return sections
 
 
-def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Table]:
+def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Listing]:
     """Return the tables of an arm, the main result first. published: {preset: figures of a publication}."""
     runs = _by_preset(results)
-    figures = {name: [run.simulated for run in x if run.simulated] for name, x in runs.items()}
     # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
-    if not all(figures.values()):
-        return [_ranking(runs)]
-    rows = []
-    sizes = {name: [run.sizes for run in x] for name, x in figures.items()}
-    for label in next(iter(sizes.values()))[0]:
-        worst = max if label == "rise of energy, no input" else min
-        rows.append(Row(label, _summary(sizes, label, worst), label in ("parameters", "training step [ms]")))
-    losses = {name: [run.losses for run in x] for name, x in figures.items()}
-    title = (
-        "Sizes, time of a training step, and invariants, the worst over seeds; a negative rise is a decrease"
-    )
-    return [_losses(losses, published), Table(title, tuple(rows))]
+    return [_losses(runs, published), _sizes(runs)] if results[0].sizes else [_ranking(runs)]
 
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
     """Return a sentence that names the best model of an arm and compares its error with the errors of all others."""
     runs, measure = _by_preset(results), _main_measure(results)
-    errors = {name: error for name, error in _medians(runs, measure).items() if error is not None}
+    medians = _by_error(_medians(runs, measure))
+    errors = {name: error for name, error in medians.items() if error is not None}
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
-    # `_medians` sorts by error, so the first model has the smallest error.
     best = errors[models[0]]
     # Models with errors equal to three digits are named together, for example closed-form and hybrid without residual
     # terms, which are the same model.
@@ -124,62 +105,59 @@ def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
     return runs
 
 
-def _ranking(runs: Runs) -> Table:
+def _ranking(runs: Runs) -> Listing:
     """Return a table of the errors of models and baselines on logs of the user, sorted by error."""
-    rows = [Row(measure, _medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors]
-    seconds = {name: statistics.median(run.seconds for run in x) for name, x in runs.items()}
-    rows.append(Row("parameters", {name: x[0].parameters for name, x in runs.items()}, ranked=False))
-    rows.append(Row("runs", {name: len(x) for name, x in runs.items()}, ranked=False))
-    rows.append(Row("training time [s]", seconds, ranked=False))
+    rows = {measure: _by_error(_medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors}
+    measures = list(rows)
+    rows["parameters"] = {name: x[0].parameters for name, x in runs.items()}
+    rows["runs"] = {name: len(x) for name, x in runs.items()}
+    rows["training time [s]"] = {
+        name: statistics.median(run.seconds for run in x) for name, x in runs.items()
+    }
     title = "Errors on the test logs, best first; medians over seeds and splits"
     note = "relative RMS: 0: no error, 1: as if the arm had stood still; columns without parameters are baselines"
-    return Table(title, tuple(rows), note)
+    return table(title, rows, note, unranked=rows.keys() - measures)
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error by ``measure``}, sorted by error; errors that are not finite are last."""
+    """Return {model or baseline: median error by ``measure``}; None for an error that is not finite."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
             for predictor, error in run.errors.get(measure, {}).items():
                 values.setdefault(preset if predictor == MODEL else predictor, []).append(error)
-    medians = {name: _combined(errors, statistics.median) for name, errors in values.items()}
+    return {name: _combined(errors, statistics.median) for name, errors in values.items()}
+
+
+def _by_error(medians: Numbers) -> Numbers:
+    """Return the same errors in ascending order; errors that are not finite are last."""
     return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 
-def _losses(figures: Mapping[str, Sequence[Figures]], published: Mapping[str, PublishedFigures]) -> Table:
-    rows = []
-    for label in next(iter(figures.values()))[0]:
-        medians = _summary(figures, label, statistics.median)
-        rows.append(Row(label, medians))
-        baseline = medians.get(BASELINE)
-        # A row with the loss of the preset `BASELINE` divided by each preset's loss is added, because absolute losses
-        # depend on units and on the sample rate.
-        if baseline is not None and label in RATIO:
-            ratios = {name: baseline / median if median else None for name, median in medians.items()}
-            rows.append(Row(f"{BASELINE}'s {RATIO[label]} / this", ratios, ranked=False))
+def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Listing:
+    """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
+    rows = {label: _medians(runs, label) for label in next(iter(runs.values()))[0].errors}
+    losses = list(rows)
     # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
-    records = {name: published[name].model_dump(exclude_none=True) for name in figures if name in published}
+    records = {name: published[name].model_dump(exclude_none=True) for name in runs if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
         if values:
-            rows.append(Row(f"published: {field.replace('_', ' ')}", values, ranked=False))
+            rows[f"published: {field.replace('_', ' ')}"] = values
     title = (
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the relative error of M; "
         "median over seeds; below, published figures"
     )
-    return Table(title, tuple(rows))
+    return table(title, rows, unranked=rows.keys() - losses)
 
 
-def _summary(
-    figures: Mapping[str, Sequence[Figures]], label: str, combine: Callable[[list[float]], float]
-) -> Numbers:
-    """Return {preset: number}, the row `label` of a table.
-
-    figures: {preset: figures of all runs}. combine: function that combines the figures of a preset's runs to one
-    number, such as the median.
-    """
-    return {name: _combined([run[label] for run in runs], combine) for name, runs in figures.items()}
+def _sizes(runs: Runs) -> Listing:
+    """Return a table of the sizes of the models of a simulated arm, and of the time of a training step."""
+    rows = {}
+    for label in next(iter(runs.values()))[0].sizes:
+        rows[label] = {name: _combined([run.sizes[label] for run in x], min) for name, x in runs.items()}
+    ranked = ("parameters", "training step [ms]")
+    return table("Sizes, and time of a training step", rows, unranked=rows.keys() - ranked)
 
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from spelgen.labels import BASE_ORDER, INERTIAL_PARAMETERS, base_name, parameter_name
 from spelgen.runtime.body_chain import BodyChain
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import applied
 
 
 def about_center(inertia: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from spelgen.dynamics.protocol import known_past, memory_after
 from spelgen.runtime.derived_mass import DerivedMass
 from spelgen.runtime.network_dynamics import NetworkDynamics
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.parts import applied
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
 @dataclass(frozen=True, eq=False)

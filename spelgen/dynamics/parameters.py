@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from spelgen.dynamics.protocol import residual_terms
 from spelgen.runtime.networks import MaskedMLP, MaskedNetwork
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import applied
 from spelgen.runtime.residual_terms import ResidualDynamics
 
 

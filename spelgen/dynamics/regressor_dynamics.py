@@ -15,8 +15,7 @@ from spelgen.dynamics.bristles import moved_bristles, reach_of
 from spelgen.dynamics.equations import MotionEquations
 from spelgen.dynamics.friction import FrictionModel
 from spelgen.runtime.body_chain import BodyChain, ChainConfiguration
-from spelgen.runtime.parts import Row
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import Row, applied
 
 
 def body_chain(arm: Chain, gravity: Row | None = None) -> BodyChain:

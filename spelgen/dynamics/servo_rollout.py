@@ -19,7 +19,8 @@ from spelgen.dynamics.bristles import moved_bristles
 from spelgen.dynamics.prepared import State
 from spelgen.runtime.friction_laws import FrictionConstants
 from spelgen.runtime.motors import ServoConstants, beyond
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.parts import applied
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 
 from spelgen.baselines.predictor import States
-from spelgen.dynamics.bristles import bristles_along
 from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.evaluation.horizons import EvaluatedLogs
 from spelgen.evaluation.plain import Curve, number
@@ -22,8 +21,7 @@ from spelgen.evaluation.tuning import TUNING
 from spelgen.labels import MODEL
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory
-from spelgen.logs.tuning import shows_accelerations
-from spelgen.logs.windows import Windows, cut_windows
+from spelgen.logs.windows import Windows
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -148,28 +146,11 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
     The middle is used because logs begin and end at rest.
     """
     motions = []
-    # A log of low sample rate does not show the acceleration at a sample. For such a log, the mean acceleration and the
-    # mean torque of each sample interval are shown.
-    slow = [piece for piece in logs.pieces if not shows_accelerations(piece.sample_rate)]
-    for samples in [*logs.samples, *(_steps(piece, logs) for piece in slow)]:
+    for samples in logs.samples:
         count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
         start = (len(samples.q) - count) // 2
         motions.append(samples[start : start + count : -(-count // TUNING.curve_samples)])
     return motions
-
-
-def _steps(piece: Trajectory, logs: EvaluatedLogs) -> DynamicsSamples:
-    """Return the mean q, qd, qdd and torque in each sample interval of `piece`, a log of low sample rate.
-
-    At a low sample rate only the mean acceleration can be computed: the change of qd divided by the duration of the
-    interval. logs: the evaluated logs, for their filter (`used`) and the break-away displacements of bristles
-    (`reach`).
-    """
-    steps = cut_windows([piece], 2, measured=logs.used.filtered)
-    qdd = steps.qd.diff(dim=1)[:, 0] / steps.dt
-    q, qd, tau = steps.q.mean(dim=1).numpy(), steps.qd.mean(dim=1).numpy(), steps.tau[:, 0].numpy()
-    z = bristles_along(q, logs.reach)
-    return DynamicsSamples(piece.name, q, qd, qdd.numpy(), tau, z, rate=piece.sample_rate)
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:

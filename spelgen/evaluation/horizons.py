@@ -44,7 +44,7 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 
     Two details differ from the reference. First, d is assumed constant between samples, so that the filter has an exact
     solution. Second, r is divided by the step response of the filter, so that a constant disturbance is estimated
-    without the delay of some time constants.
+    without the delay of some time constants: r is a weighted mean of d.
 
     Args:
         dynamics: result of `integrable`.
@@ -71,15 +71,13 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
     # `residual` is d of the docstring, the residual of the momentum balance in each of the `past` intervals before the
     # prediction, (W, past, n), in the unit of the result.
     residual = p.diff(dim=1) / dt - (at_start[:, :-1] + at_end[:, 1:]) / 2
-    gain = 1 - torch.exp(-dt / TUNING.observer_time_constant)
-    r = torch.zeros_like(residual[:, 0])
-    # `response` is the step response of the observer: the estimate for a constant disturbance of 1, (W, 1).
-    response = torch.zeros_like(gain[:, 0])
-    for k in range(past):
-        r = r + gain[:, k] * (residual[:, k] - r)
-        response = response + gain[:, k] * (1 - response)
+    # The observer is a first-order filter, so its estimate is a weighted mean of `residual`. The weight of an interval
+    # falls exponentially with the time from its end to the prediction; the sum of all weights is the step response.
+    steps = dt / TUNING.observer_time_constant
+    age = steps.sum(dim=1, keepdim=True) - steps.cumsum(dim=1)
+    weight = (1 - torch.exp(-steps)) * torch.exp(-age)
     ahead = replace(without_past(windows, past), z=z[:, -1])
-    return ahead, r / response
+    return ahead, (weight * residual).sum(dim=1) / weight.sum(dim=1)
 
 
 def without_past(windows: Windows, past: int) -> Windows:

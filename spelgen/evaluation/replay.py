@@ -44,11 +44,11 @@ PositionErrors = tuple[Trajectory, np.ndarray]
 """A log of K + 1 samples, and predicted minus measured positions after each of its K intervals, (K, n) [rad, m]."""
 
 
+@dataclass(frozen=True)
 class ServoModel:
     """The trained model as a predictor of positions under position commands (`CommandFollower`), like the baselines."""
 
-    def __init__(self, model: ArmModel) -> None:
-        self._model = without_idle_residuals(model)
+    model: ArmModel
 
     def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment of a log, (K, n) [rad, m] for a segment of K + 1 samples.
@@ -68,11 +68,11 @@ class ServoModel:
         commands, intervals = [], []
         for (log, rows), length in zip(segments, lengths, strict=True):
             padding = (0, max(lengths) - length)
-            delayed = delayed_commands(log, rows, float(self._model.servo.delay), steps)
+            delayed = delayed_commands(log, rows, float(self.model.servo.delay), steps)
             commands.append(np.pad(delayed, (padding, (0, 0), (0, 0)), mode="edge"))
             intervals.append(np.pad(np.diff(log.t[rows]), padding, mode="edge"))
         arrays = (q, qd, np.stack(commands), np.stack(intervals))
-        predicted = replayed(self._model, *map(torch.from_numpy, arrays)).numpy()
+        predicted = replayed(self.model, *map(torch.from_numpy, arrays)).numpy()
         return [positions[:length] for positions, length in zip(predicted, lengths, strict=True)]
 
 
@@ -95,7 +95,7 @@ def replays(
             windows.append((piece, slice(start, start + length)))
             first_qd.append(qd[start])
     # The model is treated as one of the predictors, so that the same code measures all errors.
-    predictors = {MODEL: ServoModel(model), **baselines}
+    predictors = {MODEL: ServoModel(without_idle_residuals(model)), **baselines}
     # Whole logs are replayed from zero velocity, as they begin at rest. Windows start with the velocity of the log.
     logs_from_rest = [(piece, slice(0, len(piece))) for piece in pieces]
     at_rest = np.zeros((len(pieces), pieces[0].q.shape[1]))

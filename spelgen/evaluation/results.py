@@ -20,7 +20,7 @@ from spelgen.labels import MODEL, counted
 from spelgen.listing import WIDTH
 
 # Version of the format of evaluation.json. It changes if files of an earlier version cannot be read any more.
-SCHEMA = 11
+SCHEMA = 12
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Results:
 
     def _repr_html_(self) -> str:
         sentence = "" if self.assessment is None else self.assessment.sentence
-        tables = [table.listing().html() for table in result_tables(self)]
+        tables = [table.html() for table in result_tables(self)]
         return "".join([f"<p>{escape(sentence)}</p>", *tables])
 
     def _heading(self) -> str:

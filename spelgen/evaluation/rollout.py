@@ -1,10 +1,8 @@
-"""Forward simulation of a model, tests of the model's physical consistency, and the error of the model's M.
+"""Forward simulation of a model, and the error of its mass matrix M.
 
-The tests are on positive definiteness of M, and on the energy of free motion. The error of M needs the true M, which is
-known for simulated arms only.
+The error of M needs the true M, which is known for simulated arms only.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from torch import Tensor
 
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.dynamics.protocol import RigidDynamics, integrable
-from spelgen.emission.assemble import ArmModel
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import roll_out
 from spelgen.logs.windows import Windows
@@ -55,38 +52,6 @@ def rollout(
     shape = (*batch, samples + 1, n)
     positions = torch.cat([q, positions], dim=1).reshape(shape)
     return positions, torch.cat([qd, velocities], dim=1).reshape(shape)
-
-
-def smallest_eigenvalue(model: ArmModel, low: Tensor, high: Tensor) -> float:
-    """Return the smallest eigenvalue of M over random positions, divided by the mean eigenvalue over them.
-
-    The positions are in [low, high] (n,) [rad, m]. The result is positive if M is positive definite at all positions.
-    """
-    # The seed of the random positions is fixed, so that the result is reproducible.
-    generator = torch.Generator().manual_seed(0)
-    count = TUNING.sampled_positions
-    q = low + (high - low) * torch.rand(count, len(low), dtype=low.dtype, generator=generator)
-    # M is computed for a tenth of the positions at a time: a batch of all would need gigabytes.
-    chunks = q.chunk(10)
-    eigenvalues = torch.cat([torch.linalg.eigvalsh(model.mass_matrix(chunk)) for chunk in chunks])
-    return (eigenvalues.min() / eigenvalues.mean().abs()).item()
-
-
-def energy_rise(model: ArmModel, windows: Windows) -> float | None:
-    """Return the largest increase of the energy H in one step of 1 ms, divided by the largest kinetic energy.
-
-    The motion is simulated without input, from the first states of the windows. For a passive model the energy does
-    not increase, except for rounding. The result is None if the motion diverged or the kinetic energy is zero.
-    """
-    q, qd = windows.q[: TUNING.started_states, 0], windows.qd[: TUNING.started_states, 0]
-    no_input = q.new_zeros(len(q), TUNING.free_steps, model.n)
-    q, qd = rollout(model, q, qd, no_input, 1e-3)
-    # The first state of each motion is omitted: it is measured, and only later states are computed by the model.
-    q, qd = q[:, 1:], qd[:, 1:]
-    energy = model.hamiltonian(q, model.momentum(q, qd))
-    kinetic = (energy - model.potential_energy(q)).max().item()
-    rise = energy.diff(dim=1).max().item()
-    return rise / kinetic if kinetic > 0 and math.isfinite(rise / kinetic) else None
 
 
 def true_mass(robot: Arm | Path | str, q: Tensor, joints: Sequence[str] | None = None) -> Tensor:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-# `spelgen --help` imports this module for LIMITS. An import of the results would also load torch.
+# `spelgen.evaluation.results` imports this module, so its class is imported for type checkers only.
 if TYPE_CHECKING:
     from spelgen.evaluation.results import Results
 
@@ -21,105 +21,50 @@ OBSERVER = (
 Numbers = Mapping[str, float | None]
 """Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
-LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
-"""Names of the figures that `spelgen evaluate --limit` accepts."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """Row of a table: one quantity, with a number per column. ranked: True if the smallest number is the best one."""
+def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Container[str] = ()) -> Listing:
+    """Return a table of numbers with a row per quantity; a star marks the smallest number of a row.
 
-    label: str
-    values: Numbers
-    ranked: bool = True
-
-    def text(self, column: str) -> str:
-        """Return the value of this row in a column as text; an empty text if there is no value."""
-        return number(self.values[column]) if column in self.values else ""
-
-    @property
-    def best(self) -> list[str]:
-        """Names of the columns that have the smallest number of this row; [] for a row of one column, or not ranked."""
-        if not self.ranked or len(self.values) < 2:
-            return []
-        smallest = min((value for value in self.values.values() if value is not None), default=None)
-        return [name for name, value in self.values.items() if value is not None and value == smallest]
-
-
-@dataclass(frozen=True)
-class Table:
-    """Table with a row per quantity and a column per predictor or model.
-
-    title: title that states the quantity and unit of the numbers. note: explanation of the rows, "" if not needed.
+    Args:
+        title: title that states the quantity and unit of the numbers.
+        rows: {label of a row: {name of a column, such as a predictor: number}}.
+        note: explanation of the rows, below the table.
+        unranked: labels of the rows in which the smallest number is not the best one.
     """
-
-    title: str
-    rows: tuple[Row, ...]
-    note: str = ""
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of all columns, in the order of their first occurrence in the rows."""
-        return list(dict.fromkeys(name for row in self.rows for name in row.values))
-
-    def text(self) -> str:
-        """Return the table for a terminal; a star marks the smallest number of each row."""
-        return self.listing().text()
-
-    def listing(self) -> Listing:
-        """Return the table with its numbers as text, for display; a star marks the smallest number of each row."""
-        lines, columns = [], self.columns
-        for row in self.rows:
+    columns = list(dict.fromkeys(name for row in rows.values() for name in row))
+    lines = []
+    for label, row in rows.items():
+        best = min((value for value in row.values() if value is not None), default=None)
+        # A row of one number has no star: there is nothing to compare it with.
+        if label in unranked or len(row) < 2:
+            best = None
+        cells = [label]
+        for name in columns:
+            star = "*" if best is not None and row.get(name) == best else " "
             # Numbers without a star end with a blank, so that the digits of a column are aligned.
-            stars = ["*" if name in row.best else " " for name in columns]
-            texts = [f"{row.text(name)} {star}" for name, star in zip(columns, stars, strict=True)]
-            lines.append((row.label, *texts))
-        return Listing(self.title, ("", *(f"{name}  " for name in columns)), tuple(lines), self.note)
+            cells.append(f"{number(row[name]) if name in row else ''} {star}")
+        lines.append(tuple(cells))
+    return Listing(title, ("", *(f"{name}  " for name in columns)), tuple(lines), note)
 
 
-def table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Table:
-    """Return a table in which the smallest number of each row is the best one.
-
-    rows: {label of a row: {name of a column: number}}. note: explanation below the table.
-    """
-    return Table(title, tuple(map(Row, rows, rows.values())), note)
-
-
-def result_tables(results: Results) -> list[Table]:
+def result_tables(results: Results) -> list[Listing]:
     """Return the tables of an evaluation: errors of replayed logs, of predictions per horizon, of torques, and of M."""
     tables = [*_replay_tables(results), *_horizon_tables(results), *_torque_tables(results)]
     if results.mass_errors:
-        tables.append(table(MASS_TITLE, {"M(q)": results.mass_errors}))
-    return list(map(_without_empty_baselines, tables))
+        tables.append(_predictor_table(MASS_TITLE, {"M(q)": results.mass_errors}))
+    return tables
 
 
-def _without_empty_baselines(full: Table) -> Table:
-    """Return the table without the columns of baselines that have no number in any row."""
+def _predictor_table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Listing:
+    """Return a table of the model and the baselines, without the baselines that have no number in any row."""
     # The column of the model is kept even without numbers: it shows that the model has no result.
-    columns, rows = {MODEL}, []
-    for row in full.rows:
-        columns |= {name for name, value in row.values.items() if value is not None}
-    for row in full.rows:
-        rows.append(replace(row, values={name: row.values[name] for name in row.values if name in columns}))
-    return replace(full, rows=tuple(rows))
-
-
-def joined(runs: Mapping[str, Results]) -> list[Table]:
-    """Return tables that compare runs: one column per run, with the numbers of the run's model.
-
-    Tables and rows that not all runs have are omitted. runs: {name of a run: its results}.
-    """
-    values: dict[tuple[str, str], dict[str, float | None]] = {}
-    for run, results in runs.items():
-        for one_table in result_tables(results):
-            for row in one_table.rows:
-                values.setdefault((one_table.title, row.label), {})[run] = row.values[MODEL]
-    tables: dict[str, dict[str, Numbers]] = {}
-    for (title, label), numbers in values.items():
-        # Rows that are absent in one run are omitted, since they cannot be compared.
-        if len(numbers) == len(runs):
-            tables.setdefault(title, {})[label] = numbers
-    return [table(title, rows) for title, rows in tables.items()]
+    columns, shown = {MODEL}, {}
+    for row in rows.values():
+        columns |= {name for name, value in row.items() if value is not None}
+    for label, row in rows.items():
+        shown[label] = {name: value for name, value in row.items() if name in columns}
+    return table(title, shown, note)
 
 
 def summary(results: Results) -> Listing | None:
@@ -142,7 +87,7 @@ def summary(results: Results) -> Listing | None:
     return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
 
 
-def _horizon_tables(results: Results) -> list[Table]:
+def _horizon_tables(results: Results) -> list[Listing]:
     """Return tables of the prediction errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
@@ -159,15 +104,15 @@ def _horizon_tables(results: Results) -> list[Table]:
     q = {name: errors.q for name, errors in horizon.errors.items()}
     qd = {name: errors.qd for name, errors in horizon.errors.items()}
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-    tables = [table(title, relative, note)]
+    tables = [_predictor_table(title, relative, note)]
     # Without a URDF the tip is unknown, and the table of tip errors is omitted.
     if any(value is not None for row in tips.values() for value in row.values()):
-        tables.append(table("Error of the tip's position [mm]", tips))
+        tables.append(_predictor_table("Error of the tip's position [mm]", tips))
     tables.append(_by_joint(results, f"Position error{{}} after {head}", "position", q))
     return [*tables, _by_joint(results, f"Velocity error{{}} after {head}", "velocity", qd)]
 
 
-def _torque_tables(results: Results) -> list[Table]:
+def _torque_tables(results: Results) -> list[Listing]:
     """Return tables of the nMSE of the torques, and of the torque errors per joint."""
     if not results.torque:
         return []
@@ -182,10 +127,10 @@ def _torque_tables(results: Results) -> list[Table]:
         note = f"logged in steps of their own size: {', '.join(results.torque_steps)}"
     title = "Torque error of the inverse dynamics, nMSE over all test samples"
     by_joint = _by_joint(results, "Torque error by joint, RMSE{}", "torque", rmse, note)
-    return [table(title, rows), by_joint]
+    return [_predictor_table(title, rows), by_joint]
 
 
-def _replay_tables(results: Results) -> list[Table]:
+def _replay_tables(results: Results) -> list[Listing]:
     """Return the tables of position errors under replayed commands: per trajectory and per joint."""
     tables, unit = [], thousandths(results.joint_types)
     for replay in results.replays:
@@ -196,9 +141,9 @@ def _replay_tables(results: Results) -> list[Table]:
         rows["mean of all"] = {name: 1000 * errors.mean for name, errors in replay.errors.items()}
         joints = {name: [1000 * rms for rms in errors.joints] for name, errors in replay.errors.items()}
         title = f"Commands replayed, {replay.name}: RMS"
-        tables.append(table(f"{title} of positions over all joints [{unit}]", rows))
+        tables.append(_predictor_table(f"{title} of positions over all joints [{unit}]", rows))
         title = f"{title} by joint, over all trajectories [{unit}]"
-        tables.append(table(title, _joint_rows(results.joints, joints)))
+        tables.append(_predictor_table(title, _joint_rows(results.joints, joints)))
     return tables
 
 
@@ -208,7 +153,7 @@ def _by_joint(
     quantity: str,
     errors: Mapping[str, Sequence[float | None]],
     note: str = "",
-) -> Table:
+) -> Listing:
     """Return a table of the errors of all predictors, with one row per joint.
 
     Args:
@@ -224,23 +169,9 @@ def _by_joint(
     if len(set(units)) > 1:
         pairs = zip(results.joints, units, strict=True)
         labels, common = tuple(f"{joint} [{unit}]" for joint, unit in pairs), ""
-    return table(title.format(common), _joint_rows(labels, errors), note)
+    return _predictor_table(title.format(common), _joint_rows(labels, errors), note)
 
 
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
     """Return {label of a joint: {predictor: error}}. errors: {predictor: errors of all joints}."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
-
-
-def limit_figures(results: Results) -> dict[str, float | None]:
-    """Return {name in `LIMITS`: figure of the model}; None for a figure that is not known.
-
-    The relative error of a rollout is the error at the longest horizon, which is the most difficult one.
-    """
-    values: dict[str, float | None] = dict.fromkeys(LIMITS)
-    if MODEL in results.torque:
-        torque = results.torque[MODEL]
-        values |= {"torque.nmse": torque.mean_nmse, "joint.nmse": torque.worst_nmse}
-    for horizon in results.horizons[-1:]:
-        values["rollout.rms"] = horizon.errors[MODEL].mean_relative_rms
-    return values

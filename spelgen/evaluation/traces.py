@@ -59,19 +59,15 @@ class Growth:
 
 
 @dataclass(frozen=True, eq=False)
-class MassCurves:
-    """Lower triangle of M along a trajectory, (entries, T) [kg m^2, kg m, kg], entries in row-major order."""
-
-    entries: Curve
-
-
-@dataclass(frozen=True, eq=False)
 class MassTrace:
-    """M along a trajectory at times t (T,) [s]. by: {predictor: its M, as `MassCurves`}."""
+    """M along a trajectory at times t (T,) [s].
+
+    by: {predictor: lower triangle of M, (entries, T) [kg m^2, kg m, kg], with the entries in row-major order}.
+    """
 
     trajectory: str
     t: Curve
-    by: dict[str, MassCurves]
+    by: dict[str, Curve]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +200,7 @@ def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> M
             mass = torch.as_tensor(predictor.mass_matrix(q)).numpy()
         # Curves with infinite values are omitted: they would make the axis useless for all other curves.
         if np.isfinite(mass).all():
-            curves[name] = MassCurves(mass[:, row, column].T)
+            curves[name] = mass[:, row, column].T
     return MassTrace(motion.trajectory, motion.t, curves)
 
 

@@ -39,21 +39,10 @@ class EvaluationTuning:
     rough_prediction: float = 0.3
     # [rad, m] Logs in which no joint has a larger range of positions contain no motion.
     smallest_motion: float = 0.01
-    # [1] Motion below this fraction of a joint's largest velocity is called slow.
-    slow: float = 0.1
-    # [1] If the RMS torque residuals of slow and of fast motion differ by more than this factor, the assessment names
-    # the kind of motion with the larger residual.
-    uneven: float = 1.4
     # [1] Logs that cover less than this fraction of a joint's range are reported as narrow.
     narrow_range: float = 0.5
     # [1] Approximate number of test positions at which M is compared with the true M.
     mass_positions: int = 500
-    # [1] Number of random positions at which the smallest eigenvalue of M is computed.
-    sampled_positions: int = 100_000
-    # [1] Number of steps of 1 ms of the simulated motion without input, in which the energy must not rise.
-    free_steps: int = 10_000
-    # [1] Number of initial states of the simulated motion without input.
-    started_states: int = 8
     # [1] Largest number of words of the first sentence of an assessment.
     headline: int = 20
     # [samples] Length of the windows from which the number of integration steps is chosen: the default length of the

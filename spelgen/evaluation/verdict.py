@@ -17,7 +17,6 @@ from spelgen.listing import number
 from spelgen.logs.checks import ELASTIC
 
 SEEN = "tested-on-training-data"
-STANDSTILL = " near standstill"
 TORQUE_USES: tuple[tuple[float, Sequence[str], Sequence[str]], ...] = (
     (TUNING.explained_for_contacts, ["feed-forward control", "contact detection"], []),
     (TUNING.explained_for_feed_forward, ["feed-forward control"], ["contact detection"]),
@@ -75,9 +74,9 @@ def verdict(
         sentence = f"Evaluated on training logs: {sentence[0].lower()}{sentence[1:]}"
     if uses.good and uses.bad:
         sentence += f", not for {listed(uses.bad)}"
-    joint, speed, proof = _worst_joint(results)
-    recommendations = _recommendations(results, identified or {}, limits, independent, joint, speed)
-    details = [f"worst at {joint}{speed}"] if joint else []
+    joint, proof = _worst_joint(results)
+    recommendations = _recommendations(results, identified or {}, limits, independent)
+    details = [f"worst at {joint}"] if joint else []
     details += [f"next, record {motion}" for motion in list(recommendations)[:1]]
     because = [] if elastic is None else [f"{elastic.where}: {elastic.message}."]
     for detail in details:
@@ -195,22 +194,19 @@ def _better_baselines(results: Results) -> list[str]:
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
-def _worst_joint(results: Results) -> tuple[str, str, str]:
-    """Return the name of the worst joint, words for its worst speed, and a sentence about its motion error.
+def _worst_joint(results: Results) -> tuple[str, str]:
+    """Return the name of the worst joint, "" if no error is known, and a sentence about its motion error.
 
     The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
-    joint of the largest motion error. The words are " near standstill" or " at speed" if the torque error of the joint
-    is clearly larger in slow or in fast motion, else "".
+    joint of the largest motion error.
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
     only_motion = error <= 1 - TUNING.explained_for_contacts and motion_error > TUNING.close_prediction
     if moving and (only_motion or not joint):
         amount = share(motion_error, "the motion")
-        return moving, "", f"At {moving} the error after {results.horizons[-1].name} is {amount}."
-    if not joint:
-        return "", "", ""
-    return joint, _slow_or_fast(results, results.joints.index(joint)), ""
+        return moving, f"At {moving} the error after {results.horizons[-1].name} is {amount}."
+    return joint, ""
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
@@ -226,35 +222,11 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     return "", math.inf
 
 
-def _slow_or_fast(results: Results, k: int) -> str:
-    """Return " near standstill" or " at speed", if the torque residual of joint k is larger in slow or in fast motion.
-
-    The result is "" if the residuals are similar, or if the curves contain too few slow or fast samples.
-    """
-    if not results.traces.torques:
-        return ""
-    residuals, speeds = [], []
-    for trace in results.traces.torques:
-        residuals.append(trace.measured[:, k] - trace.predicted[MODEL][:, k])
-        speeds.append(np.abs(trace.qd[:, k]))
-    squares, speed = np.square(np.concatenate(residuals)), np.concatenate(speeds)
-    slow = speed < TUNING.slow * np.nanmax(speed)
-    # With at most five slow or fast samples a root mean square is too uncertain.
-    if not 5 < slow.sum() < len(slow) - 5:
-        return ""
-    ratio = np.sqrt(np.nanmean(squares[slow]) / np.nanmean(squares[~slow]))
-    if ratio > TUNING.uneven:
-        return STANDSTILL
-    return " at speed" if ratio < 1 / TUNING.uneven else ""
-
-
 def _recommendations(
     results: Results,
     identified: FittedBaselines,
     limits: Limits,
     independent: Collection[str],
-    worst: str,
-    speed: str,
 ) -> dict[str, str]:
     """Return {motion to record: reason}, the most useful motion first.
 
@@ -263,8 +235,6 @@ def _recommendations(
         identified: content of least_squares.json, with the range of motion of the training logs.
         limits: position limits of the joints.
         independent: names of joints on whose position the dynamics do not depend.
-        worst: name of the worst joint, see `_worst_joint`.
-        speed: words for the speed at which its error is largest, see `_worst_joint`.
     """
     recommendations = {}
     trained = identified.get("coverage") or {}
@@ -277,8 +247,6 @@ def _recommendations(
     if outside:
         reason = f"The test logs exceed the range of the training logs: {shortened(outside, 3)}."
         recommendations[f"motion with the {outside[0]} that the test logs have"] = reason
-    if speed == STANDSTILL:
-        recommendations[f"slow reversals of {worst}"] = "Dry friction is learned from slow reversals."
     fractions = {}
     for joint, covered, bound in zip(results.joints, trained.get("q", ()), limits, strict=False):
         if bound is not None and bound[1] > bound[0] and joint not in independent:

@@ -1,4 +1,4 @@
-"""HTML pages about an arm: derived structure, identification by least squares, proposed motion, and logs."""
+"""HTML pages about an arm: derived structure, proposed motion, and logs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,16 @@ from spelgen.certificate.formulas import Formulas
 from spelgen.certificate.inspection import Inspection, range_text
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.excitation.excitation import ADVICE, Excitation
-from spelgen.fitting.run_record import Content
-from spelgen.identification.intervals import PRECISE
 from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
 from spelgen.render.charts import TUNING
-from spelgen.render.parameters import base_table
 from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.templates import render_page
 
 if TYPE_CHECKING:
     from spelgen.certificate.verify import Verification
-    from spelgen.identification.identification import Identification
 
 
 def inspection_page(
@@ -52,29 +48,6 @@ def inspection_page(
         joints=[(joint.name, joint.joint_type, range_text(joint)) for joint in inspection.arm.coordinates],
         closed=None if closed is None else formula_files.text(closed, width=100),
         proof=proof,
-    )
-
-
-def identification_page(identification: Identification, arm: Arm) -> str:
-    """Return the page about an identification: base parameters with intervals, and the torque residual.
-
-    identification: result of least squares. arm: the arm, for the values of its URDF.
-    """
-    record: Content = identification.to_dict()
-    # The page is made from the content of the JSON output, so that page and JSON agree.
-    words = [parameter["determined"] for parameter in record["base_parameters"]]
-    never = [name for name, visibility in record["identifiability"].items() if visibility == "never"]
-    return render_page(
-        "identification.html.jinja",
-        robot=identification.arm.name,
-        quality=identification.quality(),
-        sure=sum(word in PRECISE for word in words),
-        count=len(words),
-        never=never,
-        residuals=identification.listings()[0],
-        parameters=base_table(arm, record),
-        heading=identification.heading(),
-        notes=identification.diagnostics,
     )
 
 

@@ -1,20 +1,25 @@
 """Charts of the report on a run: training losses, curves of the evaluation, and ranges of motion of the logs."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
 
 from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.traces import FrictionTrace, Traces
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
-from spelgen.labels import LEAST_SQUARES, MODEL, NamedJoint, named_joints, thousandths
+from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, NamedJoint, entry_name, named_joints, thousandths
 from spelgen.listing import number
-from spelgen.render import plots
 from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
-from spelgen.render.plots import JointRow, Panel
+from spelgen.render.plots import JointRow, Panel, stacks
 from spelgen.spec import ModelSpec
+
+
+def style(predictor: str) -> str:
+    """Return the CSS class of the lines of a predictor: its name in lower case, with hyphens."""
+    return re.sub(r"\W+", "-", predictor.lower())
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
@@ -24,18 +29,16 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
     drawn = dict.fromkeys(("growth", "mass", "friction"))
     growth, mass = traces.growth, traces.mass
     if growth is not None:
-        errors = {name: (growth.seconds, error) for name, error in growth.relative.items()}
-        # Only the model and least squares have bands of quantiles, since bands of all predictors would overlap.
-        drawn["growth"] = plots.growth_chart(errors, plots.STYLES, (MODEL, LEAST_SQUARES))
+        drawn["growth"] = growth_chart(growth)
     if mass is not None and mass.by:
-        drawn["mass"] = plots.mass_panels(mass, spec.joint_types)
+        drawn["mass"] = mass_panels(mass, spec.joint_types)
     if traces.friction is not None:
         drawn["friction"] = friction_panels(traces.friction, traces.torques, joints)
     torques, trajectories = {}, {}
     for trace in traces.torques:
         torques[f"{trace.which.capitalize()} trajectory: {trace.trajectory}"] = torque_panels(trace, joints)
     for example in traces.trajectories:
-        panels = plots.trajectory_panels(example, joints, f"prediction {example.which}")
+        panels = trajectory_panels(example, joints, f"prediction {example.which}")
         trajectories[_motion_title(example, spec)] = panels
     return drawn | {"torques": torques, "trajectories": trajectories}
 
@@ -52,6 +55,85 @@ def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
         return f"{which} log replayed: {example.trajectory}, {off}"
     start = f"{example.trajectory}, from t = {example.start:g} s"
     return f"{which} prediction: {start}, relative error {number(example.error)}"
+
+
+def growth_chart(growth: Growth) -> Chart:
+    """Return the chart of the relative error over the prediction horizon; growth: errors of all predictors."""
+    marks: list[Mark] = []
+    for name, error in growth.relative.items():
+        marks.append(Line(name, growth.seconds, error.median, style(name)))
+        # Only the model and least squares have bands of quantiles, since bands of all predictors would overlap.
+        if name in (MODEL, LEAST_SQUARES):
+            label = f"{name}, 10 to 90 %"
+            marks.append(Band(label, growth.seconds, error.low, error.high, style(name)))
+    return line_chart(
+        marks, "Relative error: error by horizon", "horizon [s]", "error / motion", log=True, log_x=True,
+        limits=_error_limits(growth), width=520, height=260,
+    )  # fmt: skip
+
+
+def _error_limits(growth: Growth) -> tuple[float, float] | None:
+    """Return the limits of the axis of prediction errors, so that errors of diverged baselines do not extend it.
+
+    The limits include the 10 % and 90 % quantiles of the error of the model, and the median errors of all predictors.
+    Medians above `TUNING.outlier` times the largest quantile of the model are excluded. None is returned if no error is
+    positive.
+    """
+    of_model = growth.relative[MODEL]
+    model_errors = np.concatenate([of_model.low, of_model.high])
+    values = np.concatenate([model_errors, *(error.median for error in growth.relative.values())])
+    # Zeros are excluded from the logarithmic axis. Diverged baselines are excluded, as they would compress all lines.
+    values = values[(values > 0) & (values <= TUNING.outlier * np.nanmax(model_errors))]
+    if not values.size:
+        return None
+    return float(values.min()) / 1.3, 1.3 * float(values.max())
+
+
+def trajectory_panels(example: PredictedMotion, joints: Sequence[NamedJoint], motion: str) -> list[Panel]:
+    """Return the charts of each joint: position and position error and, if logged, velocity and velocity error.
+
+    Args:
+        example: A measured motion and its prediction.
+        joints: Names and units of the joints.
+        motion: Name of the animated motion with the same time axis.
+    """
+    rows = []
+    position = ("position", example.q, example.predicted_q)
+    velocity = ("velocity", example.qd, example.predicted_qd)
+    for quantity, measured, predicted in (position, velocity):
+        # A replayed log of position servos has no velocities, so its charts of velocity are omitted.
+        if measured is None or predicted is None:
+            continue
+        lines = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]
+        # The command is the first curve, so that the measured curve is drawn above it.
+        if example.u is not None:
+            lines.insert(0, ("commanded", example.u, "hold"))
+        rows.append(JointRow(quantity, quantity, quantity, lines))
+        # The error has its own chart: on the scale of the motion it would be a flat line.
+        error = [("predicted", predicted - measured, "predicted")]
+        rows.append(JointRow(f"Error of the {quantity}", "error", quantity, error, 100))
+    return stacks(example.t, rows, joints, motion)
+
+
+def mass_panels(trace: MassTrace, joint_types: Sequence[str]) -> list[Panel]:
+    """Return one chart over time for each entry of M that is not always zero.
+
+    Args:
+        trace: Entries of M along a trajectory, of one predictor at least.
+        joint_types: Types of the joints, for the units of the entries.
+    """
+    panels = []
+    # An entry of M whose magnitude never exceeds `zero` is zero except for rounding errors, and gets no chart.
+    zero = TUNING.zero * max(np.nanmax(np.abs(entries)) for entries in trace.by.values())
+    for index, (i, j) in enumerate(np.argwhere(np.tri(len(joint_types))).tolist()):
+        lines = [Line(name, trace.t, entries[index], style(name)) for name, entries in trace.by.items()]
+        if np.nanmax(np.abs([line.heights for line in lines])) > zero:
+            name = entry_name(i, j)
+            # An entry between a revolute and a prismatic joint has the unit of a first moment.
+            unit = UNITS[joint_types[i]].inertia if joint_types[i] == joint_types[j] else "kg m"
+            chart = line_chart(lines, name, "t [s]", f"{name} [{unit}]", width=330)
+            panels.append(Panel(name, (chart,)))
+    return panels
 
 
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
@@ -83,7 +165,7 @@ def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Pane
         JointRow("Residual", "residual", "torque", [("residual", measured - predicted, "model")], 100),
         JointRow("Components of the torque", "components", "torque", components, 162),
     ]
-    return plots.stacks(trace.t, rows, joints, f"torque {trace.which}")
+    return stacks(trace.t, rows, joints, f"torque {trace.which}")
 
 
 def friction_panels(
@@ -116,7 +198,7 @@ def friction_panels(
                 marks.append(Line("measured, over time", qd, measured, "loop"))
                 marks.append(Line("model, over time", qd, modelled, "loop model"))
         for name, curves in friction.by.items():
-            marks.append(Line(name, friction.qd[k], curves[k], plots.STYLES[name]))
+            marks.append(Line(name, friction.qd[k], curves[k], style(name)))
         limits, axis = _friction_limits(np.concatenate(values), curve), joint.axis("torque", "friction")
         title = f"Friction of {joint.name}"
         chart = line_chart(marks, title, joint.axis("velocity"), axis, limits=limits, height=220)

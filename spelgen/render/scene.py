@@ -146,8 +146,8 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
     """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
 
-    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum (revolute) or a block
-    (prismatic). names: the drawn links. radius: radius of the tubes [m].
+    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum about its axis. names: the
+    drawn links. radius: radius of the tubes [m].
     """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]
@@ -162,11 +162,8 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     if not below and inertial is not None:
         meshes += tube(np.zeros(3), np.array(inertial.com, dtype=float), 0.7 * radius)
     if joint is not None and joint.moves:
-        # A prismatic joint is drawn as a square block, a revolute joint as a drum. `width` is the radius of the block
-        # or drum and `half` is half of its length, both in radii of the tube.
-        sides, width, half = (4, 1.8, 2.4) if joint.type == "prismatic" else (10, 1.5, 1.725)
-        ends = half * radius * _axis(joint)
-        meshes += tube(-ends, ends, width * radius, sides)
+        ends = 1.725 * radius * _axis(joint)
+        meshes += tube(-ends, ends, 1.5 * radius)
     return joined(meshes)
 
 
@@ -205,21 +202,20 @@ def joined(meshes: Sequence[Trimesh]) -> Shape:
     return Shape(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def tube(start: np.ndarray, end: np.ndarray, radius: float, sides: int = 10) -> list[Trimesh]:
+def tube(start: np.ndarray, end: np.ndarray, radius: float) -> list[Trimesh]:
     """Return a closed prism as a list of one mesh; an empty list if the prism is shorter than half its radius.
 
     Args:
         start: First end point of the prism's axis, (3,) [m].
         end: Second end point of the prism's axis, (3,) [m].
         radius: Radius of the circumscribed cylinder [m].
-        sides: Number of sides.
     """
     import trimesh
 
     # A tube between joints at nearly the same place would be a disc, so it is omitted.
     if np.linalg.norm(end - start) <= radius / 2:
         return []
-    return [trimesh.creation.cylinder(radius, segment=[start, end], sections=sides)]
+    return [trimesh.creation.cylinder(radius, segment=[start, end], sections=10)]
 
 
 def triangles(shape: LinkShape) -> Trimesh:

@@ -7,8 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Row, Rows
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import Row, Rows, applied
 from spelgen.runtime.rows import Joint, Link, vector
 
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Rows
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import Rows, applied
 from spelgen.runtime.rows import vector
 
 

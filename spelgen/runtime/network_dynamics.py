@@ -9,9 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from spelgen.runtime.motors import MotorInputs
 from spelgen.runtime.networks import JointEncoding, MaskedNetwork
-from spelgen.runtime.parts import Inputs, Intermediates, Layers, Mass, Parameters
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.parts import Intermediates, Layers, Mass, Parameters, applied
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rows import Joint, vector
 
 
@@ -44,7 +45,7 @@ class NetworkDynamics(PortHamiltonian):
         potential: MaskedNetwork,
         potential_scale: float,
         friction: NetworkFriction,
-        inputs: Inputs | None = None,
+        inputs: MotorInputs | None = None,
     ) -> None:
         super().__init__(joints, inputs)
         self.encoding, self.mass = JointEncoding(joints), mass

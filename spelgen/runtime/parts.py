@@ -1,4 +1,4 @@
-"""Interfaces of the mass matrix M(q) and the input matrix G of a model, and shared types of the runtime."""
+"""Interface of the mass matrix M(q) of a model, and shared types and functions of the runtime."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -46,20 +46,12 @@ class Mass(Protocol):
         """
 
 
-class Inputs(Protocol):
-    """Interface of a constant input matrix G: joint torques = G tau, with the inputs tau of the motors.
-
-    G differs from the identity if motors drive several joints, or if joints are passive (without motor).
-    """
-
-    def gains(self) -> Tensor:
-        """Return the input matrix G, (n, n): joint torque per input of a motor."""
-
-    def force(self, tau: Tensor) -> Tensor:
-        """Return the joint torques G tau, (..., n) [Nm, N], at inputs tau, (..., n)."""
-
-    def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G tau = force, for joint torques force, (..., n)."""
+def applied(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
+    # For one state (a vector) the product is a single operation; for a batch, two reshapes are added.
+    if vector.dim() == 1:
+        return matrix @ vector
+    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def symmetric(*rows: Sequence[Tensor | float]) -> Tensor:

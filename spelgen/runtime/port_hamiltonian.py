@@ -6,16 +6,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from spelgen.runtime.parts import Configuration, Inputs, Parameters, Position
+from spelgen.runtime.motors import MotorInputs
+from spelgen.runtime.parts import Configuration, Parameters, Position, applied
 from spelgen.runtime.rows import Joint
-
-
-def applied(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    # For one state (a vector) the product is a single operation; for a batch, two reshapes are added.
-    if vector.dim() == 1:
-        return matrix @ vector
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 class PortHamiltonian(nn.Module):
@@ -46,7 +39,7 @@ class PortHamiltonian(nn.Module):
     memory_rate: Callable[[Tensor, Tensor], Tensor]  # dz/dt, (..., n, K), from the friction state z and qd
     elements = 0  # number of bristles per joint, K
 
-    def __init__(self, joints: Sequence[Joint], inputs: Inputs | None = None) -> None:
+    def __init__(self, joints: Sequence[Joint], inputs: MotorInputs | None = None) -> None:
         super().__init__()
         self.joints, self.n = tuple(joints), len(joints)
         self.inputs = inputs

@@ -13,8 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from spelgen.runtime.networks import JointEncoding, MaskedNetwork
-from spelgen.runtime.parts import Entries, Intermediates, Layers
-from spelgen.runtime.port_hamiltonian import applied
+from spelgen.runtime.parts import Entries, Intermediates, Layers, applied
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidConfiguration, RigidParameters
 from spelgen.runtime.rows import Joint, vector
 

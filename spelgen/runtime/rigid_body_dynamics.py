@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from spelgen.runtime.body_chain import ChainConfiguration, InertialParameters, chain_of_links
 from spelgen.runtime.friction_laws import FrictionConstants, FrictionLaws, turning
-from spelgen.runtime.motors import PositionServo
-from spelgen.runtime.parts import Configuration, Inputs, Parameters, Row, Rows
-from spelgen.runtime.port_hamiltonian import PortHamiltonian, applied
+from spelgen.runtime.motors import MotorInputs, PositionServo
+from spelgen.runtime.parts import Configuration, Parameters, Row, Rows, applied
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.rows import Joint, Link, vector
 
 
@@ -67,7 +67,7 @@ class RigidBodyDynamics(PortHamiltonian):
         links: Sequence[Link],
         gravity: Row,  # gravitational acceleration in the base frame [m/s^2]
         friction: FrictionLaws,
-        inputs: Inputs | None = None,
+        inputs: MotorInputs | None = None,
         motor_speeds: Rows | None = None,
         servo: PositionServo | None = None,
     ) -> None:
