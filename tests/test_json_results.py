@@ -1,4 +1,4 @@
-"""With --format json a command prints one line of JSON."""
+"""With --format json a command prints one line of JSON; figures beyond a limit have their own exit code."""
 
 import json
 from types import SimpleNamespace
@@ -7,12 +7,13 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from spelgen.cli.evaluate_command import LIMIT_EXCEEDED
 from spelgen.cli.main import app
 
 
-def spelgen(*arguments):
+def spelgen(*arguments, code=0):
     done = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == code, done.output
     return SimpleNamespace(out=done.stdout, err=done.stderr)
 
 
@@ -46,6 +47,25 @@ def test_every_step_answers_in_json(folder):
     assert excited["condition"] > 1
     identified = json.loads(spelgen("identify", folder / "arm.urdf", *data, *as_json).out)
     assert identified
-    evaluated = json.loads(spelgen("evaluate", run, *data, *as_json).out)
-    assert evaluated == json.loads((run / "evaluation.json").read_text())
-    assert evaluated["torque"]["model"]["mean_nmse"] > 0
+    evaluated = spelgen(
+        "evaluate",
+        run,
+        *data,
+        *as_json,
+        "--limit",
+        "torque.nmse=1e-9",
+        "--limit",
+        "joint.nmse=9",
+        code=LIMIT_EXCEEDED,
+    )
+    figure = json.loads(evaluated.out)["torque"]["model"]["mean_nmse"]
+    assert evaluated.err.splitlines()[-1] == (
+        f"limit exceeded: torque.nmse is {figure:.4g}, expected at most 1e-09"
+    )
+
+
+def test_a_limit_that_is_none_is_a_usage_error(folder):
+    told = spelgen("evaluate", folder / "run", "--data", folder / "logs", "--limit", "torque=1", code=2)
+    assert "'torque=1' is not FIGURE=MAX with one of torque.nmse, joint.nmse, rollout.rms" in " ".join(
+        told.err.split()
+    )

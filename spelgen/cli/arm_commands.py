@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 import typer
 
 from spelgen.cli import options
-from spelgen.cli.console import FAILED, answer, note, refuse_warnings, say
-from spelgen.cli.options import flag, option, output_option
-from spelgen.files import write_text
+from spelgen.cli.console import FAILED, deliver, note, refuse_warnings
+from spelgen.cli.options import flag, option
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:
@@ -32,10 +31,8 @@ def inspect(
     assume: Assume = options.ASSUMPTION,
     formulas: bool = flag("--formulas", "Write M and V as expressions in q and base parameters."),
     entry: str | None = options.ENTRY,
-    format: InspectionFormat | None = option(
-        "", "Format of the result; default: that of the suffix of -o, else text."
-    ),
-    output: Path | None = output_option("FILE", "Write the result to a file."),
+    format: InspectionFormat | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
     strict: bool = options.STRICT,
     verify: bool = flag("--verify", "Verify the structure by Pinocchio, SymPy and numeric samples."),
 ) -> None:
@@ -62,8 +59,7 @@ def inspect(
         closed = inspection.closed_forms(chosen_entry, longest=longest)
     # The result is printed first: afterwards a warning (with --strict) or a failed proof ends the command with an
     # error.
-    text = _text(chosen, inspection, closed, proof, arm.robot.path)
-    say(text.removesuffix("\n") if output is None else f"wrote {write_text(output, text)}")
+    deliver(_text(chosen, inspection, closed, proof, arm.robot.path), output)
     if strict:
         refuse_warnings(
             f"{chosen_arm.robot}: ", [x.severity for x in inspection.diagnostics].count("warning")
@@ -118,7 +114,8 @@ def identify(
     ),
     friction: str | None = option(",".join(EFFECTS), FRICTION_HELP),
     accept: list[str] | None = options.ACCEPT,
-    format: options.TextOrJson = options.TEXT_OR_JSON,
+    format: options.TextOrJson | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
 ) -> None:
     """Identify base parameters and friction by least squares."""
     paths = options.logs(data, extra_logs)
@@ -146,4 +143,5 @@ def identify(
     for diagnostic in result.diagnostics:
         note(diagnostic)
 
-    answer(format, result.to_dict(), result.text())
+    forms = {"text": result.text, "json": lambda: json.dumps(result.to_dict(), indent=2)}
+    options.write_result(format, output, forms)

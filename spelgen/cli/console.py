@@ -17,7 +17,7 @@ import typer
 from typer.models import OptionInfo
 
 from spelgen.errors import SpelgenError, in_one_line
-from spelgen.files import local, with_addresses
+from spelgen.files import local, with_addresses, write_text
 from spelgen.labels import counted, printable
 
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
@@ -161,6 +161,14 @@ def answer(form: str, record: Mapping[str, object], *lines: str) -> None:
         return
     for line in lines:
         say(line)
+
+
+def deliver(text: str, output: Path | None) -> None:
+    """Print a result without its last line end, or write it to the file `output` and print the path of the file."""
+    if output is None:
+        say(text.removesuffix("\n"))
+    else:
+        say(f"wrote {write_text(output, text)}")
 
 
 def refuse_warnings(subject: str, count: int) -> None:

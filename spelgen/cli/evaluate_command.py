@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -12,11 +13,16 @@ from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
 from spelgen.cli.options import argument, flag, option, output_option
 from spelgen.cli.train_settings import UsageError
+from spelgen.evaluation.tables import LIMITS, limit_figures, summary
 from spelgen.files import write_json
 from spelgen.listing import WIDTH
 
 if TYPE_CHECKING:
     from spelgen.comparison.arms import Comparison
+
+
+LIMIT_EXCEEDED = 3  # Exit code if an error exceeds --limit. Code 2 is used by usage errors.
+LIMIT_HELP = f"Exit with {LIMIT_EXCEEDED} if a figure is larger: {', '.join(LIMITS)}; once for each."
 
 
 def evaluate(
@@ -25,7 +31,9 @@ def evaluate(
     data: list[Path] | None = options.DATA,
     mapping: Path | None = options.MAPPING_FILE,
     filter: float | None = options.FILTER,
-    format: options.TextOrJson = options.TEXT_OR_JSON,
+    format: Literal["text", "json"] | None = options.result_format(),
+    output: Path | None = options.OUTPUT,
+    limit: list[str] | None = option("FIGURE=MAX", LIMIT_HELP),
     truth: Path | None = option("URDF", "The true arm of simulated logs: state the error of M(q)."),
     quick: bool = flag("--quick", "Torque errors only, without rollouts."),
 ) -> None:
@@ -34,7 +42,9 @@ def evaluate(
     The result begins with an assessment of the model. The result is also written to evaluation.json in the run folder,
     and no other file is changed.
     """
+    # Options --limit are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
+    limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
     from spelgen.evaluation.subject import read_test_logs
@@ -61,7 +71,30 @@ def evaluate(
     # Diagnostics go to stderr, because scripts read the result from stdout.
     for diagnostic in results.diagnostics:
         note(diagnostic)
-    answer(format, record, results.text())
+    options.write_result(format, output, {"text": results.text, "json": lambda: json.dumps(record)})
+    # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
+    values = limit_figures(results)
+    exceeded = []
+    for name, limit_value in limits:
+        value = values[name]
+        if value is None or value > limit_value:
+            text = "not known" if value is None else f"{value:.4g}"
+            exceeded.append(f"limit exceeded: {name} is {text}, expected at most {limit_value:g}")
+    if exceeded:
+        note("\n".join(exceeded))
+        raise typer.Exit(LIMIT_EXCEEDED)
+
+
+def _limit(text: str) -> tuple[str, float]:
+    """Return a text such as `torque.nmse=0.01` as a name and a number. Raises a usage error for any other text."""
+    name, _, value = text.partition("=")
+    try:
+        if name in LIMITS:
+            return name, float(value)
+    except ValueError:
+        pass
+    message = f"{text!r} is not FIGURE=MAX with one of {', '.join(LIMITS)}"
+    raise typer.BadParameter(message, param_hint="'--limit'")
 
 
 def estimate(
@@ -127,7 +160,6 @@ def report(
     """Write an HTML page about a run."""
     options.choose_format(None, output, ["html"])
     from spelgen.evaluation.results import Results
-    from spelgen.evaluation.tables import summary
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.render.report_page import write_report
 

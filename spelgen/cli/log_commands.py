@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,7 +162,10 @@ def logs(
     logs, notes = read_bounded_logs(paths, arm, log_mapping)
     result = check_logs(logs, arm, log_mapping)
     result = replace(result, findings=(*notes, *result.findings))
-    answer(format, result.to_dict(), result.text())
+    if format == "text":
+        say(result.text())
+    else:
+        say(json.dumps(result.to_dict(), indent=2))
     # The HTML page is also written for logs with errors, because charts may show the cause of an error.
     if html is not None:
         from spelgen.render.arm_pages import logs_page

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
 
+from spelgen.cli.console import deliver
 from spelgen.errors import SpelgenError, suggestion
 from spelgen.settings.log_mapping import Accepted
 
@@ -92,6 +93,12 @@ FILTER = option("HZ", "Cutoff frequency of the zero-phase low-pass filter; 0: no
 ADDRESS = option("HOST:PORT", "Address of a running Ray cluster; default: a new one on this machine.")
 STRICT = flag("--strict", "Exit with 1 if there is any warning.")
 FORCE = flag("--force", "Overwrite existing output.")
+OUTPUT = output_option("FILE", "Write the result to a file.")
+
+
+def result_format() -> Declared:
+    """Return the option `--format` of a command; each command has its own formats, which its help lists."""
+    return option("", "Format of the result; default: that of the suffix of -o, else text.")
 
 
 def choose_format(format: str | None, output: Path | None, formats: Container[str]) -> str:
@@ -107,6 +114,11 @@ def choose_format(format: str | None, output: Path | None, formats: Container[st
         message = f"{output.name!r} has no suffix of a format of this command: {forms}"
         raise typer.BadParameter(message, param_hint="'--output'")
     return suffixes[output.suffix.lower()]
+
+
+def write_result(format: str | None, output: Path | None, forms: Mapping[str, Callable[[], str]]) -> None:
+    """Print a result, or write it to a file. forms: {format: function that returns the result in this format}."""
+    deliver(forms[choose_format(format, output, forms)]() + "\n", output)
 
 
 def names(text: str | None) -> list[str] | None:

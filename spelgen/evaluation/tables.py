@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, URDF, observed, share, thousandths
 from spelgen.listing import Listing, number
 
-# `spelgen.evaluation.results` imports this module, so its class is imported for type checkers only.
+# `spelgen --help` imports this module for LIMITS. An import of the results would also load torch.
 if TYPE_CHECKING:
     from spelgen.evaluation.results import Results
 
@@ -21,6 +21,8 @@ OBSERVER = (
 Numbers = Mapping[str, float | None]
 """Numbers of a row, by the name of the column; None for an unknown number."""
 MASS_TITLE = "Error of the mass matrix, relative to the true one (at positions of the test logs)"
+LIMITS = ("torque.nmse", "joint.nmse", "rollout.rms")
+"""Names of the figures that `spelgen evaluate --limit` accepts."""
 
 
 def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Container[str] = ()) -> Listing:
@@ -175,3 +177,17 @@ def _by_joint(
 def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | None]]) -> dict[str, Numbers]:
     """Return {label of a joint: {predictor: error}}. errors: {predictor: errors of all joints}."""
     return {label: {name: values[k] for name, values in errors.items()} for k, label in enumerate(labels)}
+
+
+def limit_figures(results: Results) -> dict[str, float | None]:
+    """Return {name in `LIMITS`: figure of the model}; None for a figure that is not known.
+
+    The relative error of a rollout is the error at the longest horizon, which is the most difficult one.
+    """
+    values: dict[str, float | None] = dict.fromkeys(LIMITS)
+    if MODEL in results.torque:
+        torque = results.torque[MODEL]
+        values |= {"torque.nmse": torque.mean_nmse, "joint.nmse": torque.worst_nmse}
+    for horizon in results.horizons[-1:]:
+        values["rollout.rms"] = horizon.errors[MODEL].mean_relative_rms
+    return values
