@@ -1,6 +1,7 @@
 """`spelgen excite`: motions stay within limits, start and end at rest, and are more informative than random ones."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,13 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
     )  # 36 base parameters, and 4 of friction and rotor per joint, of which two are no independent parameters
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
+
+
+def test_a_random_motion_beyond_effort_limits_is_called_so(found):
+    """The comparison with a random motion is no praise of a motion that the drives cannot run."""
+    assert not found.first_overruns
+    assert "beyond effort limits" not in found.text()
+    assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):

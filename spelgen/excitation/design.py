@@ -97,14 +97,15 @@ def excite(
             f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
             f"{reach * fraction:.0%} of the ranges."
         )
-    states = np.stack([motion.q, motion.qd, motion.qdd])
+    random, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
         motion=motion,
         approach=to_motion,
         collisions=statement,
         parameters=len(criterion.columns),
-        first=criterion.condition(criterion.states(starts[0])),
+        first=criterion.condition(random),
+        first_overruns=bool((criterion.largest_efforts(random) > 1).any()),
         condition=criterion.condition(criterion.states(best)),
         efforts=criterion.largest_efforts(torch.from_numpy(states)),
     )

@@ -26,6 +26,7 @@ class Excitation:
         collisions: Text about the checked collisions.
         parameters: Number of base parameters, friction and armature included.
         first: Condition number for the first random motion, for comparison.
+        first_overruns: True if the torques of that motion exceed effort limits.
         condition: Condition number of the base regressor with columns of unit length for `motion`.
         efforts: Largest rigid-body torque divided by the effort limit, (n,) [1]; NaN without a limit or inertials.
     """
@@ -36,6 +37,7 @@ class Excitation:
     collisions: str
     parameters: int
     first: float
+    first_overruns: bool
     condition: float
     efforts: np.ndarray
 
@@ -46,6 +48,8 @@ class Excitation:
             f"condition number of the {self.parameters} base parameters' regressor: "
             f"{self.condition:.3g}\n  of the first motion at random: {self.first:.3g}"
         )
+        if self.first_overruns:
+            head += ", beyond effort limits"
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
