@@ -1,5 +1,6 @@
 """Reader of NPZ archives that contain one array per column, or matrices with one column per joint."""
 
+import json
 import re
 from collections.abc import Collection, Sequence
 from itertools import starmap
@@ -10,11 +11,12 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogTable, missing_columns
+from spelgen.logs.tables import JOINTS_KEY, LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = "joints"  # name of the optional array with the joints' names, in the order of matrix columns
+# Names of the optional array with the joints' names, in the order of matrix columns: `joints`, `joint_names`, `names`.
+JOINT_NAMES = re.compile(r"joints?|(joint_?)?names?", re.IGNORECASE)
 TRAJECTORY = "{trajectory}"
 
 Columns = dict[str, tuple[str, int]]
@@ -59,6 +61,13 @@ class NpzArrays:
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
         """Return an error about the array of this name; other arguments as for `LogError`."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
+
+    def joint_names(self) -> tuple[str, list[str]]:
+        """Return the name of the array of joint names, and the joint names; ("", []) if there is none."""
+        for name in filter(JOINT_NAMES.fullmatch, self.names):
+            if self[name].dtype.kind in "US":
+                return name, [x.decode() if isinstance(x, bytes) else x for x in self[name].ravel().tolist()]
+        return "", []
 
     def is_vector(self, name: str) -> bool:
         """Return True if an array has the shape (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
@@ -145,7 +154,8 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
     samples = max(rows.values(), default=0)
-    return _equally_long(arrays, [name for name in names if rows[name] == samples], vectors, {})
+    table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors, {})
+    return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
 
 def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
@@ -164,15 +174,15 @@ def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Column
     if further:
         got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
         raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
-    if JOINT_NAMES in arrays.names:
-        logged = list(map(str, arrays[JOINT_NAMES].ravel()))
+    stored, logged = arrays.joint_names()
+    if stored:
         absent = [name for name in names if name not in logged or len(logged) != width]
         if absent:
             expected = f"{absent[0]} among the names of the {width} columns of {matrix}"
-            raise arrays.error(JOINT_NAMES, f"the joints {', '.join(logged)}", expected)
+            raise arrays.error(stored, f"the joints {', '.join(logged)}", expected)
         names = logged
     elif width != len(names):
         is_turned = rows == len(names)
-        do = "transpose it: rows are times" if is_turned else f"name them by an array {JOINT_NAMES!r}"
+        do = "transpose it: rows are times" if is_turned else "name them by an array 'joints'"
         raise arrays.error(matrix, f"{width} columns", f"{len(names)}, one for each joint", do)
     return {pattern.replace("{joint}", name): (matrix, index) for index, name in enumerate(names)}

@@ -41,8 +41,17 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
 
 
 def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a file with a JSON object per line and row."""
-    return [LogTable.of(_flat(pa.json.read_json(file)), mapping, header=0)]
+    """Return a list with one table, the content of a file with a JSON object per line and row.
+
+    A last line that is cut off is omitted, with a remark.
+    """
+    text = file.read_bytes()
+    lines, _, last = text.rstrip().rpartition(b"\n")
+    # The last line of a recorder that was killed is cut off.
+    is_cut = bool(lines) and not last.endswith(b"}")
+    table = pa.json.read_json(pa.BufferReader(lines if is_cut else text))
+    remarks = (f"the last line is cut off and was left out: {last[:30].decode(errors='replace')}",) * is_cut
+    return [LogTable.of(_flat(table), mapping, remarks=remarks, header=0)]
 
 
 def _flat(table: pa.Table) -> pa.Table:

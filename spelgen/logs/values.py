@@ -68,6 +68,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
             do = "'dropouts: dropped' under 'logs' in the robot's YAML leaves out those rows"
+            if not np.isfinite(data[:, k]).any():
+                do = f"name a column with values in place of {layout.columns[k]} under 'logs' in the robot's YAML"
         raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 
@@ -186,7 +188,7 @@ def _column(table: pa.Table, name: str) -> Column:
     lists, index = table.column(element[0]), element[1]
     is_text = not pa.types.is_nested(lists.type)
     if is_text:
-        bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
+        bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[({]\s*|\s*[\])}].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
     # Lists that are too short are replaced by null, since Arrow would raise an error for them.
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
@@ -221,6 +223,8 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
                     do += ", the header of a second file; joined recordings need a column 'trajectory'"
                 elif re.fullmatch(r"-?\d{1,3}([,.' ]\d{3})+([,.]\d*)?", text):
                     do = "write numbers without separators of thousands"
+                elif name == layout.columns[0] and re.search(r"\d:\d\d", text):
+                    do = "write times as numbers, or like 2025-10-26T11:59:56.123 or 11:59:56.123"
                 elif re.match(NUMBER, text):
                     do = "write numbers only, and the unit as 'units' under 'logs' in the robot's YAML"
                 raise layout.row_error(repr(text[:60]), rows[index], name, "a number", do) from error
