@@ -90,7 +90,7 @@ def _of_one_arm(
             got = f"{counted(len(messages), 'joint state')}, none with names of joints"
             raise LogError(got, file=path, expected=f"joint states of {', '.join(names)}")
         got = f"joint states of {', '.join(logged)} only"
-        raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, logged))
+        raise LogError(got, file=path, expected=", ".join(names), do=names_line(names, logged))
     joints_of: dict[str, set[str]] = {}
     for message in of_arm:
         joints_of.setdefault(message.topic, set()).update(arm.intersection(message.state.name))
@@ -139,7 +139,7 @@ def _joint_states(
     return columns
 
 
-def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
+def names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
     names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains

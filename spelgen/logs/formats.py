@@ -27,7 +27,9 @@ CONVERT = {
     ".zstd": "zstd -d {0}", ".zst": "zstd -d {0}", ".gz": "gunzip {0}", ".xz": "unxz {0}", ".bz2": "bunzip2 {0}",
     **dict.fromkeys((".txt", ".dat", ".asc", ".log"), "mv {0} {1}.csv"),
     ".xlsx": _PYTHON.format("pandas; pandas.read_excel('{0}').to_csv('{1}.csv', index=False)"),
-    **dict.fromkeys((".feather", ".arrow"), _PYTHON.format("pandas; pandas.read_feather('{0}').to_parquet('{1}.parquet')")),
+    **dict.fromkeys((".feather", ".arrow"), _PYTHON.format(
+        "pandas; pandas.read_feather('{0}').to_parquet('{1}.parquet')"
+    )),
     **dict.fromkeys((".pkl", ".pickle"), _PYTHON.format(
         "pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"
     )),

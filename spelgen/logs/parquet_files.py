@@ -1,6 +1,6 @@
 """Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,17 @@ import pyarrow as pa
 import pyarrow.json
 import pyarrow.parquet
 
-from spelgen.errors import LogError, collect
+from spelgen.errors import LogError, collect, shortened
 from spelgen.files import read_json, require_regular_file
+from spelgen.labels import counted
+from spelgen.logs.bags import names_line
 from spelgen.logs.tables import LogTable, reading
+from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
 INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
-STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
+STATE, ACTION, TIMESTAMP, EPISODE = "observation.state", "action", "timestamp", "episode_index"
 ENDING = ".pos"
 # Largest magnitude of positions that LeRobot has normalised to -100..100, with a tolerance for rounding to single
 # precision.
@@ -69,18 +72,20 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
-    columns: dict[str, dict[str, str | None]] = {}
-    for joint in joints:
-        name = mapping.log_name(joint)
-        for names in (states, actions):
-            if name not in names:
-                raise LogError(
-                    f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
-                    expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
-                )  # fmt: skip
-        columns[joint] = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-    mapping = mapping.with_joint_columns(columns)
-    common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": "episode_index"})
+    logged = list(map(mapping.log_name, joints))
+    for names in (states, actions):
+        missing = [name for name in logged if name not in names]
+        if missing:
+            do = names_line(logged, names) if names else f"write them as 'names' of the features into {INFO}"
+            raise LogError(
+                f"the motors {', '.join(names) or 'without names'}", file=folder / INFO,
+                expected=f"{', '.join(missing)} among them", do=do,
+            )  # fmt: skip
+    mapping = mapping.with_joint_columns({
+        joint: {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        for joint, name in zip(joints, logged, strict=True)
+    })  # fmt: skip
+    common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": EPISODE})
     mapping = mapping.model_copy(update={"columns": common})
     files = sorted((folder / "data").rglob("*.parquet"))
     for file in files:
@@ -89,10 +94,11 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
+    remarks += _missing_episodes(files, info)
     # Joint names without the suffix ".pos" are from LeRobot 2, which always writes degrees: the remarks that positions
     # may be normalised are removed.
     if ENDING not in str(info["features"][STATE]["names"]):
-        remarks = ()
+        remarks = tuple(x for x in remarks if UNLESS_NORMALISED not in x)
     fps = info.get("fps")
     if isinstance(fps, int | float) and not mapping.sample_rate:
         _require_times(files[0], fps)
@@ -105,6 +111,23 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         with reading(file):
             tables += [table._replace(remarks=remarks) for table in read_parquet(file, joints, mapping)]
     return tables
+
+
+def _missing_episodes(files: Sequence[Path], info: Mapping[str, object]) -> tuple[str, ...]:
+    """Return a remark on the episodes that are in none of the files of a LeRobot data set; () if all are."""
+    total, numbers = info.get("total_episodes"), set[int]()
+    if not isinstance(total, int) or total > 10**6:
+        return ()
+    for file in files:
+        with reading(file):
+            if EPISODE in pa.parquet.read_schema(file).names:
+                numbers.update(pa.parquet.read_table(file, columns=[EPISODE])[EPISODE].unique().to_pylist())
+    missing = [str(number) for number in range(total) if number not in numbers]
+    if not missing or not numbers:
+        return ()
+    return (
+        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}",
+    )
 
 
 def _require_times(file: Path, fps: float) -> None:
@@ -131,14 +154,21 @@ def _with_scale(
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
     may be normalised, if neither a unit nor a calibration is given.
     """
-    largest = 0.0
+    largest, used = 0.0, {mapping.column("q", joint) for joint in joints}
     for file in files:
         with reading(file):
             if STATE not in pa.parquet.read_schema(file).names:
                 return mapping, ()
             states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
-            values = np.abs(states.flatten().to_numpy(zero_copy_only=False))
-            largest = max(largest, float(values.max(initial=0.0)))
+            width = len(states.flatten()) // max(len(states), 1)
+            # Other elements are not positions of the arm, for example of a gripper, or velocities.
+            numbers = [k for k in range(width) if f"{STATE}[{k}]" in used]
+            values = np.abs(
+                states.flatten().to_numpy(zero_copy_only=False)[: width * len(states)].astype(float)
+            )
+            largest = max(
+                largest, float(values.reshape(-1, width)[:, numbers].max(initial=0.0)) if width else 0.0
+            )
     if not 2 * np.pi < largest <= LARGEST_NORMALISED:
         return mapping, ()
     unstated = [joint for joint in joints if mapping.unit("q", joint) is None]
@@ -149,7 +179,7 @@ def _with_scale(
             "'units: {q: normalised}' and 'calibration' under 'logs' convert"
         )
         return mapping, (doubt,) if unit == "deg" else ()
-    calibration = mapping.calibration or _calibration(folder)
+    calibration = mapping.calibration or _calibration(folder, list(map(mapping.log_name, unstated)))
     if not all(mapping.log_name(joint) in calibration for joint in unstated):
         raise LogError(
             f"positions up to {largest:.4g} without a unit, within LeRobot's normalised range of -100..100",
@@ -164,12 +194,17 @@ def _with_scale(
     return mapping, ("normalised positions were converted by the ranges of the motors' calibration",)
 
 
-def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return {motor: calibration} from the file calibration.json of a LeRobot data set; {} if there is no such file."""
+def _calibration(folder: Path, motors: Sequence[str]) -> dict[str, MotorCalibration]:
+    """Return {motor: calibration} from the file calibration.json of a LeRobot data set; {} if there is no such file.
+
+    motors: names of the arm's motors; other motors in the file, for example of a gripper, are omitted.
+    """
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
-            document = YamlDocument(file, None)
-            return validated(LogMapping, {"calibration": read_json(file, LogError)}, document).calibration
+            content = read_json(file, LogError)
+            # A file of another form is validated as a whole, which raises one error.
+            content = {x: content[x] for x in motors if x in content} or content
+            return validated(LogMapping, {"calibration": content}, YamlDocument(file, None)).calibration
     return {}
 
 

@@ -276,12 +276,21 @@ def _order_in_time(rows: Rows) -> None:
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
         order = np.argsort(rows.t, kind="stable")
-        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting
-        # would interleave the recordings.
+        message = f"{counted(late, 'time')} before that of the row above: the rows were sorted"
+        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues, the clock
+        # was set back, or its counter overflowed; else the file has several recordings, which sorting would interleave.
         if _roughness(rows.positions[order]) > _roughness(rows.positions):
-            raise _backward_times(rows)
-        rows.keep(order)
-        rows.repairs.append(f"{counted(late, 'time')} before that of the row above: the rows were sorted")
+            if not _continues(rows):
+                raise _backward_times(rows)
+            steps = np.diff(rows.t)
+            steps[steps < 0] = np.median(steps)
+            rows.t[1:] = rows.t[0] + np.cumsum(steps)
+            message = (
+                f"the clock went back {counted(late, 'time')} while the motion continued: times were joined"
+            )
+        else:
+            rows.keep(order)
+        rows.repairs.append(message)
     is_repeat = np.diff(rows.t, prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(rows.data[:, 1:], axis=0) != 0).any(axis=1))
     # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
@@ -370,6 +379,22 @@ def _roughness(positions: np.ndarray) -> float:
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
+
+
+def _continues(rows: Rows) -> bool:
+    """Return True if the motion continues at each row whose time is before the time of the row above.
+
+    The position of each joint then changes at most twice as much as at the rows around it, and some joint moves.
+    """
+    changes = np.abs(np.diff(rows.positions, axis=0))
+    if len(changes) < 2 * TUNING.jump_window:
+        return False
+    for row in np.flatnonzero(np.diff(rows.t) < 0).tolist():
+        around = slice(max(0, row - TUNING.jump_window), row + TUNING.jump_window + 1)
+        others = np.delete(changes[around], row - around.start, axis=0).max(axis=0, initial=0.0)
+        if (changes[row] > 2 * others + SIGNALS.rest_range).any() or others.max() < SIGNALS.rest_range:
+            return False
+    return True
 
 
 def _backward_times(rows: Rows) -> LogError:

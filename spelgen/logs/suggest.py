@@ -299,11 +299,9 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
     bare = labels[joint].sub(" ", base) if joint else base
     # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
-    if re.search(r"[^\W\d_]", bare):
-        base = bare
-    elif name.lower() in WORDS["t"]:
-        joint = ""
-    separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", base).lower()
+    if joint and base.lower() in WORDS["t"]:
+        joint, bare = "", base
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
     found = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
     words = words | set(found) | ({"theta"} if "theta" in separated else set())
     quantity = "t" if words & WORDS["t"] else None

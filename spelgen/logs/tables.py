@@ -252,7 +252,7 @@ def _naming(unused: Collection[str]) -> str:
 
 
 def joint_pattern(words: Sequence[str]) -> re.Pattern[str]:
-    """Return the pattern of a joint's name, as separate words, in a column's name: `q_1` contains 1, `q_12` does not."""
+    """Return the pattern of a joint's name in a column's name, as separate words: `q_1` has the joint 1, `q_12` not."""
     name = r"[\W_]?".join(map(re.escape, words))
     return re.compile(rf"(?<![0-9a-z]){name}(?![0-9a-z])", re.IGNORECASE)
 

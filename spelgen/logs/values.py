@@ -77,10 +77,16 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
 
+    Such rows are without velocities and torques, or these are exactly 0 in many single rows between other rows.
+
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
-    empty = np.isnan(data[:, 1 + joints :])
-    return np.asarray(empty.all(axis=1))
+    others = data[:, 1 + joints :]
+    zero = (others == 0).all(axis=1) if others.shape[1] > joints else np.zeros(len(data), bool)
+    # A motor that is off, or an arm at rest, has more than a few such rows in succession.
+    runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
+    is_mixed = runs > TUNING.jump_window and zero.sum() < 4 * runs
+    return np.asarray(np.isnan(others).all(axis=1) | (zero & is_mixed))
 
 
 def is_split(data: np.ndarray) -> bool:

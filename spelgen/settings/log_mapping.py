@@ -12,7 +12,7 @@ from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import SettingsError
 from spelgen.settings.yaml_document import Group, Number, Positive
@@ -263,6 +263,18 @@ class LogMapping(Group):
     dropouts: Literal["kept", "dropped"] = "kept"
     sample_rate: Positive | None = None
     calibration: dict[str, MotorCalibration] = Field(default={})
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _is_by_motor(cls, content: object) -> object:
+        # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
+        if isinstance(content, dict) and not all(
+            isinstance(x, dict | MotorCalibration) for x in content.values()
+        ):
+            raise ValueError(
+                "range_min and range_max of each motor; data of an older LeRobot is in degrees, 'units: {q: deg}'"
+            )
+        return content
 
     @property
     def quantities(self) -> tuple[str, ...]:
