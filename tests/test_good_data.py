@@ -497,7 +497,7 @@ def test_an_older_calibration_of_lerobot_is_one_error_and_other_motors_do_not_ma
 
 
 def test_the_range_of_other_elements_of_a_state_does_not_matter(tmp_path):
-    """Positions in rad beside a gripper of 0 to 100 are no normalised values."""
+    """Positions in rad with a gripper of 0 to 100 are no normalised values."""
     folder = dataset(tmp_path / "set", np.column_stack([Q, 50 + 50 * np.sin(T)]), names=(*JOINTS, "gripper"))
     (log,) = read_logs(folder, JOINTS, POSITION)
     np.testing.assert_allclose(log.q, Q, atol=1e-6)

@@ -277,7 +277,7 @@ def test_delan_characters_are_read(shared):
 NPZ = {
     "missing": (
         {"t": T, "q": Q, "tau": TAU},
-        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, q_shoulder, q_elbow, and 2 more, "
+        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
         "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
         "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
     ),

@@ -352,7 +352,7 @@ def test_units_below_the_header_are_not_ignored(scara, tmp_path):
 
 
 @pytest.mark.parametrize("key", ["joints", "joint_names", "names"])
-def test_names_beside_the_matrices_of_an_archive_give_their_order(scara, tmp_path, key):
+def test_names_in_an_archive_give_the_order_of_its_matrices(scara, tmp_path, key):
     order = [3, 1, 0, 2]
     names = np.array(scara.chain.joint_names)[order]
     matrices = {"q": Q[:, order], "qd": QD[:, order], "tau": TAU[:, order]}

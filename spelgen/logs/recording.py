@@ -384,7 +384,7 @@ def _roughness(positions: np.ndarray) -> float:
 def _continues(rows: Rows) -> bool:
     """Return True if the motion continues at each row whose time is before the time of the row above.
 
-    The position of each joint then changes at most twice as much as at the rows around it, and some joint moves.
+    There some joint moves, and the change of each position is at most twice its largest change in the rows around.
     """
     changes = np.abs(np.diff(rows.positions, axis=0))
     if len(changes) < 2 * TUNING.jump_window:

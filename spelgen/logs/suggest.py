@@ -37,19 +37,17 @@ WORDS = {
                 "curr cur drehmoment strom couple par 力矩 扭矩"),
     )
 }  # fmt: skip
-# Words that distinguish the names of commanded values from the names of measured values.
-COMMANDED = {
-    "target", "targets", "desired", "des", "d", "command", "commands", "commanded", "cmd", "reference", "ref",
-    "setpoint", "goal", "action", "demand", "planned", "ipo", "set", "soll", "u", "leader",
-}  # fmt: skip
-# Words in names of columns that mark signals other than measured joint signals.
-NOT_MEASURED = COMMANDED | {
-    "error", "err", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
-    "disturbance", "interact", "dd", "ddot", "dot", "vol", "volt", "voltage", "temp", "temperature",
-}  # fmt: skip
-MEASURED = {
-    "actual", "act", "measured", "meas", "msr", "present", "feedback", "feed", "fb", "ist", "follower", "observation",
-}  # fmt: skip
+# Words in names of columns that mark commanded values, measured values, and signals other than those of joints.
+COMMANDED, MEASURED, OTHERS = (
+    frozenset(words.split())
+    for words in (
+        "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
+        "ipo set soll u leader",
+        "actual act measured meas msr present feedback feed fb ist follower observation",
+        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
+        "dot vol volt voltage temp temperature",
+    )
+)
 # Letters that are quantities in names such as `i_actual` and `m_actual`.
 LETTERS = {"i": "tau", "m": "tau"}
 # Letters in column names that are units only in brackets: without brackets they may be part of a name.
@@ -172,8 +170,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     lines += ["joints:", *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints)]
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
-    others = {"t": clocks} | {x: columns_of[x] for x in by_joint}
-    unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in others.items()}
+    columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
+    unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in columns_of.items()}
     lines += [
         f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
     ]
@@ -201,7 +199,7 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
 
 
 def _is_whole(table: pa.Table, name: str) -> bool:
-    """Return True if a column of a table has whole numbers that repeat: seconds beside a column of nanoseconds."""
+    """Return True if a column of a table has whole numbers that repeat, as seconds of a stamp do."""
     if name not in table.column_names or not _is_numeric(table[name].type):
         return False
     values = table[name].drop_null().to_numpy()
@@ -285,7 +283,7 @@ def _labels(names: Sequence[str], joints: Sequence[str]) -> dict[str, re.Pattern
 def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
     """Return the parts of a column's name; the unit is in brackets, or the last word.
 
-    labels: {joint: pattern of its name}. unit: unit that the file states beside the name. words: additional words that
+    labels: {joint: pattern of its name}. unit: unit in a line of units below the header. words: additional words that
     describe the column, such as "time" for a column of dates.
     """
     unit_names = set().union(*UNITS.values())
@@ -327,7 +325,7 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
         quantity = column.quantity
         if commands and column.words & COMMANDED and quantity in ("q", None):
             quantity = "u"
-        elif column.words & NOT_MEASURED:
+        elif column.words & (COMMANDED | OTHERS):
             continue
         if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
             unstated.append(column)
@@ -338,9 +336,9 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
     return by_quantity
 
 
-def _units(by_joint: Mapping[str, Mapping[str, ColumnName]]) -> dict[str, dict[str, str]]:
+def _units(by_joint: Mapping[str, Mapping[str, ColumnName]]) -> defaultdict[str, dict[str, str]]:
     """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
-    units: dict[str, dict[str, str]] = defaultdict(dict)
+    units: defaultdict[str, dict[str, str]] = defaultdict(dict)
     for quantity, named in by_joint.items():
         for joint, column in named.items():
             unit = UNITS["q" if quantity == "u" else quantity].get(column.unit)

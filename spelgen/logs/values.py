@@ -77,7 +77,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
 
-    Such rows are without velocities and torques, or these are exactly 0 in many single rows between other rows.
+    Their velocities and torques are absent, or exactly 0 in many single rows between other rows.
 
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
