@@ -222,11 +222,11 @@ def test_times_in_another_unit_are_named_with_the_line_to_write(tmp_path, unit, 
     pa.csv.write_csv(columns_of(np.round((1.7e9 + T) * size).astype(np.int64)), path)
     (log,) = read_logs(path, JOINTS)
     with pytest.raises(SpelgenError) as caught:
-        check(log, JOINTS, ["revolute"] * 2)
+        check([log], JOINTS, ["revolute"] * 2)
     assert f"write 'units: {{t: {unit}}}' under 'logs'" in str(caught.value)
     assert f"100 Hz if times are in {unit}" in str(caught.value)
     (log,) = read_logs(path, JOINTS, {"units": {"t": unit}})
-    assert check(log, JOINTS, ["revolute"] * 2) == []
+    assert check([log], JOINTS, ["revolute"] * 2) == []
     assert f'"t": "{unit}"' in suggest_mapping(path, JOINTS).text
 
 

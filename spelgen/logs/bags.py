@@ -7,7 +7,7 @@ body. https://mcap.dev/spec
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain, takewhile
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.joint_signals import mapping_line
-from spelgen.logs.tables import LogTable
+from spelgen.logs.tables import LogTable, joint_patterns
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
@@ -142,17 +142,12 @@ def _joint_states(
 def names_line(names: Sequence[str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name is the end of exactly one logged name ("j1" of "left_j1"). If
-    not, it is tried again without the prefix that all joint names share ("panda_j1" is then mapped to "fer_j1").
+    names: names of the arm's joints. logged: names in the log. The advice contains the settings that map the names if
+    exactly one logged name contains each joint's name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
     """
-    words = [name.split("_") for name in names]
-    shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
-    for ends in (names, ["_".join(of_name[shared:]) for of_name in words]):
-        found = [[x for x in logged if x.endswith(end)] for end in ends]
-        if all(len(full_names) == 1 for full_names in found):
-            lines = {name: {"name": full_name} for name, (full_name,) in zip(names, found, strict=True)}
-            return mapping_line({"joints": lines})
+    found = {x: list(filter(pattern.search, logged)) for x, pattern in joint_patterns(names, logged).items()}
+    if all(len(full_names) == 1 for full_names in found.values()):
+        return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in found.items()}})
     return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
 
 

@@ -39,7 +39,7 @@ class Beginning(NamedTuple):
         delimiter: character between columns.
         names: names of the columns; for a file without a header, the values of its first row.
         lines: number of lines before the first row of values: comments, the header, and lines such as units.
-        units: cells of the line of units below the header; [] if there is none.
+        units: units of the columns, from a line below the header, in lower case; [] without such a line.
         rows: the first rows of values.
     """
 
@@ -118,8 +118,9 @@ def _beginning(file: Path) -> Beginning:
     if not is_number(names[0]):
         names, start = _column_names(lines, cells, header)
         names = names + [""] * (width - len(names))
-        last = cells[start - 1]
-        units = last if sum(x.strip(" []()").lower() in ALL_UNITS for x in last) > len(last) / 2 else []
+        units = [x.strip(" []()").lower() for x in cells[start - 1]]
+        # Names, and the header itself, may contain words such as `deg`.
+        units = units if sum(x in ALL_UNITS for x in units) > len(units) / 2 else []
     return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
 
 

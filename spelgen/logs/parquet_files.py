@@ -113,29 +113,32 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     return tables
 
 
+def _column(file: Path, name: str) -> pa.Array | None:
+    """Return one column of a file of a data set; None if the file lacks it."""
+    with reading(file):
+        if name not in pa.parquet.read_schema(file).names:
+            return None
+        return pa.parquet.read_table(file, columns=[name])[name].combine_chunks()
+
+
 def _missing_episodes(files: Sequence[Path], info: Mapping[str, object]) -> tuple[str, ...]:
     """Return a remark on the episodes that are in none of the files of a LeRobot data set; () if all are."""
-    total, numbers = info.get("total_episodes"), set[int]()
-    if not isinstance(total, int) or total > 10**6:
+    total = info.get("total_episodes")
+    columns = [column for file in files if (column := _column(file, EPISODE)) is not None]
+    if not isinstance(total, int) or total > 10**6 or not columns:
         return ()
-    for file in files:
-        with reading(file):
-            if EPISODE in pa.parquet.read_schema(file).names:
-                numbers.update(pa.parquet.read_table(file, columns=[EPISODE])[EPISODE].unique().to_pylist())
+    numbers = set(chain(*(column.unique().to_pylist() for column in columns)))
     missing = [str(number) for number in range(total) if number not in numbers]
-    if not missing or not numbers:
-        return ()
-    return (
-        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}",
+    text = (
+        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}"
     )
+    return (text,) if missing else ()
 
 
 def _require_times(file: Path, fps: float) -> None:
     """Raise LogError if the times of a LeRobot data set contradict its number of frames per second."""
-    with reading(file):
-        if TIMESTAMP not in pa.parquet.read_schema(file).names:
-            return
-        steps = np.diff(pa.parquet.read_table(file, columns=[TIMESTAMP])[TIMESTAMP].to_numpy().ravel())
+    times = _column(file, TIMESTAMP)
+    steps = np.zeros(0) if times is None else np.diff(times.to_numpy(zero_copy_only=False).ravel())
     step = float(np.median(steps)) if steps.size else 0.0
     if step > 0 and fps > 0 and abs(step * fps - 1) > 0.05:
         raise LogError(
@@ -154,21 +157,16 @@ def _with_scale(
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
     may be normalised, if neither a unit nor a calibration is given.
     """
+    # Other elements are not positions of the arm, for example of a gripper, or velocities.
     largest, used = 0.0, {mapping.column("q", joint) for joint in joints}
-    for file in files:
-        with reading(file):
-            if STATE not in pa.parquet.read_schema(file).names:
-                return mapping, ()
-            states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
-            width = len(states.flatten()) // max(len(states), 1)
-            # Other elements are not positions of the arm, for example of a gripper, or velocities.
-            numbers = [k for k in range(width) if f"{STATE}[{k}]" in used]
-            values = np.abs(
-                states.flatten().to_numpy(zero_copy_only=False)[: width * len(states)].astype(float)
-            )
-            largest = max(
-                largest, float(values.reshape(-1, width)[:, numbers].max(initial=0.0)) if width else 0.0
-            )
+    for states in (_column(file, STATE) for file in files):
+        if states is None:
+            return mapping, ()
+        for index in range(pa.compute.max(pa.compute.list_value_length(states)).as_py() or 0):
+            if f"{STATE}[{index}]" in used:
+                long_enough = states.filter(pa.compute.greater(pa.compute.list_value_length(states), index))
+                ends = pa.compute.min_max(pa.compute.list_element(long_enough, index)).as_py()
+                largest = max(largest, *(abs(x) for x in ends.values() if x is not None), 0.0)
     if not 2 * np.pi < largest <= LARGEST_NORMALISED:
         return mapping, ()
     unstated = [joint for joint in joints if mapping.unit("q", joint) is None]

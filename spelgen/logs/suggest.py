@@ -4,7 +4,6 @@ Units are derived from the column names, and the unit of times also from the tim
 SI units: the checks of logs then detect degrees, for example, and state the settings to write.
 """
 
-import difflib
 import json
 import re
 from collections import Counter, defaultdict
@@ -21,7 +20,7 @@ from spelgen.errors import LogError, shortened
 from spelgen.labels import listed
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
-from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_pattern, reading, stated_units
+from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS, LogMapping
@@ -120,7 +119,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     names, stated = _names(table), stated_units(table.schema)
-    labels = _labels(names, joints)
+    labels = joint_patterns(joints, names)
     columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
     columns_of = _by_quantity(columns, commands, len(joints))
     # A column named "load" is no torque: it is a register of a servo.
@@ -245,39 +244,15 @@ def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Sugg
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
-    close = {x: [x] if x in motors else difflib.get_close_matches(x, motors, n=1) for x in joints}
+    found = {x: next(filter(y.search, motors), None) for x, y in joint_patterns(joints, motors).items()}
     lines = [
         f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
         "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
         "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
         "joints:",
-        *(
-            f"  {json.dumps(joint)}: {{name: {json.dumps(names[0])}}}"
-            for joint, names in close.items()
-            if names
-        ),
+        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in found.items() if name),
     ]
-    return _suggestion(lines, [f"q of {joint}" for joint, names in close.items() if not names], "motor")
-
-
-def _labels(names: Sequence[str], joints: Sequence[str]) -> dict[str, re.Pattern[str]]:
-    """Return {joint: pattern of its name in the names of columns}.
-
-    A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
-    joints shoulder_pan_joint and joint_1_s. The form that most columns have is used.
-    """
-    words = {joint: re.findall(r"\d+|[^\W\d_]+", joint) for joint in joints}
-    shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
-    own = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
-    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in own.items()}
-    forms = []
-    for form in (words, own, letters):
-        # Numbers only are no names: columns may be numbered in another order, which cells of the log may state.
-        is_name = all(any(not x.isdigit() for x in of_joint) for of_joint in form.values())
-        if (is_name or form is words) and len(set(map(tuple, form.values()))) == len(joints):
-            forms.append({x: joint_pattern(of_joint) for x, of_joint in form.items()})
-    complete = (form for form in forms if all(any(map(x.search, names)) for x in form.values()))
-    return next(complete, forms[0])
+    return _suggestion(lines, [f"q of {joint}" for joint, name in found.items() if not name], "motor")
 
 
 def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
@@ -292,7 +267,7 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     base, named_unit = bracketed.groups() if bracketed and bracketed[2] not in labels else (name, "")
     if not named_unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
         base, named_unit = last.groups()
-    unit = (named_unit or unit).strip(" []()").lower()
+    unit = named_unit.strip().lower() or unit
     matches = {joint: match for joint, label in labels.items() if (match := label.search(base))}
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
     bare = labels[joint].sub(" ", base) if joint else base

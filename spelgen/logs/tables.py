@@ -251,14 +251,30 @@ def _naming(unused: Collection[str]) -> str:
     )
 
 
-def joint_pattern(words: Sequence[str]) -> re.Pattern[str]:
-    """Return the pattern of a joint's name in a column's name, as separate words: `q_1` has the joint 1, `q_12` not."""
-    name = r"[\W_]?".join(map(re.escape, words))
-    return re.compile(rf"(?<![0-9a-z]){name}(?![0-9a-z])", re.IGNORECASE)
+def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
+    """Return {joint: pattern of its name}, as separate words in `names`: `q_1` has the joint 1, `q_12` has not.
+
+    A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
+    joints shoulder_pan_joint and joint_1_s. The first of these forms in which all joints are found is used.
+    """
+    words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
+    shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
+    own = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
+    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in own.items()}
+    forms = []
+    for form in (words, own, letters):
+        # Numbers are no names: columns may be numbered in another order, which cells of the log may state.
+        if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
+            parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}
+            texts = {
+                x: r"[\W_]?".join(re.escape(part.strip("_")) for part in of_x) for x, of_x in parts.items()
+            }
+            forms.append({x: re.compile(rf"(?<![^\W_]){text}(?![^\W_])", re.I) for x, text in texts.items()})
+    return next((x for x in forms if all(any(map(y.search, names)) for y in x.values())), forms[0])
 
 
 def stated_units(schema: pa.Schema) -> dict[str, str]:
-    """Return {column: unit as written} from a line of units below the header of a file; {} if there is none."""
+    """Return {column: unit in lower case} from a line of units below the header of a file; {} if there is none."""
     stated: dict[str, str] = json.loads((schema.metadata or {}).get(STATED_KEY, "{}"))
     return stated
 
@@ -270,9 +286,7 @@ def _require_units(
     stated = stated_units(schema)
     units: dict[str, str] = {}
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
-        unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(
-            stated.get(name, "").strip(" []()").lower(), ""
-        )
+        unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(stated.get(name, ""), "")
         is_mapped = mapping.units.t != "s" if quantity == "t" else mapping.unit(quantity, joint) is not None
         if unit not in ("", "s", "rad", "m", "rad/s", "m/s", "Nm", "N") and not is_mapped:
             units[quantity] = unit
