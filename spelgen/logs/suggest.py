@@ -192,21 +192,19 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     )
     stem = re.sub(r"secs?$", "", clock.name)
     other = next((x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0] if nanoseconds else None)
-    if other is None or other.name == clock.name or not _is_whole(table, clock.name):
+    times = _numbers(table, clock.name)
+    # Seconds of a stamp are whole numbers that repeat.
+    is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
+    if other is None or not is_whole:
         return clock
     return ColumnName(f"{clock.name} + {other.name}", clock.words, "s")
 
 
-def _is_whole(table: pa.Table, name: str) -> bool:
-    """Return True if a column of a table has whole numbers that repeat, as seconds of a stamp do."""
-    if name not in table.column_names or not _is_numeric(table[name].type):
-        return False
-    values = table[name].drop_null().to_numpy()
-    return bool((values == np.round(values)).all() and len(np.unique(values)) < len(values))
-
-
-def _is_numeric(kind: pa.DataType) -> bool:
-    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+def _numbers(table: pa.Table, name: str) -> np.ndarray:
+    """Return the numbers of a column, without nulls; an empty array for a column of another type."""
+    values = table[name].drop_null() if name in table.column_names else pa.chunked_array([[]])
+    is_numeric = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    return np.asarray(values.to_numpy()) if is_numeric else np.zeros(0)
 
 
 def _joint_lines(
@@ -335,13 +333,8 @@ def _common(units: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
     """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
-    if name not in table.schema.names:
-        return None
-    times = table[name].drop_null()
-    if not _is_numeric(times.type):
-        return None
-    steps = np.diff(times.to_numpy())
-    return time_unit(float(np.median(steps[steps > 0]))) if len(steps) > 1 and (steps > 0).any() else None
+    steps = np.diff(_numbers(table, name))
+    return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
