@@ -214,12 +214,39 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
         ("时间", "位置", "速度", "力矩"),
         ("time", "qpos", "qvel", "qfrc_actuator"),
         ("time", "pos", "vel", "eff"),
+        ("时间", "关节实际位置", "关节实际速度", "关节电流"),
     ],
 )
 def test_words_of_other_languages(scara, tmp_path, words):
     head = [words[0], *(f"{word} {k}" for word in words[1:] for k in range(4))]
     rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize("setpoint", ["position consigne {}", "关节{}目标位置", "Soll Winkel {}"])
+def test_set_points_in_other_languages_are_not_measurements(scara, tmp_path, setpoint):
+    measured = setpoint.replace(" consigne", " mesure").replace("目标", "实际").replace("Soll", "Ist")
+    head = ["t", *(form.format(k) for form in (measured, "speed{}", "torque{}", setpoint) for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU, Q + 0.01])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize(
+    "form", ["{0}_{1}_{2}", "{0}[{1}]_{2}", "{0} {2} [{1}]", "{0}_{1}[{2}]", "J{2}_{0}_{1}"]
+)
+def test_units_are_found_anywhere_in_a_name(scara, tmp_path, form):
+    (tmp_path / "arm.urdf").write_text(
+        scara.robot.path.read_text().replace('type="prismatic"', 'type="revolute"')
+    )
+    arm = load_arm(tmp_path / "arm.urdf")
+    signals = (
+        ("angle", "deg", Q * 180 / np.pi),
+        ("speed", "rpm", QD * 30 / np.pi),
+        ("torque", "mNm", TAU * 1e3),
+    )
+    head = ["t", *(form.format(word, unit, k) for word, unit, _ in signals for k in range(4))]
+    rows = np.column_stack([T, *(values for *_, values in signals)])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), arm)[0])
 
 
 def test_cells_with_lists_and_names_as_texts(scara, tmp_path):

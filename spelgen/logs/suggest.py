@@ -33,7 +33,7 @@ WORDS = {
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad spd 速度"),
         ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
-                "curr cur drehmoment strom couple par 力矩 扭矩"),
+                "curr cur drehmoment strom couple par 力矩 扭矩 电流"),
     )
 }  # fmt: skip
 # Words in names of columns that mark commanded values, measured values, and signals other than those of joints.
@@ -41,8 +41,8 @@ COMMANDED, MEASURED, OTHERS = (
     frozenset(words.split())
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
-        "ipo set soll u leader",
-        "actual act measured meas msr present feedback feed fb ist follower observation",
+        "ipo set soll u leader consigne 目标 指令 设定",
+        "actual act measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
         "dot vol volt voltage temp temperature",
     )
@@ -57,7 +57,8 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
-CURRENT = {"current", "currents", "curr", "cur", "strom", "i"}
+CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
+CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
 
 
 class Suggestion(NamedTuple):
@@ -260,19 +261,27 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     describe the column, such as "time" for a column of dates.
     """
     unit_names = set().union(*UNITS.values())
-    bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
-    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
-    base, named_unit = bracketed.groups() if bracketed and bracketed[2] not in labels else (name, "")
-    if not named_unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
-        base, named_unit = last.groups()
-    unit = named_unit.strip().lower() or unit
-    matches = {joint: match for joint, label in labels.items() if (match := label.search(base))}
+    # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
+    # a number or a joint.
+    for bracket in re.finditer(r"\s*[\[(]([^\])]+)[\])]", name):
+        is_unit = bracket[1].lower() in unit_names
+        if is_unit or (
+            bracket.end() == len(name) and not re.search(r"[\d',]", bracket[1]) and bracket[1] not in labels
+        ):
+            unit, name_without = bracket[1].strip().lower(), name.replace(bracket[0], "", 1)
+            return _column_name(name_without, labels, unit, words)._replace(name=name)
+    matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
-    bare = labels[joint].sub(" ", base) if joint else base
+    bare = labels[joint].sub(" ", name) if joint else name
     # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
-    if joint and base.lower() in WORDS["t"]:
-        joint, bare = "", base
+    if joint and name.lower() in WORDS["t"]:
+        joint, bare = "", name
+    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)[\W\d_]*", bare)
+    if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
+        bare, unit = last[1], last[2].lower()
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
+    # Chinese words are not separated by blanks.
+    separated = re.sub("|".join(CHINESE), r" \g<0> ", separated)
     found = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
     words = words | set(found) | ({"theta"} if "theta" in separated else set())
     quantity = "t" if words & WORDS["t"] else None

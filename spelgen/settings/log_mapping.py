@@ -31,11 +31,12 @@ NORMALISED = "normalised"
 # For each quantity: units as written in logs, in lower case, and the corresponding units of a mapping.
 UNIT_NAMES = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
-    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
+    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
           "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
           "m": "m"},
     "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
-           "rev/s": "turns/s", "rpm": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
+           "deg/sec": "deg/s", "rad/sec": "rad/s", "rev/s": "turns/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm",
+           "mm/s": "mm/s", "m/s": "m/s"},
     "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
