@@ -507,5 +507,18 @@ def test_prefixed_motors_of_a_data_set_get_the_line_that_names_them(tmp_path):
     folder = dataset(tmp_path / "set", np.degrees(Q) * 3, names=("left_shoulder", "left_elbow"))
     with pytest.raises(LogError, match=r"write 'joints: \{shoulder: \{name: left_shoulder\}, elbow: "):
         read_logs(folder, JOINTS, POSITION)
+    wrong = POSITION | {"joints": {"shoulder": {"name": "shoulder"}, "elbow": {"name": "elbow"}}}
+    renamed = {"joints": {"j1": {"name": "shoulder"}, "j2": {"name": "elbow"}}}
+    with pytest.raises(LogError, match=r"write 'joints: \{shoulder: \{name: left_shoulder\}, elbow: "):
+        read_logs(folder, JOINTS, wrong)
+    for logs in (
+        folder,
+        bag_of([(x[0], ("left_elbow", "left_shoulder"), *x[2:]) for x in states()], tmp_path / "bag"),
+    ):
+        with pytest.raises(LogError, match=r"write 'joints: \{j1: \{name: left_shoulder\}, j2: "):
+            read_logs(logs, ("j1", "j2"), (POSITION if logs is folder else {}) | renamed)
+    partial = bag_of([(x[0], ("elbow",), *(y[:1] for y in x[2:])) for x in states()], tmp_path / "partial")
+    with pytest.raises(LogError, match=r"without shoulder, .*'moving_joints: \[j2\]'"):
+        read_logs(partial, ("j1", "j2"), renamed)
     with pytest.raises(LogError, match="write them as 'names' of the features"):
         read_logs(dataset(tmp_path / "other", Q, names=()), JOINTS, POSITION)

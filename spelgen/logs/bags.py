@@ -6,7 +6,7 @@ body. https://mcap.dev/spec
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,7 +56,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     LogError for a bag that cannot be read, and if `rosbags` is not installed.
     """
     remarks: list[str] = []
-    names = list(map(mapping.log_name, joints))
+    names = {joint: mapping.log_name(joint) for joint in joints}
     messages = _of_one_arm(list(_messages(path, mapping.topic, remarks)), names, path, remarks)
     stamped = [message for message in messages if message.stamp]
     times = np.array([message.stamp for message in stamped])
@@ -66,7 +66,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         stamped, times = messages, np.array([message.recorded for message in messages])
     elif len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
-    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, names)
+    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, list(names.values()))
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply to bags.
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
@@ -74,23 +74,23 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _of_one_arm(
-    messages: Sequence[StampedState], names: Sequence[str], path: Path, remarks: list[str]
+    messages: Sequence[StampedState], names: Mapping[str, str], path: Path, remarks: list[str]
 ) -> list[StampedState]:
-    """Return the messages of a bag that contain any of the arm's joints `names`.
+    """Return the messages of a bag that contain any joint of the arm.
 
     A message may contain only some of the joints, and joints may be on several topics. If most of the messages contain
     all joints, the others are omitted. Raises LogError if several topics contain the same joint, or if a joint is in no
-    message. remarks: list to which a remark on omitted messages is added.
+    message. names: {joint: its name in the log}. remarks: list to which a remark on omitted messages is added.
     """
-    arm = set(names)
+    arm = set(names.values())
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
     if not of_arm:
         logged = list(dict.fromkeys(name for x in messages for name in x.state.name))
         if not logged:
             got = f"{counted(len(messages), 'joint state')}, none with names of joints"
-            raise LogError(got, file=path, expected=f"joint states of {', '.join(names)}")
+            raise LogError(got, file=path, expected=f"joint states of {', '.join(names.values())}")
         got = f"joint states of {', '.join(logged)} only"
-        raise LogError(got, file=path, expected=", ".join(names), do=names_line(names, logged))
+        raise LogError(got, file=path, expected=", ".join(names.values()), do=names_line(names, logged))
     joints_of: dict[str, set[str]] = {}
     for message in of_arm:
         joints_of.setdefault(message.topic, set()).update(arm.intersection(message.state.name))
@@ -98,10 +98,10 @@ def _of_one_arm(
         topics = sorted(joints_of)
         got, do = f"joint states on the topics {', '.join(topics)}", mapping_line({"topic": topics[0]})
         raise LogError(got, file=path, expected="one of them", do=f"{do}, or the other topic")
-    missing = [name for name in names if name not in set.union(*joints_of.values())]
+    missing = [name for name in names.values() if name not in set.union(*joints_of.values())]
     if missing:
         got, expected = f"joint states without {', '.join(missing)}", "states of all joints of the arm"
-        present = ", ".join(name for name in names if name not in missing)
+        present = ", ".join(joint for joint, name in names.items() if name not in missing)
         do = f"write 'moving_joints: [{present}]' into the robot's YAML if the others do not move, or map their names"
         raise LogError(got, file=path, expected=expected, do=do)
     complete = [x for x in of_arm if arm.issubset(x.state.name)]
@@ -139,16 +139,20 @@ def _joint_states(
     return columns
 
 
-def names_line(names: Sequence[str], logged: Sequence[str]) -> str:
+def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    names: names of the arm's joints. logged: names in the log. The advice contains the settings that map the names if
-    exactly one logged name contains each joint's name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
+    names: {joint: its name in the mapping}. logged: names in the log. The advice contains the settings that map the
+    names if exactly one logged name contains each name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
     """
-    found = {x: list(filter(pattern.search, logged)) for x, pattern in joint_patterns(names, logged).items()}
-    if all(len(full_names) == 1 for full_names in found.values()):
-        return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in found.items()}})
-    return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
+    patterns = joint_patterns(list(names.values()), logged)
+    matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}
+    if all(len(full_names) == 1 for full_names in matches.values()):
+        return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in matches.items()}})
+    return (
+        mapping_line({"joints": {next(iter(names)): {"name": "NAME IN THE LOG"}}})
+        + ", and so for the other joints"
+    )
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

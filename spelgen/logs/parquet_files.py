@@ -72,9 +72,9 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
-    logged = list(map(mapping.log_name, joints))
+    logged = {joint: mapping.log_name(joint) for joint in joints}
     for names in (states, actions):
-        missing = [name for name in logged if name not in names]
+        missing = [name for name in logged.values() if name not in names]
         if missing:
             do = names_line(logged, names) if names else f"write them as 'names' of the features into {INFO}"
             raise LogError(
@@ -83,7 +83,7 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
             )  # fmt: skip
     mapping = mapping.with_joint_columns({
         joint: {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-        for joint, name in zip(joints, logged, strict=True)
+        for joint, name in logged.items()
     })  # fmt: skip
     common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": EPISODE})
     mapping = mapping.model_copy(update={"columns": common})

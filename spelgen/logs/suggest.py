@@ -136,8 +136,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
         x: _by_joint(_of_one_signal(named, len(joints)), joints, order) for x, named in columns_of.items()
     }
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
-    others = [x.name for x in columns if x.quantity is None and x.name in table.column_names]
-    for name in others if not by_joint["q"] else ():
+    unstated = [x.name for x in columns if x.quantity is None and x.name in table.column_names]
+    for name in unstated if not by_joint["q"] else ():
         if _names_signals(table[name].to_pylist(), len(joints)):
             do = (
                 f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
@@ -192,13 +192,15 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
         seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
     )
     stem = re.sub(r"secs?$", "", clock.name)
-    other = next((x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0] if nanoseconds else None)
+    fraction = next(
+        (x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0] if nanoseconds else None
+    )
     times = _numbers(table, clock.name)
     # Seconds of a stamp are whole numbers that repeat.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
-    if other is None or not is_whole:
+    if fraction is None or not is_whole:
         return clock
-    return ColumnName(f"{clock.name} + {other.name}", clock.words, "s")
+    return ColumnName(f"{clock.name} + {fraction.name}", clock.words, "s")
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
@@ -220,9 +222,9 @@ def _joint_lines(
     """
     entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
     yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
-    own = {x: unit for x, unit in units.items() if x not in common}
-    if own:
-        yield f"    units: {json.dumps(own)}"
+    differing = {x: unit for x, unit in units.items() if x not in common}
+    if differing:
+        yield f"    units: {json.dumps(differing)}"
     if units.get("tau") in CURRENTS:
         yield f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
     if units.get("q") == "counts":
@@ -243,15 +245,15 @@ def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Sugg
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
-    found = {x: next(filter(y.search, motors), None) for x, y in joint_patterns(joints, motors).items()}
+    motor_of = {x: next(filter(y.search, motors), None) for x, y in joint_patterns(joints, motors).items()}
     lines = [
         f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
         "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
         "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
         "joints:",
-        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in found.items() if name),
+        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in motor_of.items() if name),
     ]
-    return _suggestion(lines, [f"q of {joint}" for joint, name in found.items() if not name], "motor")
+    return _suggestion(lines, [f"q of {joint}" for joint, name in motor_of.items() if not name], "motor")
 
 
 def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
@@ -282,15 +284,15 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
     # Chinese words are not separated by blanks.
     separated = re.sub("|".join(CHINESE), r" \g<0> ", separated)
-    found = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
-    words = words | set(found) | ({"theta"} if "theta" in separated else set())
+    texts = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
+    words = words | set(texts) | ({"theta"} if "theta" in separated else set())
     quantity = "t" if words & WORDS["t"] else None
     # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
-    for word in reversed(found):
+    for word in reversed(texts):
         quantity = quantity or next((x for x, of_quantity in WORDS.items() if word in of_quantity), None)
     quantity = quantity or next((x for x, units in UNITS.items() if unit in units), None)
     if quantity is None and words & MEASURED:
-        quantity = next((LETTERS[x] for x in found if x in LETTERS), None)
+        quantity = next((LETTERS[x] for x in texts if x in LETTERS), None)
     return ColumnName(name, words, unit, joint, quantity)
 
 
@@ -336,8 +338,8 @@ def _units(by_joint: Mapping[str, Mapping[str, ColumnName]]) -> defaultdict[str,
 
 def _common(units: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
     """Return {quantity: unit} of the units that all joints have. units: {joint: {quantity: unit}}."""
-    first, *others = units.values() or [{}]
-    return {x: unit for x, unit in first.items() if all(other.get(x) == unit for other in others)}
+    first = next(iter(units.values()), {})
+    return {x: unit for x, unit in first.items() if all(y.get(x) == unit for y in units.values())}
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:

@@ -259,10 +259,10 @@ def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, r
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
-    own = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
-    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in own.items()}
+    distinct = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
+    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
     forms = []
-    for form in (words, own, letters):
+    for form in (words, distinct, letters):
         # Numbers are no names: columns may be numbered in another order, which cells of the log may state.
         if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
             parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}

@@ -81,12 +81,12 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
 
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
-    others = data[:, 1 + joints :]
-    zero = (others == 0).all(axis=1) if others.shape[1] > joints else np.zeros(len(data), bool)
+    signals = data[:, 1 + joints :]
+    zero = (signals == 0).all(axis=1) if signals.shape[1] > joints else np.zeros(len(data), bool)
     # A motor that is off, or an arm at rest, has more than a few such rows in succession.
     runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
     is_mixed = runs > TUNING.jump_window and zero.sum() < 4 * runs
-    return np.asarray(np.isnan(others).all(axis=1) | (zero & is_mixed))
+    return np.asarray(np.isnan(signals).all(axis=1) | (zero & is_mixed))
 
 
 def is_split(data: np.ndarray) -> bool:
