@@ -98,6 +98,33 @@ def test_all_complete_messages_of_an_unfinished_recording_are_read(tmp_path, sha
     assert len(whole) == len(T)
 
 
+@pytest.mark.parametrize("encoding", ["cdr", "json", "protobuf"])
+def test_mcap_files_without_the_profile_of_ros_are_read_if_their_messages_are_cdr(tmp_path, encoding):
+    """Tools that join or cut MCAP files omit the profile; other recorders write joint states in other encodings."""
+    (path,) = bag_of(states(), tmp_path / "bag").glob("*.mcap")
+    content = path.read_bytes()
+    assert content[8 + 9 :].startswith(struct.pack("<I", 4) + b"ros2")
+    length = struct.unpack_from("<Q", content, 9)[0]
+    header = struct.pack("<BQ", 1, length - 4) + struct.pack("<I", 0) + content[8 + 9 + 8 : 8 + 9 + length]
+    changed = content[:8] + header + content[8 + 9 + length :]
+    size, name = struct.pack("<I", len(encoding)), encoding.encode()
+    end = changed.index(b"cdr", changed.index(b"/joint_states")) - 4
+    start = changed.rindex(b"\x04", 0, changed.index(b"/joint_states"))
+    record = changed[start : end + 7]
+    longer = (
+        struct.pack("<BQ", 4, struct.unpack_from("<Q", record, 1)[0] + len(encoding) - 3)
+        + record[9:-7]
+        + size
+        + name
+    )
+    (tmp_path / "x.mcap").write_bytes(changed[:start] + longer + changed[end + 7 :])
+    if encoding == "cdr":
+        check_read(read_logs(tmp_path / "x.mcap", JOINTS)[0])
+    else:
+        with pytest.raises(LogError, match=rf"joint states encoded as {encoding}, .*export them to CSV"):
+            read_logs(tmp_path / "x.mcap", JOINTS)
+
+
 @pytest.mark.parametrize("packed", ["lz4", "zstd"])
 def test_packed_chunks_of_an_unfinished_recording_are_read(tmp_path, packed):
     """Compressed chunks of a file without index, as of a recording that was cut off, are read.

@@ -376,9 +376,11 @@ def test_units_below_the_header_are_not_ignored(scara, tmp_path):
     ):
         read_logs(path, names)
     require_same(read_logs(path, names, {"units": {"tau": "mNm"}})[0])
+    gains = {name: {"gain": 1e-3} for name in names}
+    require_same(read_logs(path, names, {"joints": gains})[0])
 
 
-@pytest.mark.parametrize("key", ["joints", "joint_names", "names"])
+@pytest.mark.parametrize("key", ["joints", "joint_names", "dof_names"])
 def test_names_in_an_archive_give_the_order_of_its_matrices(scara, tmp_path, key):
     order = [3, 1, 0, 2]
     names = np.array(scara.chain.joint_names)[order]

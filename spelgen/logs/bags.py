@@ -184,9 +184,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
         # suffices.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, path)
-            unfinished = [] if is_ros1 else _unfinished(path)
-            if unfinished:
-                messages = _without_end(unfinished, path, remarks)
+            other_files = [] if is_ros1 else _of_other_recorders(path, remarks)
+            if other_files:
+                messages = _joint_states_in(other_files, path)
             topics = set()
             for name, recorded, raw in messages:
                 topics.add(name)
@@ -221,36 +221,47 @@ def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
             yield connection.topic, recorded, raw
 
 
-def _unfinished(path: Path) -> list[Path]:
-    """Return all MCAP files of a bag if one of them lacks its end (the recorder was killed); [] if all are complete.
+def _of_other_recorders(path: Path, remarks: list[str]) -> list[Path]:
+    """Return all MCAP files of a bag if one of them lacks its end or the profile of ROS 2; [] if none does.
 
-    `rosbags` cannot open such a bag, so `_without_end` reads all its files.
+    `rosbags` cannot open such a bag, so `_joint_states_in` reads all its files. remarks: list to which a remark on a
+    recorder that was killed is added.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    is_closed = is_ros2 = True
     for file in files:
         with file.open("rb") as source:
-            if source.read(len(MAGIC)) == MAGIC:
+            head = source.read(64)
+            if head.startswith(MAGIC):
+                # The first record, after its code and length, has the profile. Tools that join or cut files omit it.
+                is_ros2 &= _text(head, len(MAGIC) + 9) == "ros2"
                 source.seek(-len(MAGIC), 2)
-                if source.read() != MAGIC:
-                    return files
-    return []
+                is_closed &= source.read() == MAGIC
+    if not is_closed:
+        remarks.append("the recording was not closed: all complete messages were read")
+    return [] if is_closed and is_ros2 else files
 
 
-def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of MCAP files whose recorder was killed, and add a remark about it.
+def _joint_states_in(files: Sequence[Path], path: Path) -> Iterator[RawState]:
+    """Yield the encoded joint states on all topics of MCAP files, which may lack their end.
 
     path: path of the bag, for errors. Raises LogError if there are no joint states.
     """
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
-        got = "a recording that was not closed, without a complete message of joint states"
-        raise LogError(got, file=path, expected="an MCAP file with an end", do="try `mcap recover FILE`")
-    remarks.append("the recording was not closed: all complete messages were read")
+        got, do = (
+            "no complete message of joint states",
+            "if the recording was not closed, try `mcap recover FILE`",
+        )
+        raise LogError(got, file=path, expected=f"messages of {MESSAGE}", do=do)
     yield from messages
 
 
 def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
-    """Yield topic, recorder's time [ns] and encoded content of each complete message of a type in an MCAP file."""
+    """Yield topic, recorder's time [ns] and encoded content of each complete message of a type in an MCAP file.
+
+    Raises LogError for messages of this type in another encoding than CDR.
+    """
     types: dict[int, str] = {}
     topics: dict[int, str] = {}
     for code, body in _records(path.read_bytes()[len(MAGIC) :]):
@@ -260,6 +271,13 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
             number, schema = struct.unpack_from("<HH", body)
             if types.get(schema) == message_type:
                 topics[number] = _text(body, 4)
+                encoding = _text(body, 8 + len(topics[number].encode()))
+                if encoding != "cdr":
+                    got, do = (
+                        f"joint states encoded as {encoding}",
+                        "export them to CSV, or record by `ros2 bag record`",
+                    )
+                    raise LogError(got, file=path, expected="messages of ROS 2 (cdr)", do=do)
         elif code == MESSAGE_RECORD:
             number, _, recorded = struct.unpack_from("<HIQ", body)
             if number in topics:

@@ -15,8 +15,8 @@ from spelgen.logs.tables import JOINTS_KEY, LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-# Names of the optional array with the joints' names, in the order of matrix columns: `joints`, `joint_names`, `names`.
-JOINT_NAMES = re.compile(r"joints?|(joint_?)?names?", re.IGNORECASE)
+# Names of the optional array with the joints' names, in the order of matrix columns, such as `joints`, `joint_names`.
+JOINT_NAMES = re.compile(r"(joint|dof|motor|actuator)(s|_?names?)", re.IGNORECASE)
 TRAJECTORY = "{trajectory}"
 
 

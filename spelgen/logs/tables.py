@@ -287,7 +287,10 @@ def _require_units(
     units: dict[str, str] = {}
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
         unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(stated.get(name, ""), "")
-        is_mapped = mapping.units.t != "s" if quantity == "t" else mapping.unit(quantity, joint) is not None
+        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.units.t != "s"
+        is_mapped |= bool(
+            mapping.sample_rate if quantity == "t" else quantity == "tau" and mapping.joint(joint).gain
+        )
         if unit not in ("", "s", "rad", "m", "rad/s", "m/s", "Nm", "N") and not is_mapped:
             units[quantity] = unit
     if units:
