@@ -84,7 +84,7 @@ def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name:
         _join_signals(rows)
     rows.leave_out(
         foreign_rows(rows.data, len(layout.joints)),
-        "left out, of another topic or publisher: without values, or with positions only",
+        "left out, of another topic or publisher: without values, with positions only, or with zeros",
     )
     rows.leave_out(np.isnan(rows.data).any(axis=1), "left out, with a signal without a number")
     if mapping.sample_rate:

@@ -83,9 +83,10 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """
     signals = data[:, 1 + joints :]
     zero = (signals == 0).all(axis=1) if signals.shape[1] > joints else np.zeros(len(data), bool)
-    # A motor that is off, or an arm at rest, has more than a few such rows in succession.
+    # An arm at rest whose motors are off has more such rows in succession, and coarse signals of an arm that reverses
+    # have few: less than 2 % of all rows.
     runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
-    is_mixed = runs > TUNING.jump_window and zero.sum() < 4 * runs
+    is_mixed = runs > TUNING.jump_window and 0.02 * len(data) < zero.sum() < 4 * runs
     return np.asarray(np.isnan(signals).all(axis=1) | (zero & is_mixed))
 
 
