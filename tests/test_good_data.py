@@ -162,7 +162,8 @@ def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
     (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
     check_read(log)
     assert log.repairs == (
-        f"{len(zeros)} rows left out, of another topic or publisher: without values, with positions only, or with zeros",
+        f"{len(zeros)} rows left out, of another topic or publisher: without values, "
+        "with positions only, or with zeros",
     )
 
 
