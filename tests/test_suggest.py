@@ -362,6 +362,12 @@ def test_units_may_differ_between_joints(scara, tmp_path, place):
     rows = np.column_stack([T * 1e3, Q * factors, QD * factors, TAU]).tolist()
     path = written(tmp_path / "log.csv", head, rows if place == "names" else [line, *rows])
     require_same(suggested(path, scara)[0])
+    # a joint without a unit does not get the unit of the others
+    head = [x.replace(" [mm]", "").replace(" [mm/s]", "") for x in head]
+    factors = np.where(factors == 1e3, 1.0, factors)
+    if place == "names":
+        rows = np.column_stack([T * 1e3, Q * factors, QD * factors, TAU])
+        require_same(suggested(written(tmp_path / "other.csv", head, rows), scara)[0])
 
 
 def test_units_below_the_header_are_not_ignored(scara, tmp_path):

@@ -391,8 +391,8 @@ def _continues(rows: Rows) -> bool:
         return False
     for row in np.flatnonzero(np.diff(rows.t) < 0).tolist():
         around = slice(max(0, row - TUNING.jump_window), row + TUNING.jump_window + 1)
-        around_it = np.delete(changes[around], row - around.start, axis=0).max(axis=0, initial=0.0)
-        if (changes[row] > 2 * around_it + SIGNALS.rest_range).any() or around_it.max() < SIGNALS.rest_range:
+        largest = np.delete(changes[around], row - around.start, axis=0).max(axis=0, initial=0.0)
+        if (changes[row] > 2 * largest + SIGNALS.rest_range).any() or largest.max() < SIGNALS.rest_range:
             return False
     return True
 

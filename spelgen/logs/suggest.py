@@ -6,7 +6,7 @@ SI units: the checks of logs then detect degrees, for example, and state the set
 
 import json
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, groupby, pairwise
 from operator import itemgetter
@@ -156,7 +156,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
-    units = _units(by_joint)
+    units = _units(by_joint, joints)
     common = _common(units)
     common = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"} | common
     rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
@@ -320,9 +320,11 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
     return by_quantity
 
 
-def _units(by_joint: Mapping[str, Mapping[str, ColumnName]]) -> defaultdict[str, dict[str, str]]:
+def _units(
+    by_joint: Mapping[str, Mapping[str, ColumnName]], joints: Sequence[str]
+) -> dict[str, dict[str, str]]:
     """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
-    units: defaultdict[str, dict[str, str]] = defaultdict(dict)
+    units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():
         for joint, column in named.items():
             unit = UNITS["q" if quantity == "u" else quantity].get(column.unit)

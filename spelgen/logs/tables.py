@@ -309,6 +309,8 @@ def reading(file: Path) -> Iterator[None]:
     except UNREADABLE as error:
         lines = str(error).splitlines() or [type(error).__name__]
         got, do = f"an unreadable {file.suffix[1:]} file ({lines[0].rstrip('.')})", None
-        if file.is_file() and file.open("rb").read(len(LFS)) == LFS:
-            got, do = "a pointer of Git LFS in place of the file", "fetch the content: git lfs pull"
+        if file.is_file():
+            with file.open("rb") as source:
+                if source.read(len(LFS)) == LFS:
+                    got, do = "a pointer of Git LFS in place of the file", "fetch the content: git lfs pull"
         raise LogError(got, file=file, do=do) from error
