@@ -98,6 +98,33 @@ def test_all_complete_messages_of_an_unfinished_recording_are_read(tmp_path, sha
     assert len(whole) == len(T)
 
 
+@pytest.mark.parametrize("encoding", ["cdr", "json", "protobuf"])
+def test_mcap_files_without_the_profile_of_ros_are_read_if_their_messages_are_cdr(tmp_path, encoding):
+    """Tools that join or cut MCAP files omit the profile; other recorders write joint states in other encodings."""
+    (path,) = bag_of(states(), tmp_path / "bag").glob("*.mcap")
+    content = path.read_bytes()
+    assert content[8 + 9 :].startswith(struct.pack("<I", 4) + b"ros2")
+    length = struct.unpack_from("<Q", content, 9)[0]
+    header = struct.pack("<BQ", 1, length - 4) + struct.pack("<I", 0) + content[8 + 9 + 8 : 8 + 9 + length]
+    changed = content[:8] + header + content[8 + 9 + length :]
+    size, name = struct.pack("<I", len(encoding)), encoding.encode()
+    end = changed.index(b"cdr", changed.index(b"/joint_states")) - 4
+    start = changed.rindex(b"\x04", 0, changed.index(b"/joint_states"))
+    record = changed[start : end + 7]
+    longer = (
+        struct.pack("<BQ", 4, struct.unpack_from("<Q", record, 1)[0] + len(encoding) - 3)
+        + record[9:-7]
+        + size
+        + name
+    )
+    (tmp_path / "x.mcap").write_bytes(changed[:start] + longer + changed[end + 7 :])
+    if encoding == "cdr":
+        check_read(read_logs(tmp_path / "x.mcap", JOINTS)[0])
+    else:
+        with pytest.raises(LogError, match=rf"joint states encoded as {encoding}, .*export them to CSV"):
+            read_logs(tmp_path / "x.mcap", JOINTS)
+
+
 @pytest.mark.parametrize("packed", ["lz4", "zstd"])
 def test_packed_chunks_of_an_unfinished_recording_are_read(tmp_path, packed):
     """Compressed chunks of a file without index, as of a recording that was cut off, are read.
@@ -135,7 +162,8 @@ def test_messages_of_a_second_publisher_are_left_out_with_one_note(tmp_path):
     (log,) = read_logs(bag_of(mixed, tmp_path / "bag"), JOINTS)
     check_read(log)
     assert log.repairs == (
-        f"{len(zeros)} rows left out, of another topic or publisher: without values, or with positions only",
+        f"{len(zeros)} rows left out, of another topic or publisher: without values, "
+        "with positions only, or with zeros",
     )
 
 
@@ -230,14 +258,14 @@ def test_times_in_another_unit_are_named_with_the_line_to_write(tmp_path, unit, 
     assert f'"t": "{unit}"' in suggest_mapping(path, JOINTS).text
 
 
-def dataset(folder, values, fps=30):
-    """Write a LeRobot 3 data set with equal positions and commands `values` (T, n) of motors named like the joints."""
+def dataset(folder, values, fps=30, names=JOINTS):
+    """Write a LeRobot 3 data set with equal positions and commands `values` (T, n) of motors with these names."""
     (folder / "meta").mkdir(parents=True)
     (folder / "data" / "chunk-000").mkdir(parents=True)
-    names = [f"{joint}.pos" for joint in JOINTS]
-    features = {name: {"dtype": "float32", "names": names} for name in ("observation.state", "action")}
+    motors = [f"{name}.pos" for name in names]
+    features = {name: {"dtype": "float32", "names": motors} for name in ("observation.state", "action")}
     (folder / "meta" / "info.json").write_text(json.dumps({"fps": fps, "features": features}))
-    lists = pa.array(values.tolist(), pa.list_(pa.float32(), 2))
+    lists = pa.array(values.tolist(), pa.list_(pa.float32(), values.shape[1]))
     times = pa.array(np.arange(len(values)) / fps, pa.float32())
     table = {
         "observation.state": lists,
@@ -408,3 +436,117 @@ def test_texts_of_times_may_have_a_zone_and_infinite_values_are_dropped_on_reque
     pa.parquet.write_table(pa.table({"t": T, **table, "tau_shoulder": broken}), tmp_path / "log.parquet")
     (log,) = read_logs(tmp_path / "log.parquet", JOINTS, {"dropouts": "dropped"})
     assert len(log) == len(T) - 1
+
+
+def columns(**changed):
+    return {"t": T} | {
+        f"{x}_{joint}": y[:, k]
+        for x, y in ({"q": Q, "qd": QD, "tau": TAU} | changed).items()
+        for k, joint in enumerate(JOINTS)
+    }
+
+
+def test_messages_of_a_publisher_of_zeros_are_left_out_with_one_note(tmp_path):
+    """A second publisher may write velocities and efforts that are all 0: its messages are not dropouts of the arm."""
+    messages = states()
+    zeros = [(x[0] + 3_000_000, JOINTS, [0.1, 0.1], [0.0, 0.0], [0.0, 0.0]) for x in messages]
+    for count in (1, 5):
+        mixed = sorted([*messages, *zeros[::count]], key=lambda x: x[0])
+        (log,) = read_logs(bag_of(mixed, tmp_path / f"bag{count}"), JOINTS)
+        check_read(log)
+        assert log.repairs[0].startswith(
+            f"{len(zeros[::count])} rows left out, of another topic or publisher"
+        )
+    # an arm at rest whose motors are off has such rows, too
+    rest = [(x[0], JOINTS, x[2], [0.0, 0.0], [0.0, 0.0]) if k < 50 else x for k, x in enumerate(messages)]
+    assert len(read_logs(bag_of(rest, tmp_path / "rest"), JOINTS)[0]) == len(T)
+
+
+@pytest.mark.parametrize("fault", ["16 bits", "minutes", "set back", "dates"])
+def test_a_clock_that_goes_back_while_the_motion_continues_is_joined(tmp_path, fault):
+    t = {
+        "16 bits": (1000 * T + 65000) % 65536,
+        "minutes": 1000 * ((T + 57) % 60),
+        "set back": 1000 * (T - 0.7 * (T > 1.995)),
+        "dates": 1000 * (1.7e9 + T - 0.7 * (T > 1.995)),
+    }[fault]
+    pa.parquet.write_table(pa.table(columns() | {"t": t}), tmp_path / "x.parquet")
+    (log,) = read_logs(tmp_path / "x.parquet", JOINTS, {"units": {"t": "ms"}})
+    np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-5)
+    np.testing.assert_array_equal(log.q, Q)
+    assert log.repairs == ("the clock went back 1 time while the motion continued: times were joined",)
+    other = np.where(np.arange(len(T))[:, None] > np.argmin(np.diff(t)), Q + 1, Q)
+    pa.parquet.write_table(pa.table(columns(q=other) | {"t": t}), tmp_path / "x.parquet")
+    if fault in ("set back", "dates"):
+        with pytest.raises(LogError, match="number the recordings"):
+            read_logs(tmp_path / "x.parquet", JOINTS, {"units": {"t": "ms"}})
+
+
+@pytest.mark.parametrize("unit", [60.0, 3600.0, 86400.0])
+def test_times_in_minutes_hours_or_days_are_not_units_of_positions(tmp_path, unit):
+    """Times in a unit that a mapping does not have get the rate that all velocities show, and no unit of positions."""
+    pa.parquet.write_table(pa.table(columns() | {"t": T / unit}), tmp_path / "x.parquet")
+    log = read_logs(tmp_path / "x.parquet", JOINTS)
+    with pytest.raises(LogError, match="write 'sample_rate: 100'") as caught:
+        check(log, JOINTS, ["revolute"] * 2)
+    assert "units:" not in str(caught.value) and "counts" not in str(caught.value)
+    check(read_logs(tmp_path / "x.parquet", JOINTS, {"sample_rate": 100}), JOINTS, ["revolute"] * 2)
+    if unit > 60:
+        log = read_logs(tmp_path / "x.parquet", JOINTS, {"velocity": "differentiated"})
+        with pytest.raises(LogError, match="faster than any arm is sampled: write 'sample_rate'"):
+            check(log, JOINTS, ["revolute"] * 2)
+
+
+def test_episodes_without_a_file_are_counted(tmp_path):
+    folder = dataset(tmp_path / "set", np.degrees(Q) * 3)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    for total, remarks in ((1, ()), (3, ("2 episodes of 3 without a file: 1, 2",))):
+        (folder / "meta" / "info.json").write_text(json.dumps(info | {"total_episodes": total}))
+        (log,) = read_logs(folder, JOINTS, POSITION | {"units": {"q": "deg"}})
+        assert tuple(x for x in log.remarks if "episode" in x) == remarks
+
+
+def test_an_older_calibration_of_lerobot_is_one_error_and_other_motors_do_not_matter(tmp_path):
+    folder = dataset(tmp_path / "set", np.degrees(Q))
+    old = {
+        "homing_offset": [2048, 0],
+        "drive_mode": [0, 1],
+        "calib_mode": ["DEGREE"] * 2,
+        "motor_names": list(JOINTS),
+    }
+    (folder / "calibration.json").write_text(json.dumps(old))
+    for mapping in (POSITION, POSITION | {"units": {"q": "normalised"}, "calibration": old}):
+        with pytest.raises(SpelgenError, match="data of an older LeRobot is in degrees") as caught:
+            read_logs(folder, JOINTS, mapping)
+        assert str(caught.value).count("\n") == 0
+    gripper = {"gripper": {"id": 6, "drive_mode": 0, "homing_offset": 0, "range_min": 5, "range_max": 5}}
+    (folder / "calibration.json").write_text(json.dumps(CALIBRATION | gripper))
+    assert len(read_logs(folder, JOINTS, POSITION)) == 1
+
+
+def test_the_range_of_other_elements_of_a_state_does_not_matter(tmp_path):
+    """Positions in rad with a gripper of 0 to 100 are no normalised values."""
+    folder = dataset(tmp_path / "set", np.column_stack([Q, 50 + 50 * np.sin(T)]), names=(*JOINTS, "gripper"))
+    (log,) = read_logs(folder, JOINTS, POSITION)
+    np.testing.assert_allclose(log.q, Q, atol=1e-6)
+
+
+def test_prefixed_motors_of_a_data_set_get_the_line_that_names_them(tmp_path):
+    folder = dataset(tmp_path / "set", np.degrees(Q) * 3, names=("left_shoulder", "left_elbow"))
+    with pytest.raises(LogError, match=r"write 'joints: \{shoulder: \{name: left_shoulder\}, elbow: "):
+        read_logs(folder, JOINTS, POSITION)
+    wrong = POSITION | {"joints": {"shoulder": {"name": "shoulder"}, "elbow": {"name": "elbow"}}}
+    renamed = {"joints": {"j1": {"name": "shoulder"}, "j2": {"name": "elbow"}}}
+    with pytest.raises(LogError, match=r"write 'joints: \{shoulder: \{name: left_shoulder\}, elbow: "):
+        read_logs(folder, JOINTS, wrong)
+    for logs in (
+        folder,
+        bag_of([(x[0], ("left_elbow", "left_shoulder"), *x[2:]) for x in states()], tmp_path / "bag"),
+    ):
+        with pytest.raises(LogError, match=r"write 'joints: \{j1: \{name: left_shoulder\}, j2: "):
+            read_logs(logs, ("j1", "j2"), (POSITION if logs is folder else {}) | renamed)
+    partial = bag_of([(x[0], ("elbow",), *(y[:1] for y in x[2:])) for x in states()], tmp_path / "partial")
+    with pytest.raises(LogError, match=r"without shoulder, .*'moving_joints: \[j2\]'"):
+        read_logs(partial, ("j1", "j2"), renamed)
+    with pytest.raises(LogError, match="write them as 'names' of the features"):
+        read_logs(dataset(tmp_path / "other", Q, names=()), JOINTS, POSITION)

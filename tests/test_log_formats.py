@@ -277,7 +277,7 @@ def test_delan_characters_are_read(shared):
 NPZ = {
     "missing": (
         {"t": T, "q": Q, "tau": TAU},
-        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, q_shoulder, q_elbow, and 2 more, "
+        "{}: missing columns qd_shoulder, qd_elbow: got only the columns t, q, tau, "
         "expected t, q_<joint>, qd_<joint>, tau_<joint>; "
         "write 'velocity: differentiated' under 'logs' in the robot's YAML where none were logged",
     ),
@@ -599,6 +599,12 @@ def test_csv_as_spreadsheets_write_it(tmp_path, separator, decimal, encoding):
     check(read_logs(tmp_path / "x.csv", joints)[0], "x")
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_the_byte_order_of_a_csv_needs_no_mark(tmp_path, encoding):
+    (tmp_path / "x.csv").write_bytes(text_log().encode(encoding))
+    check(read_logs(tmp_path / "x.csv", JOINTS)[0], "x")
+
+
 UNIT_LINE = "s,rad,rad,rad/s,rad/s,Nm,Nm"
 
 
@@ -630,6 +636,12 @@ FORMS = {
         *lines[1:],
     ],
     "comments": lambda lines: ["# arm 3", "# 26 November", *lines],
+    "notes between rows": lambda lines: [*lines[:2], "# speed 50 %", *lines[2:], "# end"],
+    "units with digits": lambda lines: [
+        f"{lines[0]},acc",
+        f"{UNIT_LINE},m/s2",
+        *(f"{x},0" for x in lines[1:]),
+    ],
     "a line of units": lambda lines: [lines[0], UNIT_LINE, *lines[1:]],
     "the header twice": lambda lines: [lines[0], *lines],
     "comments and units": lambda lines: ["# arm 3", lines[0], UNIT_LINE, *lines[1:]],
@@ -995,3 +1007,40 @@ def test_a_path_is_no_code_in_an_advised_command(tmp_path, name):
         read_logs(path, JOINTS)
     command = str(caught.value).split("convert it: ")[1]
     assert "FILE" in command and path.stem not in command
+
+
+def test_columns_without_numbers_and_dashes_have_a_remedy_that_works(tmp_path):
+    """A cell with a dash has no value; an empty column is to be replaced, since rows with a number remain in none."""
+    lines = text_log().splitlines()
+    rows = [line.rpartition(",")[0] for line in lines]
+    (tmp_path / "x.csv").write_text("\n".join([lines[0], *(f"{x},-" for x in rows[1:])]))
+    with pytest.raises(LogError, match="name a column with values in place of tau_elbow") as caught:
+        read_logs(tmp_path / "x.csv", JOINTS)
+    assert "dropouts" not in str(caught.value)
+    (tmp_path / "x.csv").write_text("\n".join([*lines[:2], f"{rows[2]},-", *lines[3:]]))
+    with pytest.raises(LogError, match=r"no finite number \(1 of .*'dropouts: dropped'"):
+        read_logs(tmp_path / "x.csv", JOINTS)
+    assert len(read_logs(tmp_path / "x.csv", JOINTS, {"dropouts": "dropped"})[0]) == len(lines) - 2
+
+
+def test_dates_in_another_order_are_an_error_with_the_form_to_write(tmp_path):
+    for text in ("10/26/2025 11:59:56.5 PM", "26.10.2025 23:59:56.5", "11:59:56:500"):
+        (tmp_path / "x.csv").write_text(f"t,q_a,qd_a,tau_a\n{text},0,0,0\n")
+        with pytest.raises(LogError, match="write times as numbers, or like 2025-10-26"):
+            read_logs(tmp_path / "x.csv", ["a"])
+
+
+def test_a_pointer_of_git_lfs_is_called_so(tmp_path):
+    (tmp_path / "x.parquet").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:a\nsize 1\n")
+    with pytest.raises(
+        LogError, match="a pointer of Git LFS in place of the file; fetch the content: git lfs pull"
+    ):
+        read_logs(tmp_path / "x.parquet", JOINTS)
+
+
+def test_the_cut_last_line_of_json_lines_is_left_out(tmp_path):
+    rows = [json.dumps({"t": 0.01 * k, "q_a": k % 7, "qd_a": 0.5, "tau_a": 0.1 * k}) for k in range(20)]
+    (tmp_path / "x.jsonl").write_text("\n".join([*rows, rows[-1][:11]]))
+    (log,) = read_logs(tmp_path / "x.jsonl", ["a"])
+    assert len(log) == 20
+    assert log.remarks == (f"the last line is cut off and was left out: {rows[-1][:11]}",)

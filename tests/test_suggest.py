@@ -122,6 +122,17 @@ PUBLIC = {
                "raw_joint_torque_{} actual_motor_torque_{}"),
     "FRI": ("sec nsec", "measured_position_{}", "measured_speed_{}", "measured_torque_{}", "ipo_position_{} "
             "commanded_position_{} commanded_torque_{} external_torque_{}"),
+    "Flexiv": ("timestamp", "q_{}", "dq_{}", "tau_{}", "theta_{} dtheta_{} tau_des_{} tau_dot_{} tau_interact_{}"),
+    "Dobot": ("time_stamp", "q_actual_{}", "qd_actual_{}", "m_actual_{}", "q_target_{} m_target_{} i_actual_{}"),
+    "Aubo": ("time", "status{}.jointPosJ", "status{}.jointSpeedMoto", "status{}.jointTorque", "status{}.jointCurVol "
+             "status{}.jointTargetPosJ status{}.jointCurrentI"),
+    "Sunrise": ("sec nsec", "axisQMsr_LBR_14_R820_1[{}]", "axisVelMsr_LBR_14_R820_1[{}]",
+                "axisTauMsr_LBR_14_R820_1[{}]", "axisQCmd_LBR_14_R820_1[{}] axisTauExtMsr_LBR_14_R820_1[{}]"),
+    "FRI of Sunrise": ("Timestamp NanoSeconds", "MeasuredJointPosition{}", "MeasuredJointSpeed{}", "MeasuredTorque{}",
+                       "CommandedJointPosition{} ExternalTorque{}"),
+    "EGM": ("header.tm", "feedBack.joints.joints[{}]", "feedBack.speed[{}]", "measured.torque[{}]",
+            "planned.joints.joints[{}]"),
+    "Fanuc": ("Tick", "J{} Current Angle", "J{} Current Speed", "J{} Torque", "J{} Disturbance Torque"),
     "Kortex": ("ts", "actuators[{}].position", "actuators[{}].velocity", "actuators[{}].torque", ""
                "actuators[{}].current actuators[{}].temperature_motor"),
 }  # fmt: skip
@@ -203,12 +214,39 @@ def test_parts_of_a_torque_get_a_gain_to_write(scara, tmp_path, unit, name):
         ("时间", "位置", "速度", "力矩"),
         ("time", "qpos", "qvel", "qfrc_actuator"),
         ("time", "pos", "vel", "eff"),
+        ("时间", "关节实际位置", "关节实际速度", "关节电流"),
     ],
 )
 def test_words_of_other_languages(scara, tmp_path, words):
     head = [words[0], *(f"{word} {k}" for word in words[1:] for k in range(4))]
     rows = [[t, *q, *qd, *tau] for t, q, qd, tau in zip(T, Q, QD, TAU, strict=True)]
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize("setpoint", ["position consigne {}", "关节{}目标位置", "Soll Winkel {}"])
+def test_set_points_in_other_languages_are_not_measurements(scara, tmp_path, setpoint):
+    measured = setpoint.replace(" consigne", " mesure").replace("目标", "实际").replace("Soll", "Ist")
+    head = ["t", *(form.format(k) for form in (measured, "speed{}", "torque{}", setpoint) for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU, Q + 0.01])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize(
+    "form", ["{0}_{1}_{2}", "{0}[{1}]_{2}", "{0} {2} [{1}]", "{0}_{1}[{2}]", "J{2}_{0}_{1}"]
+)
+def test_units_are_found_anywhere_in_a_name(scara, tmp_path, form):
+    (tmp_path / "arm.urdf").write_text(
+        scara.robot.path.read_text().replace('type="prismatic"', 'type="revolute"')
+    )
+    arm = load_arm(tmp_path / "arm.urdf")
+    signals = (
+        ("angle", "deg", Q * 180 / np.pi),
+        ("speed", "rpm", QD * 30 / np.pi),
+        ("torque", "mNm", TAU * 1e3),
+    )
+    head = ["t", *(form.format(word, unit, k) for word, unit, _ in signals for k in range(4))]
+    rows = np.column_stack([T, *(values for *_, values in signals)])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), arm)[0])
 
 
 def test_cells_with_lists_and_names_as_texts(scara, tmp_path):
@@ -271,3 +309,138 @@ def test_commands_beside_a_load_register_are_those_of_servos(scara, tmp_path, co
     with pytest.raises(LogError, match=r"got commanded positions and no torques.*write 'input: position'"):
         suggest_mapping(path, names)
     assert f'"u": "{command}_{names[0]}"' in suggest_mapping(path, names, commands=True).text
+
+
+NAMES = {
+    "positions by the names of joints": (("waist", "wrist_angle", "set_joint", "arm_pos"), "{}", "{}_vel", "{}_eff"),
+    "names that are words of signals": (
+        ("waist", "wrist_angle", "speed_joint", "arm_pos"), "/arm/{}/position", "/arm/{}/velocity", "/arm/{}/effort",
+    ),
+    "names without a common word": (
+        ("base_pan_joint", "base_lift_joint", "wrist_1_joint", "wrist_2_joint"), "q_{}", "qd_{}", "tau_{}",
+    ),
+    "letters of names with numbers": (
+        ("joint_1_s", "joint_2_l", "joint_3_u", "joint_4_t"), "FBPOS_{}", "speed_{}", "TRQ_{}",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", NAMES)
+def test_joints_are_found_by_the_distinct_parts_of_their_names(scara, tmp_path, form):
+    """Columns with a joint's name, or with the part that distinguishes it, belong to the joint in any order."""
+    names, *patterns = NAMES[form]
+    text = scara.robot.path.read_text()
+    for k, name in enumerate(names):
+        text = text.replace(f'"joint{k + 1}"', f'"{name}"')
+    (tmp_path / "arm.urdf").write_text(text)
+    arm = load_arm(tmp_path / "arm.urdf")
+    short = {
+        "names without a common word": lambda x: x.removesuffix("_joint"),
+        "letters of names with numbers": lambda x: x[-1].upper(),
+    }
+    labels = list(map(short.get(form, str), names))
+    order = [2, 0, 3, 1]
+    head = ["Time", *(pattern.format(labels[k]) for pattern in patterns for k in order)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q[:, order], QD[:, order], TAU[:, order]]))
+    require_same(suggested(path, arm)[0])
+
+
+@pytest.mark.parametrize("place", ["names", "line below the header"])
+def test_units_may_differ_between_joints(scara, tmp_path, place):
+    """Units in names, or in a line below the header, are drafted for each joint: a SCARA has degrees and mm."""
+    types = scara.chain.joint_types
+    factors = np.array([180 / np.pi if kind == "revolute" else 1e3 for kind in types])
+    units = [("deg", "deg/s", "Nm") if kind == "revolute" else ("mm", "mm/s", "N") for kind in types]
+    words = ("pos", "vel", "force")
+    head, line = ["time"], ["ms"]
+    for k, word in enumerate(words):
+        head += [
+            f"J{joint + 1} {word}" + (f" [{units[joint][k]}]" if place == "names" else "")
+            for joint in range(4)
+        ]
+        line += [units[joint][k] for joint in range(4)]
+    rows = np.column_stack([T * 1e3, Q * factors, QD * factors, TAU]).tolist()
+    path = written(tmp_path / "log.csv", head, rows if place == "names" else [line, *rows])
+    require_same(suggested(path, scara)[0])
+    # a joint without a unit does not get the unit of the others
+    head = [x.replace(" [mm]", "").replace(" [mm/s]", "") for x in head]
+    factors = np.where(factors == 1e3, 1.0, factors)
+    if place == "names":
+        rows = np.column_stack([T * 1e3, Q * factors, QD * factors, TAU])
+        require_same(suggested(written(tmp_path / "other.csv", head, rows), scara)[0])
+
+
+def test_units_below_the_header_are_not_ignored(scara, tmp_path):
+    head = ["t", *(f"{x}_{name}" for x in ("q", "qd", "tau") for name in scara.chain.joint_names)]
+    line = ["s", *["rad"] * 4, *["rad/s"] * 4, *["mNm"] * 4, "m/s2"]
+    path = written(
+        tmp_path / "log.csv", [*head, "acc"], [line, *np.column_stack([T, Q, QD, TAU * 1e3, T]).tolist()]
+    )
+    names = scara.chain.joint_names
+    with pytest.raises(
+        LogError, match=r"units in a line below the header: tau: mNm, .*write 'units: \{tau: mNm\}'"
+    ):
+        read_logs(path, names)
+    require_same(read_logs(path, names, {"units": {"tau": "mNm"}})[0])
+    gains = {name: {"gain": 1e-3} for name in names}
+    require_same(read_logs(path, names, {"joints": gains})[0])
+
+
+@pytest.mark.parametrize("key", ["joints", "joint_names", "dof_names"])
+def test_names_in_an_archive_give_the_order_of_its_matrices(scara, tmp_path, key):
+    order = [3, 1, 0, 2]
+    names = np.array(scara.chain.joint_names)[order]
+    matrices = {"q": Q[:, order], "qd": QD[:, order], "tau": TAU[:, order]}
+    np.savez(tmp_path / "log.npz", t=T, **matrices, **{key: names})
+    require_same(read_logs(tmp_path / "log.npz", scara.chain.joint_names)[0])
+    renamed = {"positions": matrices["q"], "velocities": matrices["qd"], "torques": matrices["tau"]}
+    np.savez(tmp_path / "other.npz", time=T, **renamed, **{key: names.astype("S")})
+    require_same(suggested(tmp_path / "other.npz", scara)[0])
+
+
+@pytest.mark.parametrize("form", ["numbers", "signals"])
+def test_a_row_per_signal_is_to_be_pivoted(scara, tmp_path, form):
+    if form == "numbers":
+        head, column = ["time", "axis", "pos", "torque"], "axis"
+        rows = [
+            [t, k, q, x]
+            for t, *values in zip(T, Q, TAU, strict=True)
+            for k, (q, x) in enumerate(zip(*values, strict=True))
+        ]
+    else:
+        head, column = ["time", "signal", "value"], "signal"
+        rows = [[t, f"q{k}", x] for t, values in zip(T, Q, strict=True) for k, x in enumerate(values)]
+    with pytest.raises(LogError, match=rf"joints in the column '{column}'.*columns='{column}'\)"):
+        suggest_mapping(written(tmp_path / "long.csv", head, rows), scara.chain.joint_names)
+
+
+def test_empty_columns_are_not_drafted_and_other_clocks_are_listed(scara, tmp_path):
+    head = [
+        "stamp",
+        "secs",
+        "nsecs",
+        "rosbagTimestamp",
+        *(f"{x}{k}" for x in ("pos", "vel", "eff") for k in range(4)),
+    ]
+    rows = [
+        ["", int(1.6e9 + t), round((t % 1) * 1e9), 1.6e9 + t + 0.003 * (k % 2), *values]
+        for k, (t, values) in enumerate(zip(T, np.column_stack([Q, QD, TAU]).tolist(), strict=True))
+    ]
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found)
+    assert "# not used for t: rosbagTimestamp" in text
+
+
+def test_lists_in_braces(scara, tmp_path):
+    lists = [["{" + ", ".join(map(repr, x)) + "}" for x in values.tolist()] for values in (Q, QD, TAU)]
+    rows = zip(T, *lists, strict=True)
+    require_same(suggested(written(tmp_path / "log.csv", ["time", "Angle", "Spd", "Torque"], rows), scara)[0])
+
+
+def test_leaders_command_followers(scara, tmp_path):
+    names = scara.chain.joint_names
+    head = ["t", *(f"{x}_{name}" for x in ("leader", "follower") for name in names)]
+    draft = suggest_mapping(
+        written(tmp_path / "log.csv", head, np.column_stack([T, Q, Q])), names, commands=True
+    )
+    assert f'"q": "follower_{names[0]}", "u": "leader_{names[0]}"' in draft.text

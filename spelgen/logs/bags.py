@@ -6,8 +6,8 @@ body. https://mcap.dev/spec
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from itertools import chain, takewhile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from spelgen.errors import LogError, in_one_line
 from spelgen.files import limited_memory, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.joint_signals import mapping_line
-from spelgen.logs.tables import LogTable
+from spelgen.logs.tables import LogTable, joint_patterns
 from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
@@ -56,7 +56,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     LogError for a bag that cannot be read, and if `rosbags` is not installed.
     """
     remarks: list[str] = []
-    names = list(map(mapping.log_name, joints))
+    names = {joint: mapping.log_name(joint) for joint in joints}
     messages = _of_one_arm(list(_messages(path, mapping.topic, remarks)), names, path, remarks)
     stamped = [message for message in messages if message.stamp]
     times = np.array([message.stamp for message in stamped])
@@ -66,7 +66,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         stamped, times = messages, np.array([message.recorded for message in messages])
     elif len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
-    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, names)
+    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, list(names.values()))
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply to bags.
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
@@ -74,23 +74,23 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _of_one_arm(
-    messages: Sequence[StampedState], names: Sequence[str], path: Path, remarks: list[str]
+    messages: Sequence[StampedState], names: Mapping[str, str], path: Path, remarks: list[str]
 ) -> list[StampedState]:
-    """Return the messages of a bag that contain any of the arm's joints `names`.
+    """Return the messages of a bag that contain any joint of the arm.
 
     A message may contain only some of the joints, and joints may be on several topics. If most of the messages contain
     all joints, the others are omitted. Raises LogError if several topics contain the same joint, or if a joint is in no
-    message. remarks: list to which a remark on omitted messages is added.
+    message. names: {joint: its name in the log}. remarks: list to which a remark on omitted messages is added.
     """
-    arm = set(names)
+    arm = set(names.values())
     of_arm = [x for x in messages if not arm.isdisjoint(x.state.name)]
     if not of_arm:
         logged = list(dict.fromkeys(name for x in messages for name in x.state.name))
         if not logged:
             got = f"{counted(len(messages), 'joint state')}, none with names of joints"
-            raise LogError(got, file=path, expected=f"joint states of {', '.join(names)}")
+            raise LogError(got, file=path, expected=f"joint states of {', '.join(names.values())}")
         got = f"joint states of {', '.join(logged)} only"
-        raise LogError(got, file=path, expected=", ".join(names), do=_names_line(names, logged))
+        raise LogError(got, file=path, expected=", ".join(names.values()), do=names_line(names, logged))
     joints_of: dict[str, set[str]] = {}
     for message in of_arm:
         joints_of.setdefault(message.topic, set()).update(arm.intersection(message.state.name))
@@ -98,10 +98,10 @@ def _of_one_arm(
         topics = sorted(joints_of)
         got, do = f"joint states on the topics {', '.join(topics)}", mapping_line({"topic": topics[0]})
         raise LogError(got, file=path, expected="one of them", do=f"{do}, or the other topic")
-    missing = [name for name in names if name not in set.union(*joints_of.values())]
+    missing = [name for name in names.values() if name not in set.union(*joints_of.values())]
     if missing:
         got, expected = f"joint states without {', '.join(missing)}", "states of all joints of the arm"
-        present = ", ".join(name for name in names if name not in missing)
+        present = ", ".join(joint for joint, name in names.items() if name not in missing)
         do = f"write 'moving_joints: [{present}]' into the robot's YAML if the others do not move, or map their names"
         raise LogError(got, file=path, expected=expected, do=do)
     complete = [x for x in of_arm if arm.issubset(x.state.name)]
@@ -139,21 +139,20 @@ def _joint_states(
     return columns
 
 
-def _names_line(names: Sequence[str], logged: Sequence[str]) -> str:
+def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    names: names of the arm's joints, none of which is in the log. logged: joint names in the log. The advice contains
-    the settings that map the names if every joint name is the end of exactly one logged name ("j1" of "left_j1"). If
-    not, it is tried again without the prefix that all joint names share ("panda_j1" is then mapped to "fer_j1").
+    names: {joint: its name in the mapping}. logged: names in the log. The advice contains the settings that map the
+    names if exactly one logged name contains each name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
     """
-    words = [name.split("_") for name in names]
-    shared = len(list(takewhile(lambda column: len(set(column)) == 1, zip(*words, strict=False))))
-    for ends in (names, ["_".join(of_name[shared:]) for of_name in words]):
-        found = [[x for x in logged if x.endswith(end)] for end in ends]
-        if all(len(full_names) == 1 for full_names in found):
-            lines = {name: {"name": full_name} for name, (full_name,) in zip(names, found, strict=True)}
-            return mapping_line({"joints": lines})
-    return mapping_line({"joints": {names[0]: {"name": "NAME IN THE LOG"}}}) + ", and so for the other joints"
+    patterns = joint_patterns(list(names.values()), logged)
+    matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}
+    if all(len(full_names) == 1 for full_names in matches.values()):
+        return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in matches.items()}})
+    return (
+        mapping_line({"joints": {next(iter(names)): {"name": "NAME IN THE LOG"}}})
+        + ", and so for the other joints"
+    )
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
@@ -185,9 +184,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
         # suffices.
         with limited_memory(MEMORY + 20 * size):
             messages = _read_by(Ros1Reader if is_ros1 else Ros2Reader, path)
-            unfinished = [] if is_ros1 else _unfinished(path)
-            if unfinished:
-                messages = _without_end(unfinished, path, remarks)
+            other_files = [] if is_ros1 else _of_other_recorders(path, remarks)
+            if other_files:
+                messages = _joint_states_in(other_files, path)
             topics = set()
             for name, recorded, raw in messages:
                 topics.add(name)
@@ -222,36 +221,47 @@ def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
             yield connection.topic, recorded, raw
 
 
-def _unfinished(path: Path) -> list[Path]:
-    """Return all MCAP files of a bag if one of them lacks its end (the recorder was killed); [] if all are complete.
+def _of_other_recorders(path: Path, remarks: list[str]) -> list[Path]:
+    """Return all MCAP files of a bag if one of them lacks its end or the profile of ROS 2; [] if none does.
 
-    `rosbags` cannot open such a bag, so `_without_end` reads all its files.
+    `rosbags` cannot open such a bag, so `_joint_states_in` reads all its files. remarks: list to which a remark on a
+    recorder that was killed is added.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    is_closed = is_ros2 = True
     for file in files:
         with file.open("rb") as source:
-            if source.read(len(MAGIC)) == MAGIC:
+            head = source.read(64)
+            if head.startswith(MAGIC):
+                # The first record, after its code and length, has the profile. Tools that join or cut files omit it.
+                is_ros2 &= _text(head, len(MAGIC) + 9) == "ros2"
                 source.seek(-len(MAGIC), 2)
-                if source.read() != MAGIC:
-                    return files
-    return []
+                is_closed &= source.read() == MAGIC
+    if not is_closed:
+        remarks.append("the recording was not closed: all complete messages were read")
+    return [] if is_closed and is_ros2 else files
 
 
-def _without_end(files: Sequence[Path], path: Path, remarks: list[str]) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of MCAP files whose recorder was killed, and add a remark about it.
+def _joint_states_in(files: Sequence[Path], path: Path) -> Iterator[RawState]:
+    """Yield the encoded joint states on all topics of MCAP files, which may lack their end.
 
     path: path of the bag, for errors. Raises LogError if there are no joint states.
     """
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
-        got = "a recording that was not closed, without a complete message of joint states"
-        raise LogError(got, file=path, expected="an MCAP file with an end", do="try `mcap recover FILE`")
-    remarks.append("the recording was not closed: all complete messages were read")
+        got, do = (
+            "no complete message of joint states",
+            "if the recording was not closed, try `mcap recover FILE`",
+        )
+        raise LogError(got, file=path, expected=f"messages of {MESSAGE}", do=do)
     yield from messages
 
 
 def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
-    """Yield topic, recorder's time [ns] and encoded content of each complete message of a type in an MCAP file."""
+    """Yield topic, recorder's time [ns] and encoded content of each complete message of a type in an MCAP file.
+
+    Raises LogError for messages of this type in another encoding than CDR.
+    """
     types: dict[int, str] = {}
     topics: dict[int, str] = {}
     for code, body in _records(path.read_bytes()[len(MAGIC) :]):
@@ -261,6 +271,13 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
             number, schema = struct.unpack_from("<HH", body)
             if types.get(schema) == message_type:
                 topics[number] = _text(body, 4)
+                encoding = _text(body, 8 + len(topics[number].encode()))
+                if encoding != "cdr":
+                    got, do = (
+                        f"joint states encoded as {encoding}",
+                        "export them to CSV, or record by `ros2 bag record`",
+                    )
+                    raise LogError(got, file=path, expected="messages of ROS 2 (cdr)", do=do)
         elif code == MESSAGE_RECORD:
             number, _, recorded = struct.unpack_from("<HIQ", body)
             if number in topics:

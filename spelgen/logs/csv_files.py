@@ -2,6 +2,7 @@
 
 import codecs
 import csv
+import json
 import re
 from collections.abc import Sequence
 from itertools import takewhile, zip_longest
@@ -14,15 +15,20 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
-from spelgen.logs.tables import LogTable
+from spelgen.logs.tables import STATED_KEY, LogTable
 from spelgen.logs.values import is_number, stamps
-from spelgen.settings.log_mapping import PLAIN, LogMapping
+from spelgen.settings.log_mapping import PLAIN, UNIT_NAMES, LogMapping
 
 # First columns of a file that `ros2 topic echo --csv` writes: the fields of the message header.
 STAMP = ("sec", "nanosec", "frame_id")
+ALL_UNITS = set().union(*UNIT_NAMES.values())
 # Beginning of a comment line: "#" or "% ". A "%" without a blank is no comment: `rostopic echo -p` names a column
 # "%time".
 COMMENT = re.compile(r"^(#|% )\s*")
+
+
+# Texts that are no value, in addition to the texts that Arrow recognises.
+NO_VALUE = [*pa.csv.ConvertOptions().null_values, "-", "--", "---", "None"]
 
 
 class Beginning(NamedTuple):
@@ -33,6 +39,7 @@ class Beginning(NamedTuple):
         delimiter: character between columns.
         names: names of the columns; for a file without a header, the values of its first row.
         lines: number of lines before the first row of values: comments, the header, and lines such as units.
+        units: units of the columns, from a line below the header, in lower case; [] without such a line.
         rows: the first rows of values.
     """
 
@@ -40,6 +47,7 @@ class Beginning(NamedTuple):
     delimiter: str
     names: list[str]
     lines: int
+    units: list[str]
     rows: str
 
 
@@ -63,6 +71,8 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     wrong: list[pa.csv.InvalidRow] = []
 
     def skipped(row: pa.csv.InvalidRow) -> str:
+        if COMMENT.match(row.text):
+            return "skip"
         wrong.append(row)
         return "skip" if len(wrong) == 1 else "error"
 
@@ -78,7 +88,7 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
         source,
         pa.csv.ReadOptions(use_threads=False, encoding=encoding, **rows),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
-        pa.csv.ConvertOptions(decimal_point=decimal_point),
+        pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
     )
     # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
@@ -91,6 +101,9 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
             )
     if names is not None:
         table = table.append_column(PLAIN["t"], stamps(table[STAMP[0]], table[STAMP[1]]))
+    if text.units:
+        units = dict(zip(text.names, text.units, strict=False))
+        table = table.replace_schema_metadata({STATED_KEY: json.dumps(units)})
     return table, text.lines, wrong[0].text if wrong else ""
 
 
@@ -101,10 +114,14 @@ def _beginning(file: Path) -> Beginning:
     delimiter, cells, width = _divided(lines)
     header = _header_row(lines, cells, width)
     names, start = cells[header], header
+    units: list[str] = []
     if not is_number(names[0]):
         names, start = _column_names(lines, cells, header)
         names = names + [""] * (width - len(names))
-    return Beginning(encoding, delimiter, names, start, "\n".join(lines[start:]))
+        units = [x.strip(" []()").lower() for x in cells[start - 1]]
+        # Names, and the header itself, may contain words such as `deg`.
+        units = units if sum(x in ALL_UNITS for x in units) > len(units) / 2 else []
+    return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
 
 
 def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
@@ -145,9 +162,7 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
     names, between = cells[header], header + 1
     is_repeated = len(set(names)) < len(names) - 1
     start = between
-    while start < len(lines) - 1 and _is_text(
-        lines[start], lines[header], cells[start] if is_repeated else None
-    ):
+    while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
         start += 1
     if is_repeated and start > between:
         filled = names[:1]
@@ -158,15 +173,14 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
     return names, start
 
 
-def _is_text(line: str, header: str, cells: Sequence[str] | None) -> bool:
+def _is_text(line: str, header: str, cells: Sequence[str]) -> bool:
     """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    A line without digits has no values. In a file with joint names in a second line, names such as "joint1" have
-    digits: there, a line has no values if none of its cells is a number. cells: cells of the line for such a file; None
-    for other files.
+    Names and units may have digits, such as "joint1" and "m/s2". A value is a cell that is a number, or has a number or
+    a time in its text, such as "[0.1, 0.2]" and "10:00:00".
     """
-    is_name = cells is not None and not any(map(is_number, cells))
-    return bool(line) and (line == header or is_name or not re.search(r"\d", line))
+    has_values = any(map(is_number, cells)) or re.search(r"\d[.,:]\d", line)
+    return bool(line) and (line == header or not has_values)
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -206,6 +220,10 @@ def _decoded_head(file: Path) -> tuple[str, str]:
         head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
+    # Without a mark of the byte order, the first character shows UTF-16: its other byte is 0.
+    if 0 in head[:2] and head[:2] != b"\0\0":
+        encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
+        return encoding, head.decode(encoding, "ignore")
     try:
         # The head of the file may end in the middle of a UTF-8 character, which the incremental decoder omits.
         return "utf-8", codecs.getincrementaldecoder("utf-8")().decode(head, final=len(head) < size)

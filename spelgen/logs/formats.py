@@ -23,10 +23,16 @@ _PYTHON = 'python -c "import {}"'
 # {suffix of a file that is no log: command that converts the file to a log}; in the command, {0} is the path of the
 # file, and {1} the path without the suffix.
 CONVERT = {
+    ".zip": "unzip {0}", **dict.fromkeys((".tar", ".tgz"), "tar -xf {0}"),
     ".zstd": "zstd -d {0}", ".zst": "zstd -d {0}", ".gz": "gunzip {0}", ".xz": "unxz {0}", ".bz2": "bunzip2 {0}",
-    **dict.fromkeys((".txt", ".dat", ".asc"), "mv {0} {1}.csv"),
+    **dict.fromkeys((".txt", ".dat", ".asc", ".log"), "mv {0} {1}.csv"),
     ".xlsx": _PYTHON.format("pandas; pandas.read_excel('{0}').to_csv('{1}.csv', index=False)"),
-    ".pkl": _PYTHON.format("pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"),
+    **dict.fromkeys((".feather", ".arrow"), _PYTHON.format(
+        "pandas; pandas.read_feather('{0}').to_parquet('{1}.parquet')"
+    )),
+    **dict.fromkeys((".pkl", ".pickle"), _PYTHON.format(
+        "pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"
+    )),
     ".json": _PYTHON.format("pandas; pandas.read_json('{0}').to_parquet('{1}.parquet')"),
     ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
     ".mat": _PYTHON.format("numpy, scipy.io; numpy.savez('{1}.npz', **scipy.io.loadmat('{0}'))"),

@@ -1,5 +1,6 @@
 """Reader of NPZ archives that contain one array per column, or matrices with one column per joint."""
 
+import json
 import re
 from collections.abc import Collection, Sequence
 from itertools import starmap
@@ -10,15 +11,13 @@ import numpy as np
 import pyarrow as pa
 
 from spelgen.errors import LogError
-from spelgen.logs.tables import LogTable, missing_columns
+from spelgen.logs.tables import JOINTS_KEY, LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
-JOINT_NAMES = "joints"  # name of the optional array with the joints' names, in the order of matrix columns
+# Names of the optional array with the joints' names, in the order of matrix columns, such as `joints`, `joint_names`.
+JOINT_NAMES = re.compile(r"(joint|dof|motor|actuator)(s|_?names?)", re.IGNORECASE)
 TRAJECTORY = "{trajectory}"
-
-Columns = dict[str, tuple[str, int]]
-"""Columns of matrices: {name of the column: (name of the matrix, index)}."""
 
 
 class NpzArrays:
@@ -60,6 +59,13 @@ class NpzArrays:
         """Return an error about the array of this name; other arguments as for `LogError`."""
         return LogError(got, file=self.file, element=f"array {name}", expected=expected, do=do)
 
+    def joint_names(self) -> tuple[str, list[str]]:
+        """Return the name of the array of joint names, and the joint names; ("", []) if there is none."""
+        for name in filter(JOINT_NAMES.fullmatch, self.names):
+            if self[name].dtype.kind in "US":
+                return name, [x.decode() if isinstance(x, bytes) else x for x in self[name].ravel().tolist()]
+        return "", []
+
     def is_vector(self, name: str) -> bool:
         """Return True if an array has the shape (T,), (T, 1) or (1, T): MATLAB stores vectors as matrices."""
         return max(self[name].shape, default=0) == self[name].size
@@ -85,54 +91,50 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
-    """Return the table of one recording of an archive; `recording` is its name, None if it is the only one."""
-    columns: Columns = {}
-    patterns: dict[str, str] = {}
+    """Return the table of one recording of an archive; `recording` is its name, None if it is the only one.
+
+    A matrix (T, n) of an archive replaces n arrays, one per joint: the column `q_<joint>` may be `q[2]`.
+    """
+    columns: dict[str, dict[str, str | None]] = {joint: {} for joint in joints}
     for quantity in mapping.quantities if joints else ():
-        pattern = mapping.pattern(quantity)
-        # The mapping may name a matrix with one column per joint, without the placeholder `{joint}`.
-        named = pattern if "{joint}" in pattern else pattern + "_{joint}"
-        of_matrix = _matrix_columns(named, arrays, [mapping.log_name(joint) for joint in joints])
-        if of_matrix:
-            columns, patterns[quantity] = columns | of_matrix, named
-    mapping = mapping.model_copy(update={"columns": mapping.columns.model_copy(update=patterns)})
+        matrix = mapping.pattern(quantity).replace("{joint}", "").rstrip("_")
+        if matrix in arrays.names and arrays[matrix].ndim > 1:
+            order = _order(matrix, arrays, [mapping.log_name(joint) for joint in joints])
+            for joint, index in zip(joints, order, strict=True):
+                columns[joint][quantity] = f"{matrix}[{index}]"
+    mapping = mapping.with_joint_columns(columns)
     # `vectors`: columns in the mapping that are vectors, or elements of a matrix, such as data[0].
     vectors = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
 
     def read(names: list[str] | None) -> pa.Table:
-        return _longest(arrays) if names is None else _equally_long(arrays, names, vectors, columns)
+        return _longest(arrays) if names is None else _equally_long(arrays, names, vectors)
 
     # The schema has names without types, since the type of an array is known only after it is read.
-    schema = pa.schema([(name, pa.null()) for name in [*arrays.names, *columns]])
+    schema = pa.schema([(name, pa.null()) for name in arrays.names])
     return LogTable(schema, read, mapping, recording=recording)
 
 
-def _equally_long(
-    arrays: NpzArrays, names: Sequence[str], vectors: Collection[str], matrix_columns: Columns
-) -> pa.Table:
+def _equally_long(arrays: NpzArrays, names: Sequence[str], vectors: Collection[str]) -> pa.Table:
     """Return a table of the arrays `names`, all of T rows. Raises LogError if their lengths differ.
 
-    An array (T,) becomes a column, and a matrix (T, n) a column of lists. matrix_columns: {name: (matrix, index)}
-    for names that are single columns of a matrix. vectors: names of arrays that are vectors, also if they have the
-    shape (T, 1) or (1, T).
+    An array (T,) becomes a column, and a matrix (T, n) a column of lists. vectors: names of arrays that are vectors,
+    also if they have the shape (T, 1) or (1, T).
     """
     table: dict[str, pa.Array] = {}
     samples = None
     for name in names:
-        stored, index = matrix_columns.get(name, (name, None))
-        array = arrays[stored]
-        is_matrix = array.ndim == 2 and (index is not None or name not in vectors)
+        array = arrays[name]
+        is_matrix = array.ndim == 2 and name not in vectors
         length = len(array) if is_matrix else array.size
         samples = length if samples is None else samples
-        if length != samples or not (is_matrix or arrays.is_vector(stored)):
+        if length != samples or not (is_matrix or arrays.is_vector(name)):
             expected, do = f"a value for each of the {samples} times", "resample it to these times"
-            raise arrays.error(stored, f"an array of shape {array.shape}", expected, do)
+            raise arrays.error(name, f"an array of shape {array.shape}", expected, do)
         # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
         # orders.
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
-        values = pa.array((array if index is None else array[:, index]).astype(wide).ravel())
-        is_list = is_matrix and index is None
-        table[name] = pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_list else values
+        values = pa.array(array.astype(wide).ravel())
+        table[name] = pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_matrix else values
     return pa.table(table)
 
 
@@ -145,34 +147,28 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
     samples = max(rows.values(), default=0)
-    return _equally_long(arrays, [name for name in names if rows[name] == samples], vectors, {})
+    table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
+    return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
 
-def _matrix_columns(pattern: str, arrays: NpzArrays, names: list[str]) -> Columns:
-    """Return {column name in the mapping: (matrix, index of its column)}, such as {"q_elbow": ("q", 2)}.
+def _order(matrix: str, arrays: NpzArrays, names: list[str]) -> list[int]:
+    """Return the column of each joint in a matrix (T, n) of an archive. names: names of the arm's joints in the log.
 
-    Thus a matrix (T, n) of an archive replaces n arrays, one per joint; {} is returned if the archive lacks the matrix.
-    The array `joints` of the archive states the order of its columns; without it the order is the arm's.
-
-    pattern: name of the columns in the mapping, such as `q_{joint}` for the matrix `q`. names: names of the arm's
-    joints in the log.
+    An array of names in the archive states the order of the columns; without it the order is the arm's.
     """
-    matrix = pattern.replace("{joint}", "").rstrip("_")
-    if matrix not in arrays.names or arrays[matrix].ndim < 2:
-        return {}
     rows, width, *further = arrays[matrix].shape
     if further:
         got, expected = f"an array of shape {arrays[matrix].shape}", "a row per time and a column per joint"
         raise arrays.error(matrix, got, expected, "store an array per recording, such as q_1, q_2")
-    if JOINT_NAMES in arrays.names:
-        logged = list(map(str, arrays[JOINT_NAMES].ravel()))
+    stored, logged = arrays.joint_names()
+    if stored:
         absent = [name for name in names if name not in logged or len(logged) != width]
         if absent:
             expected = f"{absent[0]} among the names of the {width} columns of {matrix}"
-            raise arrays.error(JOINT_NAMES, f"the joints {', '.join(logged)}", expected)
-        names = logged
-    elif width != len(names):
+            raise arrays.error(stored, f"the joints {', '.join(logged)}", expected)
+        return [logged.index(name) for name in names]
+    if width != len(names):
         is_turned = rows == len(names)
-        do = "transpose it: rows are times" if is_turned else f"name them by an array {JOINT_NAMES!r}"
+        do = "transpose it: rows are times" if is_turned else "name them by an array 'joints'"
         raise arrays.error(matrix, f"{width} columns", f"{len(names)}, one for each joint", do)
-    return {pattern.replace("{joint}", name): (matrix, index) for index, name in enumerate(names)}
+    return list(range(width))

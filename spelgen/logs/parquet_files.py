@@ -1,6 +1,6 @@
 """Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -10,14 +10,17 @@ import pyarrow as pa
 import pyarrow.json
 import pyarrow.parquet
 
-from spelgen.errors import LogError, collect
+from spelgen.errors import LogError, collect, shortened
 from spelgen.files import read_json, require_regular_file
+from spelgen.labels import counted
+from spelgen.logs.bags import names_line
 from spelgen.logs.tables import LogTable, reading
+from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
 
 INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
-STATE, ACTION, TIMESTAMP = "observation.state", "action", "timestamp"
+STATE, ACTION, TIMESTAMP, EPISODE = "observation.state", "action", "timestamp", "episode_index"
 ENDING = ".pos"
 # Largest magnitude of positions that LeRobot has normalised to -100..100, with a tolerance for rounding to single
 # precision.
@@ -41,8 +44,17 @@ def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list
 
 
 def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a file with a JSON object per line and row."""
-    return [LogTable.of(_flat(pa.json.read_json(file)), mapping, header=0)]
+    """Return a list with one table, the content of a file with a JSON object per line and row.
+
+    A last line that is cut off is omitted, with a remark.
+    """
+    text = file.read_bytes()
+    lines, _, last = text.rstrip().rpartition(b"\n")
+    # The last line of a recorder that was killed is cut off.
+    is_cut = bool(lines) and not last.endswith(b"}")
+    table = pa.json.read_json(pa.BufferReader(lines if is_cut else text))
+    remarks = (f"the last line is cut off and was left out: {last[:30].decode(errors='replace')}",) * is_cut
+    return [LogTable.of(_flat(table), mapping, remarks=remarks, header=0)]
 
 
 def _flat(table: pa.Table) -> pa.Table:
@@ -60,18 +72,20 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     """
     info = read_json(folder / INFO, LogError)
     states, actions = _motor_names(folder, info, STATE), _motor_names(folder, info, ACTION)
-    columns: dict[str, dict[str, str | None]] = {}
-    for joint in joints:
-        name = mapping.log_name(joint)
-        for names in (states, actions):
-            if name not in names:
-                raise LogError(
-                    f"the motors {', '.join(names) or 'without names'}", file=folder / INFO, element=f"joint {joint}",
-                    expected=f"{name} among them", do="write its name under 'logs', 'joints' in the robot's YAML",
-                )  # fmt: skip
-        columns[joint] = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-    mapping = mapping.with_joint_columns(columns)
-    common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": "episode_index"})
+    logged = {joint: mapping.log_name(joint) for joint in joints}
+    for names in (states, actions):
+        missing = [name for name in logged.values() if name not in names]
+        if missing:
+            do = names_line(logged, names) if names else f"write them as 'names' of the features into {INFO}"
+            raise LogError(
+                f"the motors {', '.join(names) or 'without names'}", file=folder / INFO,
+                expected=f"{', '.join(missing)} among them", do=do,
+            )  # fmt: skip
+    mapping = mapping.with_joint_columns({
+        joint: {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        for joint, name in logged.items()
+    })  # fmt: skip
+    common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": EPISODE})
     mapping = mapping.model_copy(update={"columns": common})
     files = sorted((folder / "data").rglob("*.parquet"))
     for file in files:
@@ -80,10 +94,11 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
         expected = "data/chunk-000/file-000.parquet"
         raise LogError("a data set without Parquet files", file=folder, expected=expected)
     mapping, remarks = _with_scale(folder, files, joints, mapping)
+    remarks += _missing_episodes(files, info)
     # Joint names without the suffix ".pos" are from LeRobot 2, which always writes degrees: the remarks that positions
     # may be normalised are removed.
     if ENDING not in str(info["features"][STATE]["names"]):
-        remarks = ()
+        remarks = tuple(x for x in remarks if UNLESS_NORMALISED not in x)
     fps = info.get("fps")
     if isinstance(fps, int | float) and not mapping.sample_rate:
         _require_times(files[0], fps)
@@ -98,12 +113,32 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     return tables
 
 
+def _column(file: Path, name: str) -> pa.Array | None:
+    """Return one column of a file of a data set; None if the file lacks it."""
+    with reading(file):
+        if name not in pa.parquet.read_schema(file).names:
+            return None
+        return pa.parquet.read_table(file, columns=[name])[name].combine_chunks()
+
+
+def _missing_episodes(files: Sequence[Path], info: Mapping[str, object]) -> tuple[str, ...]:
+    """Return a remark on the episodes that are in none of the files of a LeRobot data set; () if all are."""
+    total = info.get("total_episodes")
+    columns = [column for file in files if (column := _column(file, EPISODE)) is not None]
+    if not isinstance(total, int) or total > 10**6 or not columns:
+        return ()
+    numbers = set(chain(*(column.unique().to_pylist() for column in columns)))
+    missing = [str(number) for number in range(total) if number not in numbers]
+    text = (
+        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}"
+    )
+    return (text,) if missing else ()
+
+
 def _require_times(file: Path, fps: float) -> None:
     """Raise LogError if the times of a LeRobot data set contradict its number of frames per second."""
-    with reading(file):
-        if TIMESTAMP not in pa.parquet.read_schema(file).names:
-            return
-        steps = np.diff(pa.parquet.read_table(file, columns=[TIMESTAMP])[TIMESTAMP].to_numpy().ravel())
+    times = _column(file, TIMESTAMP)
+    steps = np.zeros(0) if times is None else np.diff(times.to_numpy(zero_copy_only=False).ravel())
     step = float(np.median(steps)) if steps.size else 0.0
     if step > 0 and fps > 0 and abs(step * fps - 1) > 0.05:
         raise LogError(
@@ -122,14 +157,16 @@ def _with_scale(
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
     may be normalised, if neither a unit nor a calibration is given.
     """
-    largest = 0.0
-    for file in files:
-        with reading(file):
-            if STATE not in pa.parquet.read_schema(file).names:
-                return mapping, ()
-            states = pa.parquet.read_table(file, columns=[STATE])[STATE].combine_chunks()
-            values = np.abs(states.flatten().to_numpy(zero_copy_only=False))
-            largest = max(largest, float(values.max(initial=0.0)))
+    # Other elements are not positions of the arm, for example of a gripper, or velocities.
+    largest, used = 0.0, {mapping.column("q", joint) for joint in joints}
+    for states in (_column(file, STATE) for file in files):
+        if states is None:
+            return mapping, ()
+        for index in range(pa.compute.max(pa.compute.list_value_length(states)).as_py() or 0):
+            if f"{STATE}[{index}]" in used:
+                long_enough = states.filter(pa.compute.greater(pa.compute.list_value_length(states), index))
+                ends = pa.compute.min_max(pa.compute.list_element(long_enough, index)).as_py()
+                largest = max(largest, *(abs(x) for x in ends.values() if x is not None), 0.0)
     if not 2 * np.pi < largest <= LARGEST_NORMALISED:
         return mapping, ()
     unstated = [joint for joint in joints if mapping.unit("q", joint) is None]
@@ -140,7 +177,7 @@ def _with_scale(
             "'units: {q: normalised}' and 'calibration' under 'logs' convert"
         )
         return mapping, (doubt,) if unit == "deg" else ()
-    calibration = mapping.calibration or _calibration(folder)
+    calibration = mapping.calibration or _calibration(folder, list(map(mapping.log_name, unstated)))
     if not all(mapping.log_name(joint) in calibration for joint in unstated):
         raise LogError(
             f"positions up to {largest:.4g} without a unit, within LeRobot's normalised range of -100..100",
@@ -155,12 +192,17 @@ def _with_scale(
     return mapping, ("normalised positions were converted by the ranges of the motors' calibration",)
 
 
-def _calibration(folder: Path) -> dict[str, MotorCalibration]:
-    """Return {motor: calibration} from the file calibration.json of a LeRobot data set; {} if there is no such file."""
+def _calibration(folder: Path, motors: Sequence[str]) -> dict[str, MotorCalibration]:
+    """Return {motor: calibration} from the file calibration.json of a LeRobot data set; {} if there is no such file.
+
+    motors: names of the arm's motors; other motors in the file, for example of a gripper, are omitted.
+    """
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
-            document = YamlDocument(file, None)
-            return validated(LogMapping, {"calibration": read_json(file, LogError)}, document).calibration
+            content = read_json(file, LogError)
+            # A file of another form is validated as a whole, which raises one error.
+            content = {x: content[x] for x in motors if x in content} or content
+            return validated(LogMapping, {"calibration": content}, YamlDocument(file, None)).calibration
     return {}
 
 

@@ -84,7 +84,7 @@ def make_trajectory(data: np.ndarray, numbers: np.ndarray, layout: Layout, name:
         _join_signals(rows)
     rows.leave_out(
         foreign_rows(rows.data, len(layout.joints)),
-        "left out, of another topic or publisher: without values, or with positions only",
+        "left out, of another topic or publisher: without values, with positions only, or with zeros",
     )
     rows.leave_out(np.isnan(rows.data).any(axis=1), "left out, with a signal without a number")
     if mapping.sample_rate:
@@ -276,12 +276,21 @@ def _order_in_time(rows: Rows) -> None:
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
     if late:
         order = np.argsort(rows.t, kind="stable")
-        # If positions are rougher after sorting, the clock restarted between two recordings in the file, and sorting
-        # would interleave the recordings.
+        message = f"{counted(late, 'time')} before that of the row above: the rows were sorted"
+        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues, the clock
+        # was set back, or its counter overflowed; else the file has several recordings, which sorting would interleave.
         if _roughness(rows.positions[order]) > _roughness(rows.positions):
-            raise _backward_times(rows)
-        rows.keep(order)
-        rows.repairs.append(f"{counted(late, 'time')} before that of the row above: the rows were sorted")
+            if not _continues(rows):
+                raise _backward_times(rows)
+            steps = np.diff(rows.t)
+            steps[steps < 0] = np.median(steps)
+            rows.t[1:] = rows.t[0] + np.cumsum(steps)
+            message = (
+                f"the clock went back {counted(late, 'time')} while the motion continued: times were joined"
+            )
+        else:
+            rows.keep(order)
+        rows.repairs.append(message)
     is_repeat = np.diff(rows.t, prepend=-np.inf) == 0
     differs = is_repeat & np.append(False, (np.diff(rows.data[:, 1:], axis=0) != 0).any(axis=1))
     # The resolution of the clock is too low if more than ten rows, and more than 2 % of all rows, have the same time as
@@ -370,6 +379,22 @@ def _roughness(positions: np.ndarray) -> float:
     ranges = np.ptp(positions, axis=0)
     length = np.abs(np.diff(positions, axis=0)).sum(axis=0)
     return float((length / np.where(ranges > 0, ranges, 1.0)).sum())
+
+
+def _continues(rows: Rows) -> bool:
+    """Return True if the motion continues at each row whose time is before the time of the row above.
+
+    There some joint moves, and the change of each position is at most twice its largest change in the rows around.
+    """
+    changes = np.abs(np.diff(rows.positions, axis=0))
+    if len(changes) < 2 * TUNING.jump_window:
+        return False
+    for row in np.flatnonzero(np.diff(rows.t) < 0).tolist():
+        around = slice(max(0, row - TUNING.jump_window), row + TUNING.jump_window + 1)
+        largest = np.delete(changes[around], row - around.start, axis=0).max(axis=0, initial=0.0)
+        if (changes[row] > 2 * largest + SIGNALS.rest_range).any() or largest.max() < SIGNALS.rest_range:
+            return False
+    return True
 
 
 def _backward_times(rows: Rows) -> LogError:

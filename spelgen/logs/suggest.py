@@ -4,11 +4,11 @@ Units are derived from the column names, and the unit of times also from the tim
 SI units: the checks of logs then detect degrees, for example, and state the settings to write.
 """
 
-import difflib
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, groupby
+from itertools import chain, groupby, pairwise
 from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -20,43 +20,35 @@ from spelgen.errors import LogError, shortened
 from spelgen.labels import listed
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
-from spelgen.logs.tables import SERVO_ADVICE, names_joint, reading
+from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
 from spelgen.settings.log_mapping import CURRENTS, LogMapping
+from spelgen.settings.log_mapping import UNIT_NAMES as UNITS
 
 WORDS = {
     quantity: frozenset(words.split())
     for quantity, words in (
-        ("t", "t ts time times timestamp stamp clock datetime secs seconds millis zeit temps tiempo 时间"),
+        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit temps tiempo 时间"),
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
-        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad 速度"),
+        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad spd 速度"),
         ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
-                "curr cur drehmoment strom couple par 力矩 扭矩"),
+                "curr cur drehmoment strom couple par 力矩 扭矩 电流"),
     )
 }  # fmt: skip
-# Words that distinguish the names of commanded values from the names of measured values.
-COMMANDED = {
-    "target", "desired", "des", "d", "command", "commanded", "cmd", "reference", "ref", "setpoint", "goal", "action",
-    "demand", "planned", "ipo", "set", "soll", "u",
-}  # fmt: skip
-# Words in names of columns that mark signals other than measured joint signals.
-NOT_MEASURED = COMMANDED | {
-    "error", "std", "external", "ext", "tcp", "ee", "eef", "cartesian", "tool", "contact", "gravity", "friction",
-    "dd", "ddot",
-}  # fmt: skip
-MEASURED = {"actual", "act", "measured", "meas", "present", "feedback", "fb", "ist"}
-# For each quantity: units as written in column names, in lower case, and the corresponding units of a mapping.
-UNITS = {
-    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "ns": "ns"},
-    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad",
-          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
-          "m": "m"},
-    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
-           "rev/s": "turns/s", "rpm": "rpm", "mm/s": "mm/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
-            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
-}  # fmt: skip
+# Words in names of columns that mark commanded values, measured values, and signals other than those of joints.
+COMMANDED, MEASURED, OTHERS = (
+    frozenset(words.split())
+    for words in (
+        "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
+        "ipo set soll u leader consigne 目标 指令 设定",
+        "actual act measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈",
+        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
+        "dot vol volt voltage temp temperature",
+    )
+)
+# Letters that are quantities in names such as `i_actual` and `m_actual`.
+LETTERS = {"i": "tau", "m": "tau"}
 # Letters in column names that are units only in brackets: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
 # Names of derivatives of positions, such as `d_theta` and `q_dot`.
@@ -65,7 +57,8 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
-CURRENT = {"current", "currents", "curr", "cur", "strom"}
+CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
+CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
 
 
 class Suggestion(NamedTuple):
@@ -76,11 +69,21 @@ class Suggestion(NamedTuple):
 
 
 class ColumnName(NamedTuple):
-    """Name of a column, the set of its words in lower case, and its unit ("" if the name contains none)."""
+    """Name of a column, and its parts.
+
+    Attributes:
+        name: the name.
+        words: words of the name in lower case, without the words of the joint.
+        unit: unit in the name, or in a line of units below the header; "" if there is none.
+        joint: joint whose name the column's name contains; "" if there is none.
+        quantity: "t", "q", "qd" or "tau"; None if neither words nor unit state it.
+    """
 
     name: str
     words: set[str]
-    unit: str
+    unit: str = ""
+    joint: str = ""
+    quantity: str | None = None
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
@@ -100,28 +103,49 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
         raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
     with reading(file):
         table = log_format.read(file, (), LogMapping())[0].read(None)
-    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
-    for name in (x for x in texts if set(joints) <= set(table[x].to_pylist())):
-        do = f"in Python: wide = log.pivot(index=TIME, columns={name!r}); wide.columns = map('_'.join, wide.columns)"
-        raise LogError(f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do)
     return _table_mapping(table, file, joints, commands)
+
+
+def _names_signals(values: Sequence[object], joints: int) -> bool:
+    """Return True if the values of a column name the signal or the joint of each row, and rows have one signal each.
+
+    Such a value differs from the value of the row before, and each value occurs equally often.
+    """
+    counts = Counter(values).values()
+    is_cycle = 1 < joints <= len(counts) <= len(values) / 2 and max(counts) - min(counts) <= 1
+    return is_cycle and all(x != y for x, y in pairwise(values))
 
 
 def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
     """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
-    columns = [_column_name(name, {"time"} if name in dates else set()) for name in _names(table)]
-    columns_of = _by_quantity(columns, commands, joints)
+    names, stated = _names(table), stated_units(table.schema)
+    labels = joint_patterns(joints, names)
+    columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
+    columns_of = _by_quantity(columns, commands, len(joints))
     # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
-    if not commands and not torques and len(_by_quantity(columns, True, joints)["u"]) >= len(joints):
+    if not commands and not torques and len(_by_quantity(columns, True, len(joints))["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
-    clock = _clock(columns_of.pop("t"), columns)
+    clocks = columns_of.pop("t")
+    clock = _clock(clocks, columns, table)
     # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
     # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {x: _by_joint(_of_one_signal(named, joints), joints, order) for x, named in columns_of.items()}
+    by_joint = {
+        x: _by_joint(_of_one_signal(named, len(joints)), joints, order) for x, named in columns_of.items()
+    }
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
+    unstated = [x.name for x in columns if x.quantity is None and x.name in table.column_names]
+    for name in unstated if not by_joint["q"] else ():
+        if _names_signals(table[name].to_pylist(), len(joints)):
+            do = (
+                f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
+                "wide.columns = [f'{x}_{y}' for x, y in wide.columns]"
+            )
+            raise LogError(
+                f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do
+            )
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
@@ -132,18 +156,22 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
-    units = _units(clock, by_joint, table)
+    units = _units(by_joint, joints)
+    common = _common(units)
+    common = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"} | common
     rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
         f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
-        f"units: {json.dumps(units)}",
+        f"units: {json.dumps(common)}",
     ]
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
-    lines += ["joints:", *chain.from_iterable(_joint_lines(joint, by_joint, units) for joint in joints)]
+    lines += ["joints:", *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints)]
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
-    unused = {x: _ranges([y.name for y in columns_of[x] if y.name not in used]) for x in by_joint}
+    used |= set(clock.name.split(" + "))
+    columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
+    unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in columns_of.items()}
     lines += [
         f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
     ]
@@ -151,31 +179,52 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     return _suggestion(lines, missing, "column")
 
 
-def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName]) -> ColumnName:
+def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
     """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
 
-    If it contains seconds, and ``columns`` (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
+    If it contains whole seconds, and ``columns`` (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
     """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
-    none = ColumnName("", set(), "s")
-    clock = min(clocks, key=lambda x: ("header" not in x.words, len(x.words)), default=none)
-    stamp = re.sub(r"secs?$", "", clock.name)
-    nanoseconds = [x.name for x in columns if re.fullmatch(rf"{re.escape(stamp)}n(ano)?secs?", x.name)]
-    if stamp != clock.name and nanoseconds:
-        return ColumnName(f"{clock.name} + {nanoseconds[0]}", clock.words, "s")
-    return clock
+    nanoseconds = [x for x in columns if re.search(r"n(?:ano)?sec(?:ond)?s?$", x.name.lower())]
+    seconds = [x for x in clocks if x not in nanoseconds]
+    clock = min(
+        seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
+    )
+    stem = re.sub(r"secs?$", "", clock.name)
+    fraction = next(
+        (x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0] if nanoseconds else None
+    )
+    times = _numbers(table, clock.name)
+    # Seconds of a stamp are whole numbers that repeat.
+    is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
+    if fraction is None or not is_whole:
+        return clock
+    return ColumnName(f"{clock.name} + {fraction.name}", clock.words, "s")
+
+
+def _numbers(table: pa.Table, name: str) -> np.ndarray:
+    """Return the numbers of a column, without nulls; an empty array for a column of another type."""
+    values = table[name].drop_null() if name in table.column_names else pa.chunked_array([[]])
+    is_numeric = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
+    return np.asarray(values.to_numpy()) if is_numeric else np.zeros(0)
 
 
 def _joint_lines(
-    joint: str, by_joint: Mapping[str, Mapping[str, ColumnName]], units: Mapping[str, str]
+    joint: str,
+    by_joint: Mapping[str, Mapping[str, ColumnName]],
+    units: Mapping[str, str],
+    common: Mapping[str, str],
 ) -> Iterator[str]:
     """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
 
-    by_joint: {quantity: {joint: column}}. units: {quantity: unit of its columns}.
+    by_joint: {quantity: {joint: column}}. units: {quantity: unit} of the joint; common: the same of all joints.
     """
     entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
     yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
+    differing = {x: unit for x, unit in units.items() if x not in common}
+    if differing:
+        yield f"    units: {json.dumps(differing)}"
     if units.get("tau") in CURRENTS:
         yield f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
     if units.get("q") == "counts":
@@ -196,93 +245,109 @@ def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Sugg
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
-    close = {x: [x] if x in motors else difflib.get_close_matches(x, motors, n=1) for x in joints}
+    motor_of = {x: next(filter(y.search, motors), None) for x, y in joint_patterns(joints, motors).items()}
     lines = [
         f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
         "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
         "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
         "joints:",
-        *(
-            f"  {json.dumps(joint)}: {{name: {json.dumps(names[0])}}}"
-            for joint, names in close.items()
-            if names
-        ),
+        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in motor_of.items() if name),
     ]
-    return _suggestion(lines, [f"q of {joint}" for joint, names in close.items() if not names], "motor")
+    return _suggestion(lines, [f"q of {joint}" for joint, name in motor_of.items() if not name], "motor")
 
 
-def _column_name(name: str, words: set[str]) -> ColumnName:
-    """Return the words and the unit in a column's name; the unit is in brackets, or the last word.
+def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
+    """Return the parts of a column's name; the unit is in brackets, or the last word.
 
-    words: additional words that describe the column, such as "time" for a column of dates.
+    labels: {joint: pattern of its name}. unit: unit in a line of units below the header. words: additional words that
+    describe the column, such as "time" for a column of dates.
     """
-    bracketed = re.fullmatch(r"(.*?)\s*[\[(]([^\])\d',]+)[\])]", name)
-    base, unit = bracketed.groups() if bracketed else (name, "")
     unit_names = set().union(*UNITS.values())
-    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)", name)
+    # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
+    # a number or a joint.
+    for bracket in re.finditer(r"\s*[\[(]([^\])]+)[\])]", name):
+        is_unit = bracket[1].lower() in unit_names
+        if is_unit or (
+            bracket.end() == len(name) and not re.search(r"[\d',]", bracket[1]) and bracket[1] not in labels
+        ):
+            unit, name_without = bracket[1].strip().lower(), name.replace(bracket[0], "", 1)
+            return _column_name(name_without, labels, unit, words)._replace(name=name)
+    matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
+    joint = max(matches, key=lambda x: len(matches[x][0]), default="")
+    bare = labels[joint].sub(" ", name) if joint else name
+    # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
+    if joint and name.lower() in WORDS["t"]:
+        joint, bare = "", name
+    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)[\W\d_]*", bare)
     if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
-        base, unit = last.groups()
-    separated = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", base)
-    text = re.sub(DERIVATIVE, "qd", separated.lower())
-    return ColumnName(name, words | set(re.findall(r"[^\W\d_]+", text)), unit.strip().lower())
+        bare, unit = last[1], last[2].lower()
+    separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
+    # Chinese words are not separated by blanks.
+    separated = re.sub("|".join(CHINESE), r" \g<0> ", separated)
+    texts = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
+    words = words | set(texts) | ({"theta"} if "theta" in separated else set())
+    quantity = "t" if words & WORDS["t"] else None
+    # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
+    for word in reversed(texts):
+        quantity = quantity or next((x for x, of_quantity in WORDS.items() if word in of_quantity), None)
+    quantity = quantity or next((x for x, units in UNITS.items() if unit in units), None)
+    if quantity is None and words & MEASURED:
+        quantity = next((LETTERS[x] for x in texts if x in LETTERS), None)
+    return ColumnName(name, words, unit, joint, quantity)
 
 
-def _by_quantity(
-    columns: Sequence[ColumnName], commands: bool, joints: Sequence[str]
-) -> dict[str, list[ColumnName]]:
+def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> dict[str, list[ColumnName]]:
     """Return {quantity: columns} for the quantities "t", "q", "qd", "tau" or "u".
 
-    The quantity of a column is determined by the words in its name or, if these do not determine it, by its unit.
-
-    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: names of the joints.
-    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques. Words of joints' names
-    do not count as words for commands.
+    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: number of joints.
+    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques. If no names state
+    positions, columns that only name a joint are positions.
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
-    names = set().union(*(_column_name(joint, set()).words for joint in joints))
+    unstated = []
     for column in columns:
-        quantity = next((x for x, words in WORDS.items() if column.words & words), None)
-        if quantity is None:
-            quantity = next((x for x, units in UNITS.items() if column.unit in units), None)
-        if commands and column.words & (COMMANDED - names) and quantity in ("q", None):
+        quantity = column.quantity
+        if commands and column.words & COMMANDED and quantity in ("q", None):
             quantity = "u"
-        elif column.words & (NOT_MEASURED - names):
+        elif column.words & (COMMANDED | OTHERS):
             continue
+        if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
+            unstated.append(column)
         if quantity in by_quantity:
             by_quantity[quantity].append(column)
+    if len(by_quantity["q"]) < joints:
+        by_quantity["q"] += unstated
     return by_quantity
 
 
 def _units(
-    clock: ColumnName, by_joint: Mapping[str, Mapping[str, ColumnName]], table: pa.Table
-) -> dict[str, str]:
-    """Return {quantity: unit} from the units and words in column names; the unit of times also from the time steps.
-
-    clock: column of the times. by_joint: {quantity: {joint: column}}. table: first rows of the log.
-    """
-    units = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"}
+    by_joint: Mapping[str, Mapping[str, ColumnName]], joints: Sequence[str]
+) -> dict[str, dict[str, str]]:
+    """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
+    units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():
-        for column in named.values():
-            # A mapping has no separate unit of commands: the unit of positions applies to them.
-            stated = UNITS.get(quantity, {}).get(column.unit)
-            if stated is None and quantity == "qd":
-                stated = {"deg": "deg/s", "rad": "rad/s"}.get(units.get("q", ""))
-            if stated is None and quantity == "tau" and column.words & CURRENT:
-                stated = "A"
-            if stated is not None:
-                units[quantity] = stated
+        for joint, column in named.items():
+            unit = UNITS["q" if quantity == "u" else quantity].get(column.unit)
+            if unit is None and quantity == "qd":
+                unit = {"deg": "deg/s", "rad": "rad/s", "mm": "mm/s"}.get(units[joint].get("q", ""))
+            if unit is None and quantity == "tau" and column.words & CURRENT:
+                unit = "A"
+            # The unit of positions also applies to commands.
+            if unit is not None and (quantity != "u" or unit != units[joint].get("q")):
+                units[joint][quantity] = unit
     return units
+
+
+def _common(units: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
+    """Return {quantity: unit} of the units that all joints have. units: {joint: {quantity: unit}}."""
+    first = next(iter(units.values()), {})
+    return {x: unit for x, unit in first.items() if all(y.get(x) == unit for y in units.values())}
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
     """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
-    if name not in table.schema.names:
-        return None
-    times = table[name].drop_null()
-    if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
-        return None
-    steps = np.diff(times.to_numpy())
-    return time_unit(float(np.median(steps[steps > 0]))) if len(steps) > 1 and (steps > 0).any() else None
+    steps = np.diff(_numbers(table, name))
+    return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
@@ -291,7 +356,8 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
     The names are cells of columns `name0`, `name1`, ..., or elements of a list: "elbow" in the column `name2` gives
     {"elbow": 2}. Joints whose names are not in the row are omitted.
     """
-    order: dict[str, int] = {}
+    listed_names = json.loads((table.schema.metadata or {}).get(JOINTS_KEY, "[]"))
+    order = {name: position for position, name in enumerate(listed_names) if name in joints}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
         for position, text in enumerate(_first_list(column)):
@@ -305,11 +371,11 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 def _names(table: pa.Table) -> list[str]:
     """Return the names of a table's columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
 
-    Names that two columns have are omitted.
+    Names that two columns have are omitted, and columns without values.
     """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
-        if table.column_names.count(name) == 1:
+        if table.column_names.count(name) == 1 and column.null_count < len(column):
             names += [f"{name}[{index}]" for index in range(len(_first_list(column)))] or [name]
     return names
 
@@ -317,29 +383,31 @@ def _names(table: pa.Table) -> list[str]:
 def _first_list(column: pa.ChunkedArray) -> list[object]:
     """Return the first list of a column of lists, which may be texts such as "[0.1, 0.2]"; [] for other columns."""
     first = next(iter(column.drop_null().slice(0, 1).to_pylist()), None)
-    if isinstance(first, str) and (match := re.fullmatch(r"[\w.]*[\[(]+(.*?)[\])]+", first.strip())):
+    if isinstance(first, str) and (match := re.fullmatch(r"[^\[({]*[\[({]+(.*?)[\])}]+", first.strip())):
         first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
     return first if isinstance(first, list) else []
 
 
-def _of_one_signal(columns: Sequence[ColumnName], joints: Sequence[str]) -> Sequence[ColumnName]:
+def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[ColumnName]:
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. Torques are preferred to currents, torques of joints to torques of motors,
+    differ only in the words of the joint. Torques are preferred to currents, signals of joints to signals of motors,
     names with a word such as "actual" to others, and names with few words to longer ones: `tau_J` to
     `tau_hat_filtered`.
 
-    columns: all columns of the quantity, which are returned if no signal has a column for each joint.
+    columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
     """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
-        joint = max((x for x in joints if names_joint(column.name, x)), key=len, default="")
-        signals.setdefault(frozenset(column.words - _column_name(joint, set()).words), []).append(column)
+        signals.setdefault(frozenset(column.words), []).append(column)
     complete = [
-        ((bool(words & CURRENT), "motor" in words, not words & MEASURED, len(words)), named)
+        (
+            (bool(words & CURRENT), bool(words & {"motor", "theta"}), not words & MEASURED, len(words)),
+            named,
+        )
         for words, named in signals.items()
-        if len(named) >= len(joints)
+        if len(named) >= joints
     ]
     return min(reversed(complete), key=itemgetter(0), default=((), columns))[1]
 
@@ -353,11 +421,11 @@ def _by_joint(
     this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
     number}, the result of `_order_in_cells`.
     """
-    named = {joint: column for joint in joints for column in columns if names_joint(column.name, joint)}
+    named = {column.joint: column for column in columns if column.joint}
     numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
     numbered = {int(match[-1]): column for match, column in numbers if match}
     if named or len(numbered) < len(joints):
-        return named
+        return {joint: named[joint] for joint in joints if joint in named}
     if set(order) == set(joints):
         return {joint: numbered[order[joint]] for joint in joints if order[joint] in numbered}
     return dict(zip(joints, map(numbered.__getitem__, sorted(numbered)), strict=False))

@@ -1,5 +1,6 @@
 """Common result of all readers of logs: a table, and its layout, which states the column of each quantity and joint."""
 
+import json
 import re
 import zipfile
 import zlib
@@ -14,13 +15,16 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
-from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import UNIT_NAMES, LogMapping
 
 UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
+STATED_KEY = b"stated units"  # key of {column: unit} in a table's metadata, from a line below a header
+JOINTS_KEY = b"joints"  # key of the joint names of a table's numbered columns, in their order
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units declared in logs that spelgen writes
 
+LFS = b"version https://git-lfs"  # first bytes of a file whose content Git LFS has not fetched
 # Types of the errors that Arrow, NumPy and zipfile raise for damaged files.
 UNREADABLE = (
     pa.ArrowException, OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error,
@@ -141,6 +145,7 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
         del missing[0]
     if missing:
         raise missing_columns(missing, schema.names, file, mapping, joints)
+    _require_units(schema, columns, mapping, joints, file)
     labels = mapping.columns.trajectory if log.recording is None else None
     if labels not in schema.names:
         labels = None
@@ -246,9 +251,54 @@ def _naming(unused: Collection[str]) -> str:
     )
 
 
-def names_joint(column: str, joint: str) -> bool:
-    """Return True if a column's name contains a joint's name as a separate word: `q_1` contains 1, `q_12` does not."""
-    return re.search(rf"(?<![0-9a-z]){re.escape(joint)}(?![0-9a-z])", column, re.IGNORECASE) is not None
+def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
+    """Return {joint: pattern of its name}, as separate words in `names`: `q_1` has the joint 1, `q_12` has not.
+
+    A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
+    joints shoulder_pan_joint and joint_1_s. The first of these forms in which all joints are found is used.
+    """
+    words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
+    shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
+    distinct = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
+    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
+    forms = []
+    for form in (words, distinct, letters):
+        # Numbers are no names: columns may be numbered in another order, which cells of the log may state.
+        if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
+            parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}
+            texts = {
+                x: r"[\W_]?".join(re.escape(part.strip("_")) for part in of_x) for x, of_x in parts.items()
+            }
+            forms.append({x: re.compile(rf"(?<![^\W_]){text}(?![^\W_])", re.I) for x, text in texts.items()})
+    return next((x for x in forms if all(any(map(y.search, names)) for y in x.values())), forms[0])
+
+
+def stated_units(schema: pa.Schema) -> dict[str, str]:
+    """Return {column: unit in lower case} from a line of units below the header of a file; {} if there is none."""
+    stated: dict[str, str] = json.loads((schema.metadata or {}).get(STATED_KEY, "{}"))
+    return stated
+
+
+def _require_units(
+    schema: pa.Schema, columns: Sequence[str], mapping: LogMapping, joints: Sequence[str], file: Path
+) -> None:
+    """Raise LogError if the file states units that are no SI units, and the mapping has no units for these columns."""
+    stated = stated_units(schema)
+    units: dict[str, str] = {}
+    for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
+        unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(stated.get(name, ""), "")
+        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.units.t != "s"
+        is_mapped |= bool(
+            mapping.sample_rate if quantity == "t" else quantity == "tau" and mapping.joint(joint).gain
+        )
+        if unit not in ("", "s", "rad", "m", "rad/s", "m/s", "Nm", "N") and not is_mapped:
+            units[quantity] = unit
+    if units:
+        line = ", ".join(f"{quantity}: {unit}" for quantity, unit in units.items())
+        raise LogError(
+            f"units in a line below the header: {line}", file=file, expected="SI units, or units in the mapping",
+            do=f"write 'units: {{{line}}}' under 'logs' in the robot's YAML",
+        )  # fmt: skip
 
 
 @contextmanager
@@ -258,4 +308,9 @@ def reading(file: Path) -> Iterator[None]:
         yield
     except UNREADABLE as error:
         lines = str(error).splitlines() or [type(error).__name__]
-        raise LogError(f"an unreadable {file.suffix[1:]} file ({lines[0].rstrip('.')})", file=file) from error
+        got, do = f"an unreadable {file.suffix[1:]} file ({lines[0].rstrip('.')})", None
+        if file.is_file():
+            with file.open("rb") as source:
+                if source.read(len(LFS)) == LFS:
+                    got, do = "a pointer of Git LFS in place of the file", "fetch the content: git lfs pull"
+        raise LogError(got, file=file, do=do) from error

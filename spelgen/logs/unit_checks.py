@@ -117,6 +117,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     # A wrong unit in the mapping, such as deg for positions in rad, makes the motion of all joints implausibly small.
     # The unit of the positions is then a better explanation than the unit of the velocities.
     largest = float(np.ptp(signals.trajectory.q, axis=0).max())
+    # In a unit of positions in which no joint moves by 0.05 rad or m, the times are wrong and not the positions.
+    smallest = 0.05 / largest if is_known and largest > 0 else 0.0
     for unit in positions if stated and is_known and largest < 0.1 else ():
         ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
         if 0.5 < largest * ratio < TURNS:
@@ -129,13 +131,16 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         speeds = speeds[:1]
     for q, qd in product(positions, speeds):
         scale = SCALES.get(q, 1.0)
+        if scale < min(smallest, 1.0):
+            continue
         units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
         distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
         if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
-        distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
-        yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
+        if 2 * np.pi / counts >= smallest:
+            distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
+            yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
 
 
 def find_time_unit(signals: JointSignals) -> str | Advice | None:
@@ -153,6 +158,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
         )
         return Advice(message, keys={"sample_rate": rate})
     message, unit = f"a sample every {step:.3g} s", time_unit(step)
+    if 0 < step < SIGNALS.fastest_step / 2 and not signals.number:
+        return f"{message}, faster than any arm is sampled: write 'sample_rate', or times in s"
     if step <= SIGNALS.slowest_step:
         message = f"q that changes {signals.factor:.3g} times as fast as qd"
         is_known = signals.correlation > SIGNALS.agreement

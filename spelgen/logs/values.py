@@ -68,6 +68,8 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         if not np.isfinite(value):
             got, expected = f"no finite number ({count} gap", "a number"
             do = "'dropouts: dropped' under 'logs' in the robot's YAML leaves out those rows"
+            if not np.isfinite(data[:, k]).any():
+                do = f"name a column with values in place of {layout.columns[k]} under 'logs' in the robot's YAML"
         raise layout.row_error(f"{got}, this is the first)", rows[first], layout.columns[k], expected, do)
     return data
 
@@ -75,10 +77,17 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
 
+    Their velocities and torques are absent, or exactly 0 in many single rows between other rows.
+
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
-    empty = np.isnan(data[:, 1 + joints :])
-    return np.asarray(empty.all(axis=1))
+    signals = data[:, 1 + joints :]
+    zero = (signals == 0).all(axis=1) if signals.shape[1] > joints else np.zeros(len(data), bool)
+    # An arm at rest whose motors are off has more such rows in succession, and coarse signals of an arm that reverses
+    # have few: less than 2 % of all rows.
+    runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
+    is_mixed = runs > TUNING.jump_window and 0.02 * len(data) < zero.sum() < 4 * runs
+    return np.asarray(np.isnan(signals).all(axis=1) | (zero & is_mixed))
 
 
 def is_split(data: np.ndarray) -> bool:
@@ -186,7 +195,7 @@ def _column(table: pa.Table, name: str) -> Column:
     lists, index = table.column(element[0]), element[1]
     is_text = not pa.types.is_nested(lists.type)
     if is_text:
-        bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[(]\s*|\s*[\])].*$", "")
+        bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[({]\s*|\s*[\])}].*$", "")
         lists = pa.compute.split_pattern_regex(bare, r"[,;\s]+")
     # Lists that are too short are replaced by null, since Arrow would raise an error for them.
     long_enough = pa.compute.greater(pa.compute.list_value_length(lists), index)
@@ -221,6 +230,8 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
                     do += ", the header of a second file; joined recordings need a column 'trajectory'"
                 elif re.fullmatch(r"-?\d{1,3}([,.' ]\d{3})+([,.]\d*)?", text):
                     do = "write numbers without separators of thousands"
+                elif name == layout.columns[0] and re.search(r"\d:\d\d", text):
+                    do = "write times as numbers, or like 2025-10-26T11:59:56.123 or 11:59:56.123"
                 elif re.match(NUMBER, text):
                     do = "write numbers only, and the unit as 'units' under 'logs' in the robot's YAML"
                 raise layout.row_error(repr(text[:60]), rows[index], name, "a number", do) from error

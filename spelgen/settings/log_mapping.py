@@ -12,7 +12,7 @@ from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import SettingsError
 from spelgen.settings.yaml_document import Group, Number, Positive
@@ -28,6 +28,18 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
+# For each quantity: units as written in logs, in lower case, and the corresponding units of a mapping.
+UNIT_NAMES = {
+    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
+    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
+          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
+          "m": "m"},
+    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
+           "deg/sec": "deg/s", "rad/sec": "rad/s", "rev/s": "turns/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm",
+           "mm/s": "mm/s", "m/s": "m/s"},
+    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
+            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
+}  # fmt: skip
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
@@ -252,6 +264,18 @@ class LogMapping(Group):
     dropouts: Literal["kept", "dropped"] = "kept"
     sample_rate: Positive | None = None
     calibration: dict[str, MotorCalibration] = Field(default={})
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _is_by_motor(cls, content: object) -> object:
+        # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
+        if isinstance(content, dict) and not all(
+            isinstance(x, dict | MotorCalibration) for x in content.values()
+        ):
+            raise ValueError(
+                "range_min and range_max of each motor; data of an older LeRobot is in degrees, 'units: {q: deg}'"
+            )
+        return content
 
     @property
     def quantities(self) -> tuple[str, ...]:
