@@ -293,15 +293,15 @@ class ServoLogs:
     def _check_geometry(self, summary: Findings) -> None:
         """Add a finding to `summary` if another sense, order or zero of the joints explains the position errors better.
 
-        Nothing is tested if a servo's residual with the unchanged log is above `GEOMETRY.no_advice`, for example due to
-        backlash. The hypothesis must explain the position errors of all joints.
+        The hypothesis must explain the position errors of all joints: servos with backlash, for example, have a large
+        residual with every hypothesis.
         """
         problems = self._geometry_problems()
         fits = [x.thinned(GEOMETRY.coarse_samples).fit(x.unchanged).errors for x in problems]
         logarithms = [float(np.log(errors + GEOMETRY.error_floor).sum()) for errors in fits]
-        best = int(np.argmin(logarithms)) if fits else -1
-        if best < 0 or not fits[best].max() <= GEOMETRY.no_advice:
+        if not fits:
             return
+        best = int(np.argmin(logarithms))
         unchanged, *better = compare_hypotheses(problems[best], kinds_of_servo_faults(self._arm.chain))
         # The cost must fall by double the bound for torques: with times stretched by two, the best wrong hypothesis
         # lowers it by 20, and right ones by 40 to 240, on simulated arms.
@@ -332,7 +332,8 @@ class ServoLogs:
             signals[..., 3] -= signals[..., 0]
             if signals[..., 3].any():
                 delayed = samples._replace(values=signals[..., None])
-                problems.append(GeometryProblem(chain, delayed, alone, seconds, stated, free_gains=True))
+                problem = GeometryProblem(chain, delayed, alone, seconds, stated)
+                problems.append(problem.with_free_gains())
         return problems
 
     def _check_units(self, summary: Findings) -> None:
