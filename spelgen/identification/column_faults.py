@@ -234,8 +234,8 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield least-squares fits of torques with a common factor, with factors of few joints, and of all joints.
 
-        A factor of a single joint must lower the cost significantly: the load of the last joint, for example, is
-        determined only by the masses of the URDF.
+        A factor of a single joint must clearly lower the cost: the load of the last joint, for example, is determined
+        only by the masses of the URDF.
         """
         gains = problem.with_free_gains().fit(base.hypothesis).gains
         gains, logarithms = np.where(self._is_open, gains, 1.0), np.log(gains)
@@ -249,12 +249,13 @@ class TorqueUnit(WrongScale):
             best = self._scaled(problem, base, factors)
             yield best
         differing = is_other_unit(gains / common)
-        factors = np.where(differing, shared / common * gains, factors)
-        fit = self._scaled(problem, base, factors)
+        # relative to the other joints or by the masses of the URDF, whichever explains the torques better
+        options = [np.where(differing, ratio * gains, factors) for ratio in (shared / common, 1.0)]
+        fit, factors = min(((self._scaled(problem, base, x), x) for x in options), key=lambda x: x[0].cost)
         for k in np.flatnonzero(differing):
             fewer = np.where(np.arange(len(gains)) == k, shared, factors)
             without = self._scaled(problem, base, fewer)
-            if without.cost < fit.cost + GEOMETRY.needed:
+            if without.cost < fit.cost + GEOMETRY.ambiguous:
                 factors, fit, gains[k] = fewer, without, common
         if (factors != shared).any():
             yield fit

@@ -70,8 +70,8 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 
     The best hypothesis is first; costs of the others are within `GEOMETRY.ambiguous` of its cost. If no decrease is
     significant, hypotheses with evidence other than the cost are tried (faults with `needed` = 0, such as
-    `TorqueUnit`), and the best one is returned, too, if there is one. faults: kinds of faults, tested singly and
-    combined.
+    `TorqueUnit`). The best one is returned, too, if it lowers the cost at all; otherwise the result has only the fit of
+    the unchanged log. faults: kinds of faults, tested singly and combined.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
@@ -104,10 +104,10 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     likely = _likely(unchanged, fits)
     if not likely:
         # If no cost decrease is significant, faults with other evidence than the cost are considered, e.g. another
-        # torque unit. Such a hypothesis must explain the torques as well as the unchanged log.
+        # torque unit.
         known = [fit for fault in faults if not fault.needed for fit in fault.fits(coarse, unchanged)]
-        known = [fit for fit in known if fit.misfit < unchanged.misfit + GEOMETRY.slight]
-        return unchanged, *sorted(known, key=RANK)[:1]
+        best = min(known, key=RANK, default=unchanged)
+        return (unchanged, best) if best.cost < unchanged.cost else (unchanged,)
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
     # only three hypotheses are confirmed, since a message lists at most three

@@ -211,7 +211,7 @@ class GeometryProblem:
         cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         # The cost hardly determines a common factor of all gains. It is therefore the factor of the initial gains, from
-        # regressions on the torques by the prior mean, of the joints at which both torques are correlated; without such
+        # regressions on the torques by the prior mean, of the joints at which both torques are correlated. Without such
         # joints, the median of the gains is 1.
         factors = initial[known] / gains[known] if known.any() else 1 / gains
         gains = gains * np.exp(np.median(np.log(factors)))
