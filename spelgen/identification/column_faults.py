@@ -243,14 +243,16 @@ class TorqueUnit(WrongScale):
         # one nearest to 1.
         agreeing = (np.abs(logarithms[:, None] - logarithms) < np.log(2)).sum(axis=1)
         common = float(gains[np.lexsort((np.abs(logarithms), -agreeing))[0]]) if self._is_open.all() else 1.0
-        shared = common if is_other_unit(common) else 1.0
+        shared = rounded_factor(common) if is_other_unit(common) else 1.0
         factors, best = np.full(len(gains), shared), base
         if shared != 1.0:
             best = self._scaled(problem, base, factors)
             yield best
         differing = is_other_unit(gains / common)
         # relative to the other joints or by the masses of the URDF, whichever explains the torques better
-        options = [np.where(differing, ratio * gains, factors) for ratio in (shared / common, 1.0)]
+        options = []
+        for ratio in (shared / common, 1.0):
+            options.append(np.where(differing, list(map(rounded_factor, ratio * gains)), factors))
         fit, factors = min(((self._scaled(problem, base, x), x) for x in options), key=lambda x: x[0].cost)
         for k in np.flatnonzero(differing):
             fewer = np.where(np.arange(len(gains)) == k, shared, factors)
@@ -271,12 +273,12 @@ class TorqueUnit(WrongScale):
                 yield fit
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the least-squares fit of the torques after multiplication by `factors` (n,), rounded for a message.
+        """Return the least-squares fit of the torques after multiplication by `factors` (n,), rounded to three digits.
 
         For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor is
         inexact because the masses of the URDF are.
         """
-        rounded = np.array([rounded_factor(x) for x in factors])
+        rounded = np.array([float(f"{x:.3g}") for x in factors])
         rounded[self._is_milli & ~is_other_unit(rounded / 1e3)] = 1e3
         motion, torque = fit.hypothesis.scale
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * torque])))

@@ -306,7 +306,8 @@ class ServoLogs:
         # The cost must fall by double the bound for torques: with times stretched by two, the best wrong hypothesis
         # lowers it by 20, and right ones by 40 to 240, on simulated arms.
         is_sure = better and better[0].cost < unchanged.cost - 2 * GEOMETRY.needed
-        if not is_sure or better[0].errors.max() > GEOMETRY.explained:
+        is_sure = is_sure and better[0].errors.max() <= GEOMETRY.no_advice
+        if not is_sure or better[0].errors.mean() > GEOMETRY.explained:
             return
         if {fault.code for fault in better[0].hypothesis.faults} <= set(self._logs[0].accepted):
             return
@@ -352,11 +353,11 @@ class ServoLogs:
         is_sound = any(_are_encoders(_steps([log])) for log, finding in findings if not finding)
         for log, finding in {str(x.keys): (log, x) for log, x in findings if x}.values():
             check = UNIT if finding.keys else NORMALISED
+            if check.code in log.accepted:
+                continue
             # The file reader warned that positions of a LeRobot data set, read as degrees, may be normalised. This
             # warning is omitted, since the error below states the unit.
             summary.notes[:] = [x for x in summary.notes if UNLESS_NORMALISED not in x.message]
-            if check.code in log.accepted:
-                continue
             names = ", ".join(x.name for x, y in findings if y and y.keys == finding.keys)
             if is_sound:
                 summary.add(replace(check, do=OF_ONE), finding.message, f"trajectory {names}", log.file)
