@@ -184,7 +184,10 @@ class GeometryProblem:
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains, known = mean, np.ones(len(normal)), np.ones(len(normal), bool)
         if self._has_free_gains:
-            gains, known = self._initial_gains(normal, right, variance)
+            # regressions of the prior mean's torques on the logged ones; positive, even if they are not correlated
+            load = np.maximum(np.einsum("k,nkl,l->n", mean, normal, mean), 1e-9 * total)
+            correlation = right @ mean / np.sqrt(load * total)
+            gains, known = np.sqrt(load / total) / np.maximum(correlation, 0.3), correlation > 0.5
         initial = gains
         # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, all iterations but the
         # first and the last one are steps of parameters and gains together.
@@ -216,33 +219,6 @@ class GeometryProblem:
         factors = initial[known] / gains[known] if known.any() else 1 / gains
         gains = gains * np.exp(np.median(np.log(factors)))
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors, gains)
-
-    def _initial_gains(
-        self, normal: np.ndarray, right: np.ndarray, variance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return factors (n,) on the logged torques that fit the URDF's torques best, with free friction.
-
-        The second value is a mask (n,) of the joints at which both torques, without friction, have a correlation above
-        0.5. The factor is 1 if the bodies do not load the joint.
-
-        Args:
-            normal: (n, K, K) Gram matrices of the regressor per joint.
-            right: (n, K) products of the regressor and the logged torques per joint.
-            variance: (n,) sums of squared deviations of the logged torques from their means.
-        """
-        bodies, gains, correlations = self._bodies, np.ones(len(normal)), np.zeros(len(normal))
-        mean = self.prior_mean[:bodies]
-        for k, (gram, product, power) in enumerate(zip(normal, right, variance, strict=True)):
-            columns = np.flatnonzero(gram.diagonal()[bodies:] > 0) + bodies
-            friction = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-9, hermitian=True)
-            coupled = gram[columns, :bodies] @ mean
-            load = float(mean @ gram[:bodies, :bodies] @ mean - coupled @ friction @ coupled)
-            if load > 1e-9 * power:
-                agreement = float(product[:bodies] @ mean - coupled @ friction @ product[columns])
-                correlations[k] = agreement / np.sqrt(load * power)
-                # the factor is positive, also if both torques are not correlated
-                gains[k] = np.sqrt(load / power) / max(correlations[k], 0.3)
-        return gains, correlations > 0.5
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
