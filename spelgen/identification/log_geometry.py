@@ -183,16 +183,18 @@ class GeometryProblem:
         flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains, known = mean, np.ones(len(normal)), np.ones(len(normal), bool)
-        if self._has_free_gains:
-            # regressions of the prior mean's torques on the logged ones; positive, even if they are not correlated
-            load = np.maximum(np.einsum("k,nkl,l->n", mean, normal, mean), 1e-9 * total)
-            correlation = right @ mean / np.sqrt(load * total)
-            gains, known = np.sqrt(load / total) / np.maximum(correlation, 0.3), correlation > 0.5
-        initial = gains
-        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, all iterations but the
-        # first and the last one are steps of parameters and gains together.
-        count = 14 if self._has_free_gains else 6
-        for iteration in range(count):
+        initial, lowest = gains, np.inf
+        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
+        # alternate between gains and parameters, and the others are steps of both together, which converge faster near
+        # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
+        for iteration in range(14 if self._has_free_gains else 6):
+            if self._has_free_gains and iteration < 6:
+                # regressions of the model's torques on the logged ones; positive, even if they are not correlated
+                load = np.maximum((normal @ x) @ x, 1e-9 * total)
+                correlation = right @ x / np.sqrt(load * total)
+                gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
+                if iteration == 0:
+                    initial, known = gains, correlation > 0.5
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ flat).reshape(precision.shape)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
@@ -201,17 +203,20 @@ class GeometryProblem:
             matrix += scale * precision
             np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
             vector = (weights * gains) @ right + scale * precision @ mean
-            if self._has_free_gains and 0 < iteration < count - 1:
-                x, gains = _joint_step(matrix, vector, weights * gains, gains, normal @ x, right @ x, x)
-            else:
+            if iteration < 6:
                 x = solution(matrix, vector)
+            else:
+                x, gains = _joint_step(matrix, vector, weights * gains, gains, normal @ x, right @ x, x)
             squares = total - 2 * (right @ x) / gains + (normal @ x) @ x / gains**2
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
+            misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+            cost = misfit + freedom * float(np.log1p(distance / freedom))
+            if cost < lowest or not self._has_free_gains:
+                lowest, best = cost, (x, gains, errors, misfit, matrix)
+        cost, (x, gains, errors, misfit, matrix) = lowest, best
         covariance = inverse(matrix)
-        misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
-        cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         # The cost hardly determines a common factor of all gains. It is therefore the factor of the initial gains, from
         # regressions on the torques by the prior mean, of the joints at which both torques are correlated. Without such
