@@ -177,7 +177,7 @@ class GeometryProblem:
         tau = signals.tau
         tau = tau if self._counted is None else tau * self._counted[..., 0]
         right = (tau.T[:, None] @ rows.swapaxes(0, 1))[:, 0]
-        total = np.square(tau).sum(axis=0)
+        total = np.maximum(np.square(tau).sum(axis=0), 1e-30)
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         flat = normal.reshape(len(normal), -1)

@@ -170,10 +170,11 @@ class JointClock(Fault):
             delays, best = problem.descend(
                 lambda x, signals=signals: drifting(x, signals), start, largest=0.3, smallest=0.002
             )
-            is_long = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
+            is_clock = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
+            is_clock &= bool(np.abs(best.hypothesis.drift).max() <= GEOMETRY.clock_error)
             # No setting corrects a clock, so the finding must be certain: the mean residual of the joints must fall.
             is_certain = best.errors.mean() < GEOMETRY.lower * base.errors.mean()
-            if is_long and is_certain and _explains_more(problem, base, best):
+            if is_clock and is_certain and _explains_more(problem, base, best):
                 yield best
 
     def text(self, correction: Correction) -> str:
