@@ -19,10 +19,10 @@ from spelgen.identification.column_faults import (
     WrongOrder,
     position_factors,
 )
-from spelgen.identification.continuous_faults import Compensation, Delay, Gravity, JointClock, ZeroOffset
-from spelgen.identification.hypotheses import HypothesisFit
-from spelgen.identification.log_faults import Fault
+from spelgen.identification.continuous_faults import Compensation, Gravity, ZeroOffset
+from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.time_faults import Delay, JointClock
 from spelgen.identification.tuning import GEOMETRY
 
 RANK = attrgetter("rank")

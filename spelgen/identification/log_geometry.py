@@ -36,8 +36,6 @@ class GeometryProblem:
         speeds: np.ndarray,
         seconds: float,
         unchanged: Hypothesis | None = None,
-        *,
-        free_gains: bool = False,
     ) -> None:
         """Define the least-squares problem of the torques in logs of an arm with n joints.
 
@@ -47,8 +45,6 @@ class GeometryProblem:
             speeds: matrix C (n, n) from joint speeds to motor speeds, see `Drives`.
             seconds: duration of the logs [s], which limits the number of independent errors.
             unchanged: scales and offsets of the mapping of the logs; None: SI units and no offsets.
-            free_gains: True if each fit also estimates a positive factor on the torques of each joint, such as the
-                unknown gain kp of a servo, whose torque is kp times the position error.
         """
         self.arm, self.speeds = arm, speeds
         self.unchanged = unchanged or Hypothesis.unchanged(arm)
@@ -63,7 +59,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
-        self._free_gains = free_gains
+        self._has_free_gains = False
         self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
         self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
@@ -97,6 +93,15 @@ class GeometryProblem:
         extended._precision = block_diag(self._precision, np.zeros((added, added)))
         return extended
 
+    def with_free_gains(self) -> GeometryProblem:
+        """Return the same least-squares problem with an unknown positive factor on the torques of each joint.
+
+        The factor is, for example, the unknown gain kp of a servo, whose torque is kp times the position error.
+        """
+        extended = copy(self)
+        extended._has_free_gains = True
+        return extended
+
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint."""
         other, values = copy(self), self.samples.values.copy()
@@ -116,15 +121,6 @@ class GeometryProblem:
         other = copy(self)
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
-
-    def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
-
-        The hypothesis of `fit` determines the positions and the vector of gravity.
-        """
-        weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
-        columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
-        return columns @ fit.parameters, columns @ self.prior_mean
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of a fit's torques due to the covariance of its parameters."""
@@ -181,17 +177,24 @@ class GeometryProblem:
         tau = signals.tau
         tau = tau if self._counted is None else tau * self._counted[..., 0]
         right = (tau.T[:, None] @ rows.swapaxes(0, 1))[:, 0]
-        total = np.square(tau).sum(axis=0)
+        total = np.maximum(np.square(tau).sum(axis=0), 1e-30)
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
-        x, gains = mean, np.ones(len(normal))
-        # Number of reweightings: further ones change the cost by less than 0.1. With unknown gains, the fit converges
-        # more slowly.
-        for _ in range(12 if self._free_gains else 6):
-            if self._free_gains:
-                gains = self._gains(x, normal, right, variance)
+        x, gains, known = mean, np.ones(len(normal)), np.ones(len(normal), bool)
+        initial, lowest = gains, np.inf
+        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
+        # alternate between gains and parameters, and the others are steps of both together, which converge faster near
+        # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
+        for iteration in range(14 if self._has_free_gains else 6):
+            if self._has_free_gains and iteration < 6:
+                # regressions of the model's torques on the logged ones; positive, even if they are not correlated
+                load = np.maximum((normal @ x) @ x, 1e-9 * total)
+                correlation = right @ x / np.sqrt(load * total)
+                gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
+                if iteration == 0:
+                    initial, known = gains, correlation > 0.5
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ flat).reshape(precision.shape)
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
@@ -199,40 +202,28 @@ class GeometryProblem:
             ridge = np.append(np.zeros(self._bodies), 1e-9 * drives + 1e-9)
             matrix += scale * precision
             np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
-            x = solution(matrix, (weights * gains) @ right + scale * precision @ mean)
+            vector = (weights * gains) @ right + scale * precision @ mean
+            if iteration < 6:
+                x = solution(matrix, vector)
+            else:
+                x, gains = _joint_step(matrix, vector, weights * gains, gains, normal @ x, right @ x, x)
             squares = total - 2 * (right @ x) / gains + (normal @ x) @ x / gains**2
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
+            misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+            cost = misfit + freedom * float(np.log1p(distance / freedom))
+            if cost < lowest or not self._has_free_gains:
+                lowest, best = cost, (x, gains, errors, misfit, matrix)
+        cost, (x, gains, errors, misfit, matrix) = lowest, best
         covariance = inverse(matrix)
-        misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
-        cost = misfit + freedom * float(np.log1p(distance / freedom))
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
-        return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
-
-    def _gains(
-        self, x: np.ndarray, normal: np.ndarray, right: np.ndarray, variance: np.ndarray
-    ) -> np.ndarray:
-        """Return the factors (n,) on the logged torques that fit the torques of the bodies best, with free friction.
-
-        Args:
-            x: (K,) parameters, of which the inertial ones are used.
-            normal: (n, K, K) Gram matrices of the regressor per joint.
-            right: (n, K) products of the regressor and the logged torques per joint.
-            variance: (n,) sums of squared deviations of the logged torques from their means.
-        """
-        bodies, gains = self._bodies, []
-        for gram, product, power in zip(normal, right, variance, strict=True):
-            columns = np.flatnonzero(gram.diagonal()[bodies:] > 0) + bodies
-            friction = np.linalg.pinv(gram[np.ix_(columns, columns)], rcond=1e-9, hermitian=True)
-            coupled = gram[columns, :bodies] @ x[:bodies]
-            load = float(x[:bodies] @ gram[:bodies, :bodies] @ x[:bodies] - coupled @ friction @ coupled)
-            agreement = float(product[:bodies] @ x[:bodies] - coupled @ friction @ product[columns])
-            # The factor is positive, and at most 1,000 times the factor that makes the torques as large as the loads
-            # of the bodies. It is 1 if the bodies do not load the joint.
-            agreement = max(agreement, 1e-3 * float(np.sqrt(max(load, 0.0) * power)))
-            gains.append(load / agreement if load > 1e-9 * power and agreement > 0 else 1.0)
-        return np.array(gains)
+        # The cost hardly determines a common factor of all gains. It is therefore the factor of the initial gains, from
+        # regressions on the torques by the prior mean, of the joints at which both torques are correlated. Without such
+        # joints, the median of the gains is 1.
+        factors = initial[known] / gains[known] if known.any() else 1 / gains
+        gains = gains * np.exp(np.median(np.log(factors)))
+        return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors, gains)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
@@ -334,6 +325,38 @@ class GeometryProblem:
         variance = (functionals @ covariance * functionals).sum(axis=1)
         odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)
         return float(np.minimum(odds, np.repeat([15.0, 10.0], n)).sum())
+
+
+def _joint_step(
+    matrix: np.ndarray,
+    vector: np.ndarray,
+    weights: np.ndarray,
+    gains: np.ndarray,
+    products: np.ndarray,
+    agreement: np.ndarray,
+    x: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the parameters (K,) and gains (n,) after a Gauss-Newton step of both.
+
+    The torque residual of joint k is tau_k - h_k Y_k x, with the logged torque tau_k and the inverse gain h_k. Its
+    derivatives with respect to x and to h_k are -h_k Y_k and -Y_k x.
+
+    Args:
+        matrix: (K, K) Hessian of the cost with respect to x.
+        vector: (K,) right-hand side of the normal equations for x.
+        weights: (n,) weights of the squared residuals, divided by the gains.
+        gains: (n,) current gains.
+        products: (n, K) Y_k^T Y_k x.
+        agreement: (n,) tau_k^T Y_k x.
+        x: (K,) current parameters.
+    """
+    count, coupling = len(x), weights[:, None] * products
+    scale = weights * gains
+    # The ridge keeps the gain of a joint without load: the gain is then confounded with friction.
+    power = scale * (products @ x) * (1 + 1e-6) + 1e-30
+    whole = np.block([[matrix, coupling.T], [coupling, np.diag(power)]])
+    step = solution(whole, np.append(vector, scale * agreement))
+    return step[:count], gains / np.exp(np.clip(step[count:] * gains, -0.7, 1.0))
 
 
 def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:

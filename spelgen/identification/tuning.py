@@ -106,6 +106,8 @@ class LogGeometryTuning:
     delay_start: float = 0.06
     # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
+    # [1] Largest relative error of a clock; a larger one explains other errors, such as friction of slow motions.
+    clock_error: float = 0.05
     # [1] A delay is accepted if the squared residual of a joint with the delay is below this fraction of its value
     # without delay; wrong delays have fractions from 0.78 on, on recordings of seven arms.
     delay_gain: float = 0.65

@@ -15,9 +15,8 @@ from spelgen.errors import Diagnostic, LogError, SpelgenError
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
-from spelgen.identification.hypotheses import HypothesisFit
+from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.least_squares import varying
-from spelgen.identification.log_faults import Fault
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
@@ -37,7 +36,6 @@ from spelgen.log_checks.robot_checks import (
     TUNING,
     JointEvidence,
     fit_gravity,
-    torque_factors,
 )
 from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
@@ -124,13 +122,14 @@ class TorqueLogs:
             is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
-        has_errors, faults = bool(summary.errors), dict[Check[JointEvidence], dict[str, str]]()
+        # Torques beyond the limits of the drives are not reported if the log has an error, since they are a consequence
+        # of it, and if the torques agree with the gravity of the URDF: the limits are then placeholders.
+        faults, accepted_limits = dict[Check[JointEvidence], dict[str, str]](), set[str]()
+        if summary.errors or any(joint.shows_unit for joint in evidence):
+            accepted_limits.add("torque-beyond-drive")
         for joint in evidence:
-            passed = accepted | {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
-            # torques beyond the limits of the drive are not reported if the log has an error, since they are a
-            # consequence of it
-            if has_errors:
-                passed.add("torque-beyond-drive")
+            passed = accepted | accepted_limits
+            passed |= {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
                     faults.setdefault(check, {})[joint.coordinate.name] = found.message
@@ -259,7 +258,7 @@ class TorqueLogs:
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
-        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        unchanged, *better = compare_hypotheses(problem, self._faults(problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
@@ -279,26 +278,21 @@ class TorqueLogs:
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
-    def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
+    def _faults(self, problem: GeometryProblem) -> tuple[Fault, ...]:
+        """Return the kinds of faults to test, see `kinds_of_faults`.
 
-        The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
-        unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
+        A unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
         is_milli = np.array([unit == "mNm" for unit in units])
         is_open = is_milli | np.array([unit is None for unit in units])
-        coarse = problem.thinned(GEOMETRY.coarse_samples)
-        _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
-        loads = of_urdf.std(axis=0)
-        factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
         # Units of positions are tested only if velocities have the same unit per second, so that one factor changes
         # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
         scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
+        return kinds_of_faults(problem.arm, TorqueUnit(is_open, is_milli), scale)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
@@ -326,7 +320,9 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
         # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
-        if fit.errors[k] > 0.1 or problem.without_gravity(k).fit(problem.unchanged).cost < fit.cost:
+        # The cost without gravity must be clearly lower: a wrong centre of mass of the last link has a similar effect.
+        without = problem.without_gravity(k).fit(problem.unchanged).cost
+        if fit.errors[k] > 0.1 or without < fit.cost - GEOMETRY.ambiguous:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
                 f"torque varies {deviation:.2g} times as much as tau"

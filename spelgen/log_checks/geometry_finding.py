@@ -11,8 +11,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.continuous_faults import Gravity, ZeroOffset
-from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
-from spelgen.identification.log_faults import Correction, Fault
+from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.tuning import SAMPLES

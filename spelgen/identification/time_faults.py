@@ -1,0 +1,222 @@
+"""Kinds of faults of the times of a log: signals that are delayed, or that have the times of another clock.
+
+The delays of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from operator import itemgetter
+
+import numpy as np
+
+from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.joint_signals import plain_number
+
+DIFFERENCE = 1e-4  # [s] step of finite differences with respect to delays
+
+
+class Delay(Fault):
+    """Kind of fault of a log: some signals were logged later or earlier than the others.
+
+    These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
+    """
+
+    code = "joint-delay"
+    rarity = 2
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield least-squares fits of the log's torques, each with one set of delayed signals (`_delayed_signals`).
+
+        Each fit has the best delay of its signals. Delays below `GEOMETRY.min_delay` are omitted: friction causes such
+        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if the samples
+        lack the earlier and later signals from which delayed signals are interpolated.
+        """
+        reading, longest = base.hypothesis, problem.samples.longest_delay
+        if not longest or reading.delay.any():
+            return
+        for signals in _delayed_signals(len(reading.offset)):
+
+            def delayed(delay: np.ndarray, signals: np.ndarray = signals) -> Hypothesis:
+                """Return the hypothesis that `signals`, a (2, n) mask of motions and torques, have a delay.
+
+                delay: (1,) [s].
+                """
+                return reading.changed(self, delay=delay * signals)
+
+            # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
+            # torques, whose derivative with respect to time is mostly noise.
+            starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
+            delay, _ = problem.descend(
+                delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
+                allowed=lambda x: np.clip(x, -longest, longest),
+            )  # fmt: skip
+            if abs(delay[0]) >= GEOMETRY.min_delay:
+                fit = problem.fit(delayed(delay.round(3)))
+                yield from [fit] if _explains_more(problem, base, fit) else []
+
+    def text(self, correction: Correction) -> str:
+        """Return the text about delayed signals: which signals of the joints, and the longest delay."""
+        delay = correction.hypothesis.delay
+        longest = 1e3 * float(delay.ravel()[np.abs(delay).argmax()])
+        order = "later" if longest > 0 else "earlier"
+        return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
+
+    def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
+        """Return the setting `delay` of a joint's delayed signals; {} without delay, or if `log_keys` corrects it."""
+        mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
+        if self.log_keys(correction) or not delays.any():
+            return {}
+        present = mapping.joint(correction.arm.joint_names[joint]).delay
+        late = {}
+        for quantity in mapping.quantities:
+            delay = delays[int(quantity == "tau")]
+            if delay:
+                late[quantity] = plain_number(present.model_dump()[quantity] + delay)
+        return {"delay": {**present.model_dump(exclude_unset=True), **late}}
+
+    def log_keys(self, correction: Correction) -> dict[str, object]:
+        """Return the setting `torque_delay` of the log if the torques of all joints have one delay; else {}."""
+        delay = correction.hypothesis.delay[1]
+        if not delay.any() or (delay != delay[0]).any():
+            return {}
+        return {"torque_delay": plain_number(correction.mapping.torque_delay + delay[0])}
+
+
+class JointClock(Fault):
+    """Kind of fault of a log: some signals have times of another clock, so that their delay changes linearly.
+
+    These signals are the motion, the torque or all signals of a joint, or the torques of all joints.
+    """
+
+    code = "joint-clock"
+    rarity = 3
+    advice = "no setting corrects it: log all joints with one clock"
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
+        """Return the least-squares fit of the torques with a delay that changes linearly with time.
+
+        The search starts from the delay of `base`. If there is no delay, it starts from delays at the start and end of
+        a recording by one Gauss-Newton step from the fit `base`, for each set of `_delayed_signals`. The residual's
+        derivatives with respect to the two delays are (1 - t) d and t d: t is the relative time, 0 to 1, and d the
+        derivative for a constant delay. [] is returned if the delay of `base` already changes.
+        """
+        reading = base.hypothesis
+        if reading.drift.any() or not problem.samples.longest_delay:
+            return []
+        if reading.delay.any():
+            signals, first = 1.0 * (reading.delay != 0), reading.delay[reading.delay != 0][0]
+            faults = tuple(x for x in reading.faults if not isinstance(x, Delay))
+            reading = replace(reading, faults=faults, delay=np.zeros_like(reading.delay))
+            return self._best(problem, reading, [(np.full(2, first), signals)], np.inf)
+        residual = problem.residual(reading, base.parameters)
+        time = (problem.samples.times / problem.samples.times.max())[:, None, None]
+        starts = []
+        for signals in _delayed_signals(len(reading.offset)):
+            shifted = problem.residual(reading.changed(self, delay=DIFFERENCE * signals), base.parameters)
+            column = ((shifted - residual) / DIFFERENCE)[..., None]
+            step = problem.step(base, np.concatenate([(1 - time) * column, time * column], axis=2))
+            if abs(step[1] - step[0]) >= GEOMETRY.min_delay / 2:
+                starts.append((np.clip(step, -0.3, 0.3), signals))
+        return self._best(problem, reading, starts, base.cost - GEOMETRY.slight)
+
+    def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
+        """Return at most three least-squares fits in which the delay of some signals changes linearly with time.
+
+        The delay is 0 at the start of a recording. An initial guess has a set of delayed signals (from
+        `_delayed_signals`) and a delay at the end [s] (from `GEOMETRY.clock_starts`). All combinations are tried, and
+        the three of lowest cost are refined, which have the right signals and the right sign of the drift. unchanged:
+        fit of the unchanged log.
+        """
+        reading, starts = unchanged.hypothesis, []
+        for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():
+            starts += [(np.array([0.0, last]), signals) for last in GEOMETRY.clock_starts]
+        return self._best(problem, reading, starts, np.inf, 3)
+
+    def _best(
+        self,
+        problem: GeometryProblem,
+        reading: Hypothesis,
+        starts: list[tuple[np.ndarray, np.ndarray]],
+        limit: float,
+        count: int = 1,
+    ) -> Iterator[HypothesisFit]:
+        """Yield least-squares fits in which some signals have the best delays at the start and end of a recording.
+
+        Between start and end the delay changes linearly. A fit is omitted if both delays are about equal, or if the
+        torque residual hardly falls.
+
+        Args:
+            problem: least-squares problem of the log.
+            reading: hypothesis without these delays.
+            starts: initial delays (2,) [s] at the start and the end, and masks (2, n) of the delayed motions and
+                torques. Only the `count` starts of lowest cost, below `limit`, are refined.
+        """
+
+        def drifting(delays: np.ndarray, signals: np.ndarray) -> Hypothesis:
+            """Return the hypothesis in which the delay of some signals changes linearly during a recording."""
+            first, last = delays
+            drift = (last - first) / float(problem.samples.times.max())
+            return reading.changed(self, delay=first * signals, drift=drift * signals)
+
+        costs = [(problem.fit(drifting(*start)).cost, *start) for start in starts]
+        base = problem.fit(reading)
+        for cost, start, signals in sorted(costs, key=itemgetter(0))[:count]:
+            if cost >= limit:
+                return
+            delays, best = problem.descend(
+                lambda x, signals=signals: drifting(x, signals), start, largest=0.3, smallest=0.002
+            )
+            is_clock = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
+            is_clock &= bool(np.abs(best.hypothesis.drift).max() <= GEOMETRY.clock_error)
+            # No setting corrects a clock, so the finding must be certain: the mean residual of the joints must fall.
+            is_certain = best.errors.mean() < GEOMETRY.lower * base.errors.mean()
+            if is_clock and is_certain and _explains_more(problem, base, best):
+                yield best
+
+    def text(self, correction: Correction) -> str:
+        """Return the text about signals with another clock: which signals, and the error of the clock's rate."""
+        drift = correction.hypothesis.drift
+        largest = float(drift.ravel()[np.abs(drift).argmax()])
+        return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
+
+    def joints(self, correction: Correction) -> list[str]:
+        """Return the names of the joints with signals whose times, by `correction`, are from a clock of their own."""
+        names = np.array(correction.arm.joint_names)
+        return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
+
+
+def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:
+    """Return True if delayed signals explain the torque of at least one joint much better than the fit `base`.
+
+    The joint's squared torque residual in `fit` must be less than `GEOMETRY.delay_gain` times the residual in `base`.
+    Hysteresis of friction resembles a delay, so this must also hold for the fits of both hypotheses with hysteresis.
+    """
+    stateful = problem.with_hysteresis()
+    is_better = fit.errors < GEOMETRY.delay_gain * base.errors
+    before, after = (stateful.fit(x.hypothesis).errors for x in (base, fit))
+    return bool((is_better & (after < GEOMETRY.delay_gain * before)).any())
+
+
+def _delayed_signals(n: int) -> list[np.ndarray]:
+    """Return masks (2, n) of motion and torque, one per set of signals that may have a common delay.
+
+    The sets: the torques of all n joints; then, for each joint, its motion, its torque, and both.
+    """
+    masks = [np.stack([np.zeros(n), np.ones(n)])]
+    for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
+        masks += [np.outer(rows, unit) for unit in np.eye(n)]
+    return masks
+
+
+def _late_signals(delay: np.ndarray) -> str:
+    """Return words for the delayed signals, such as "torques". delay: (2, n) of motions and torques."""
+    names = {
+        (0, 1): "torques",
+        (1, 0): "positions and velocities",
+        (1, 1): "positions, velocities and torques",
+    }
+    return names[bool(delay[0].any()), bool(delay[1].any())]
