@@ -52,6 +52,10 @@ def pseudo_inertia(ten: Tensor) -> Tensor:
     return torch.unflatten(torch.stack(rows, dim=-1), -1, (4, 4))
 
 
+_UNIT_PARAMETERS = pseudo_inertia(torch.eye(10).double())
+"""Pseudo-inertias for one inertial parameter of 1 and all others of 0, (10, 4, 4): derivatives of `pseudo_inertia`."""
+
+
 def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the regressor Y of B bodies, (..., n, 10 B): the joint torques are Y @ inertial parameters [Nm, N].
 
@@ -74,7 +78,7 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
     jacobian = pose.jacobian if identical else chain.ratios.mT @ pose.jacobian
     jacobian = torch.unflatten(jacobian, -1, (3, count, 4))
     products = torch.einsum("...nxba,...xbc->...nbac", jacobian, rises)
-    rows: Tensor = torch.tensordot(products, pseudo_inertia(torch.eye(10).to(q)), dims=([-2, -1], [1, 2]))
+    rows: Tensor = torch.tensordot(products, _UNIT_PARAMETERS.to(q), dims=([-2, -1], [1, 2]))
     return rows.flatten(-2)
 
 
