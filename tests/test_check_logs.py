@@ -94,13 +94,16 @@ def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
     )
 
 
+@pytest.fixture(scope="module")
 def loaded_joint(loaded, log) -> int:
-    return max(range(3), key=lambda k: check_logs([log], loaded).joints[k].gravity.relative_deviation or 0)
+    """Return the index of the joint that gravity loads most, from one check for all tests."""
+    joints = check_logs([log], loaded).joints
+    return max(range(3), key=lambda k: joints[k].gravity.relative_deviation or 0)
 
 
 @pytest.mark.parametrize("code", ["torque-without-gravity", "torque-scale"])
-def test_torques_without_gravity_or_of_another_scale_are_found(loaded, arm, log, code):
-    joint, tau = loaded_joint(loaded, log), log.tau.copy()
+def test_torques_without_gravity_or_of_another_scale_are_found(loaded, loaded_joint, arm, log, code):
+    joint, tau = loaded_joint, log.tau.copy()
     still = np.zeros_like(log.q)
     gravity = regressor(arm, log.q, still, still) @ urdf_parameters(arm)
     random = np.random.default_rng(1)
@@ -123,9 +126,11 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)
-def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(loaded, arm, log, case):
+def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(
+    loaded, loaded_joint, arm, log, case
+):
     factor, told, line = IMPOSSIBLE[case]
-    joint, tau = loaded_joint(loaded, log), log.tau.copy()
+    joint, tau = loaded_joint, log.tau.copy()
     tau[:, joint] *= factor
     wrong = [replace(log, tau=tau)]
     name = arm.coordinates[joint].name
@@ -462,7 +467,7 @@ def test_a_position_limit_that_is_reached_without_contact_is_not_reported(loaded
 def test_a_joint_that_never_reverses_is_reported(loaded, log):
     forward = np.abs(log.qd[:, 0])
     q = np.column_stack([cumulative_trapezoid(forward, log.t, initial=0.0), log.q[:, 1:]])
-    moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]))
+    moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]), tau=np.ones_like(log.tau))
     one_way = [x.where for x in check_logs([moved], loaded).findings if x.code == "one-way"]
     assert one_way == [f"joint {loaded.chain.joint_names[0]!r}"]
     # it is enough that the joint reverses in another log
@@ -538,7 +543,9 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
 
 
 def test_notes_of_several_joints_with_one_text_are_one_note(loaded, log):
-    forward = replace(log, q=np.abs(log.qd).cumsum(axis=0) * 0.01, qd=np.abs(log.qd))
+    # with constant torques no fault of the geometry is searched, which would take five seconds
+    speed = np.abs(log.qd)
+    forward = replace(log, q=speed.cumsum(axis=0) * 0.01, qd=speed, tau=np.ones_like(log.tau))
     (finding,) = (x for x in check_logs([forward], loaded).findings if x.code == "one-way")
     assert finding.where == f"joint {', '.join(map(repr, loaded.chain.joint_names))}"
 

@@ -40,9 +40,9 @@ SLOW = {"tutorial_servo.md"}  # a fit takes half a minute: only `pytest --update
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
-        "PICKED, END = 3.0, 11.0": "PICKED, END = 3.0, 9.0",
-        "END, dynamics=with_load": "END if estimator else 5.5, dynamics=with_load",
-    }
+        "PICKED, END = 3.0, 11.0": "PICKED, END = 2.0, 6.5",
+        "END, dynamics=with_load": "END if estimator else 4.5, dynamics=with_load",
+    },
 }
 RUN = [page for page in PAGES if page.name not in SLOW or "--update" in sys.argv]
 TUTORIALS = sorted((ROOT / "docs").glob("tutorial_*.md"))

@@ -149,7 +149,7 @@ def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
     tau = torch.randint(-2, 3, (count, samples, model.n), generator=random).double()
     with torch.no_grad():
         q, qd = rollout(
-            model, start, torch.zeros_like(start), tau[:, :-1], 1 / rate, substeps=round(640 / rate)
+            model, start, torch.zeros_like(start), tau[:, :-1], 1 / rate, substeps=round(320 / rate)
         )
     t = np.arange(samples) / rate
     return [Trajectory(t, q[k], qd[k], tau[k], f"motion_{seed}{k}") for k in range(count)]

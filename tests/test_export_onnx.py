@@ -9,6 +9,7 @@ import pytest
 import torch
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, readme_results
 from onnxscript.values import TracedOnnxFunction
+from torch.onnx._internal.exporter._registration import ONNXRegistry
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.tip import tip_kinematics
@@ -28,10 +29,12 @@ ENTRIES = (
 
 @pytest.fixture(scope="module", autouse=True)
 def functions_parsed_once():
-    """For each file, the exporter of torch parses the source of 500 functions again, which takes half a second."""
+    """For each file, torch's exporter parses the source of 500 functions and lists them again, in nearly a second."""
     parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
+    listed = staticmethod(functools.cache(ONNXRegistry.from_torchlib))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TracedOnnxFunction, "function_ir", parsed)
+        patch.setattr(ONNXRegistry, "from_torchlib", listed)
         yield
 
 

@@ -25,12 +25,18 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
-@pytest.mark.parametrize("code", FAULTS)
-def test_the_recording_whose_torques_contradict_the_others_is_named(arm, code):  # noqa: F811
+@pytest.fixture(scope="module")
+def recordings(arm):  # noqa: F811
+    """Return four recordings without faults."""
     logs = [replace(recorded(arm, 10 + k), name=f"run {k}") for k in range(4)]
     assert check_logs(logs, arm).errors == ()
-    logs[2] = FAULTS[code](logs[2])
+    return logs
+
+
+@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
+@pytest.mark.parametrize("code", FAULTS)
+def test_the_recording_whose_torques_contradict_the_others_is_named(arm, recordings, code):  # noqa: F811
+    logs = [*recordings[:2], FAULTS[code](recordings[2]), recordings[3]]
     (error,) = map(str, check_logs(logs, arm).errors)
     assert "trajectory run 2, " in error and OF_ONE in error and f"--accept {code}" not in error
     assert "write '" not in error
@@ -44,13 +50,24 @@ SERVO_FAULTS = {
 }
 
 
-@pytest.mark.parametrize("text", SERVO_FAULTS)
-def test_the_recording_of_servos_with_a_fault_is_named(tmp_path, text):
-    servos = spelgen.load_arm(write_servo_arm(tmp_path, "input: position\nlogs: {units: {q: deg}}\n"))
-    mapping = servos.settings.logs
-    logs = [replace(x, mapping=mapping) for x in servo_logs(4, 12.0)]
+@pytest.fixture(scope="module")
+def servos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("servos")
+    return spelgen.load_arm(write_servo_arm(folder, "input: position\nlogs: {units: {q: deg}}\n"))
+
+
+@pytest.fixture(scope="module")
+def servo_recordings(servos):
+    """Return four recordings of servos without faults."""
+    logs = [replace(x, mapping=servos.settings.logs) for x in servo_logs(4, 12.0)]
     assert check_logs(logs, servos).errors == ()
-    logs[1] = SERVO_FAULTS[text](logs[1])
+    return logs
+
+
+@pytest.mark.parametrize("text", SERVO_FAULTS)
+def test_the_recording_of_servos_with_a_fault_is_named(servos, servo_recordings, text):
+    first, second, *others = servo_recordings
+    logs = [first, SERVO_FAULTS[text](second), *others]
     errors = list(map(str, check_logs(logs, servos).errors))
     assert len(errors) == 1 and text in errors[0]
     assert "trajectory motion 1" in errors[0] and OF_ONE in errors[0] and "write '" not in errors[0]

@@ -272,7 +272,8 @@ def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
     with torch.no_grad():
         heavy.bodies.raw[:, -1] += np.log(1.2)
     held, q = [], np.random.default_rng(0).uniform(-1.5, 1.5, (4, 2))
-    second = spelgen.fit(heavy, servo_logs(5, 3.0, other, seed=4))
+    # ten short logs, since the time of a fit depends on the duration of its windows and not on their number
+    second = spelgen.fit(heavy, servo_logs(10, 2.0, other, seed=4))
     for fit, servos in ((fitted, TRUTH), (second, other)):
         posterior, kp = fit.posterior, np.array(servos.kp)
         truths = {

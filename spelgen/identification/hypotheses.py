@@ -102,8 +102,11 @@ def _per_signal(values: np.ndarray) -> np.ndarray:
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
     """Return signals (S, n, 4, E), with the motion of joint source[0, k] and the torque of joint source[1, k] at k.
 
-    values: (S, n, 4, E), see `MotionSamples`.
+    values: (S, n, 4, E), see `MotionSamples`. Without a permutation, the result is `values` itself: a copy would take a
+    twentieth of the time of a search.
     """
+    if (source == np.arange(source.shape[1])).all():
+        return values
     return np.concatenate([values[:, source[0], :3], values[:, source[1], 3:]], axis=2)
 
 

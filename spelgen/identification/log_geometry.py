@@ -174,13 +174,11 @@ class GeometryProblem:
         """
         rows, normal = self.equations(hypothesis)
         signals = hypothesis.signals(self.samples)
-        tau = signals.tau
-        tau = tau if self._counted is None else tau * self._counted[..., 0]
+        tau = signals.tau if self._counted is None else signals.tau * self._counted[..., 0]
         right = (tau.T[:, None] @ rows.swapaxes(0, 1))[:, 0]
         total = np.maximum(np.square(tau).sum(axis=0), 1e-30)
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
-        flat = normal.reshape(len(normal), -1)
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains, known = mean, np.ones(len(normal)), np.ones(len(normal), bool)
         initial, lowest = gains, np.inf
@@ -196,12 +194,12 @@ class GeometryProblem:
                 if iteration == 0:
                     initial, known = gains, correlation > 0.5
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
-            matrix = (weights[None] @ flat).reshape(precision.shape)
-            # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable
-            drives = np.diagonal(matrix)[self._bodies :]
-            ridge = np.append(np.zeros(self._bodies), 1e-9 * drives + 1e-9)
+            matrix = (weights[None] @ normal.reshape(len(normal), -1)).reshape(precision.shape)
             matrix += scale * precision
-            np.fill_diagonal(matrix, np.diagonal(matrix) + ridge)
+            # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable; `drives`
+            # is a view of the diagonal
+            drives = np.einsum("kk->k", matrix)[self._bodies :]
+            drives += 1e-9 * drives + 1e-9
             vector = (weights * gains) @ right + scale * precision @ mean
             if iteration < 6:
                 x = solution(matrix, vector)

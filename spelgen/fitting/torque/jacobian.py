@@ -110,8 +110,8 @@ class TorqueJacobian:
         parameters = self.rigid.unflatten(x)
         with torch.no_grad():
             blocks = [self._torque_residual(parameters, block)[0] for block in self._blocks]
-        # The weights of eliminated terms depend on all samples of a joint, so the blocks are concatenated.
-        residual = torch.cat(blocks) * self.logged_scale(x)
+            # The weights of eliminated terms depend on all samples of a joint, so the blocks are concatenated.
+            residual = torch.cat(blocks) * self._logged_scale(parameters)
         squared_residual = residual.square().sum(dim=0)
         for joint, terms in self.terms.items():
             squared_residual[joint] = terms.residual(residual[:, joint]).square().sum()
