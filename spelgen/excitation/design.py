@@ -93,10 +93,8 @@ def excite(
         do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
     if attempt:
-        statement += (
-            f" Designs with seeds {seed} to {seed + attempt - 1} had contacts; this one has seed {seed + attempt} and "
-            f"{reach * fraction:.0%} of the ranges."
-        )
+        earlier = f"Designs with seeds {seed} to {seed + attempt - 1} had contacts"
+        statement += f" {earlier}; this one has seed {seed + attempt} and {reach * fraction:.0%} of the ranges."
     random, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
