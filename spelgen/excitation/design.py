@@ -94,7 +94,7 @@ def excite(
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
     if attempt:
         earlier = f"Designs with seeds {seed} to {seed + attempt - 1} had contacts"
-        statement += f" {earlier}; this one has seed {seed + attempt} and {reach * fraction:.0%} of the ranges."
+        statement += f" {earlier}; this one has seed {seed + attempt}, {reach * fraction:.0%} of the ranges."
     random, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
         arm=arm.chain,
