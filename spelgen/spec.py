@@ -185,8 +185,8 @@ class ModelSpec:
         joints = [*self.potential, *(link.joint for link in links)]
         for output in self.outputs:
             joints += output.joints
-        for part in (*self.outputs, *self.constants):
-            for row, column, _ in part.basis:
+        for basis in [x.basis for x in self.outputs] + [x.basis for x in self.constants]:
+            for row, column, _ in basis:
                 joints += [row, column]
         for entry in self.inputs:
             joints += [entry.joint, entry.motor]
