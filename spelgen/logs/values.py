@@ -82,12 +82,14 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
     signals = data[:, 1 + joints :]
-    zero = (signals == 0).all(axis=1) if signals.shape[1] > joints else np.zeros(len(data), bool)
+    empty, zero = np.isnan(signals).all(axis=1), (signals == 0).all(axis=1)
     # An arm at rest whose motors are off has more such rows in succession, and coarse signals of an arm that reverses
     # have few: less than 2 % of all rows.
-    runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
-    is_mixed = runs > TUNING.jump_window and 0.02 * len(data) < zero.sum() < 4 * runs
-    return np.asarray(np.isnan(signals).all(axis=1) | (zero & is_mixed))
+    if signals.shape[1] > joints and zero.sum() > max(TUNING.jump_window, 0.02 * len(data)):
+        runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
+        if runs > TUNING.jump_window and zero.sum() < 4 * runs:
+            empty |= zero
+    return np.asarray(empty)
 
 
 def is_split(data: np.ndarray) -> bool:
