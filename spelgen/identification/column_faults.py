@@ -237,12 +237,12 @@ class TorqueUnit(WrongScale):
         A factor of a single joint must clearly lower the cost: the load of the last joint, for example, is determined
         only by the masses of the URDF.
         """
-        gains = problem.with_free_gains().fit(base.hypothesis).gains
-        gains, logarithms = np.where(self._is_open, gains, 1.0), np.log(gains)
-        # The common factor is the factor with which most factors agree, up to a ratio of 2; of several such factors the
-        # one nearest to 1.
-        agreeing = (np.abs(logarithms[:, None] - logarithms) < np.log(2)).sum(axis=1)
-        common = float(gains[np.lexsort((np.abs(logarithms), -agreeing))[0]]) if self._is_open.all() else 1.0
+        extended, reading = problem.with_free_gains(), base.hypothesis
+        opposite = extended.fit(reading.changed(self, scale=reading.scale * np.array([[1.0], [-1.0]]))).gains
+        if is_other_unit(self._common(opposite)):
+            yield self._scaled(problem, base, np.full(len(opposite), -rounded_factor(self._common(opposite))))
+        gains = np.where(self._is_open, extended.fit(reading).gains, 1.0)
+        common = self._common(gains)
         shared = rounded_factor(common) if is_other_unit(common) else 1.0
         factors, best = np.full(len(gains), shared), base
         if shared != 1.0:
@@ -272,6 +272,16 @@ class TorqueUnit(WrongScale):
             if is_better and fit.errors.max() <= GEOMETRY.unexplained:
                 yield fit
 
+    def _common(self, gains: np.ndarray) -> float:
+        """Return the gain with which most of n gains agree, up to a ratio of 2, and the one nearest to 1 of several.
+
+        1 is returned if the unit of some joints is right.
+        """
+        logarithms = np.log(gains)
+        agreeing = (np.abs(logarithms[:, None] - logarithms) < np.log(2)).sum(axis=1)
+        best = np.lexsort((np.abs(logarithms), -agreeing))[0]
+        return float(gains[best]) if self._is_open.all() else 1.0
+
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
         """Return the least-squares fit of the torques after multiplication by `factors` (n,), rounded to three digits.
 
@@ -279,7 +289,8 @@ class TorqueUnit(WrongScale):
         inexact because the masses of the URDF are.
         """
         rounded = np.array([float(f"{x:.3g}") for x in factors])
-        rounded[self._is_milli & ~is_other_unit(rounded / 1e3)] = 1e3
+        is_unit = self._is_milli & ~is_other_unit(rounded / 1e3)
+        rounded[is_unit] = np.copysign(1e3, rounded[is_unit])
         motion, torque = fit.hypothesis.scale
         return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * torque])))
 

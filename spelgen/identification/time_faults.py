@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from operator import itemgetter
 
 import numpy as np
@@ -168,7 +169,7 @@ class JointClock(Fault):
             if cost >= limit:
                 return
             delays, best = problem.descend(
-                lambda x, signals=signals: drifting(x, signals), start, largest=0.3, smallest=0.002
+                partial(drifting, signals=signals), start, largest=0.3, smallest=0.002
             )
             is_clock = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
             is_clock &= bool(np.abs(best.hypothesis.drift).max() <= GEOMETRY.clock_error)
