@@ -180,9 +180,9 @@ class GeometryProblem:
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
-        x, gains, known = mean, np.ones(len(normal)), np.ones(len(normal), bool)
+        x, gains, correlated = mean, np.ones(len(normal)), np.ones(len(normal), bool)
         initial, lowest = gains, np.inf
-        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
+        # Six reweightings: further ones change the cost by less than 0.1. With uncorrelated gains, the first six iterations
         # alternate between gains and parameters, and the others are steps of both together, which converge faster near
         # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
         for iteration in range(14 if self._has_free_gains else 6):
@@ -192,7 +192,7 @@ class GeometryProblem:
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
                 if iteration == 0:
-                    initial, known = gains, correlation > 0.5
+                    initial, correlated = gains, correlation > 0.5
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ normal.reshape(len(normal), -1)).reshape(precision.shape)
             matrix += scale * precision
@@ -211,7 +211,7 @@ class GeometryProblem:
             scale = 2 * freedom / (freedom + distance)
             misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
             cost = misfit + freedom * float(np.log1p(distance / freedom))
-            if cost < lowest or not self._has_free_gains:
+            if iteration == 0 or cost < lowest or not self._has_free_gains:
                 lowest, best = cost, (x, gains, errors, misfit, matrix)
         cost, (x, gains, errors, misfit, matrix) = lowest, best
         covariance = inverse(matrix)
@@ -219,7 +219,7 @@ class GeometryProblem:
         # The cost hardly determines a common factor of all gains. It is therefore the factor of the initial gains, from
         # regressions on the torques by the prior mean, of the joints at which both torques are correlated. Without such
         # joints, the median of the gains is 1.
-        factors = initial[known] / gains[known] if known.any() else 1 / gains
+        factors = initial[correlated] / gains[correlated] if correlated.any() else 1 / gains
         gains = gains * np.exp(np.median(np.log(factors)))
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors, gains)
 
@@ -230,15 +230,15 @@ class GeometryProblem:
         residual with respect to the quantities.
         """
         rows, _ = self.equations(fit.hypothesis)
-        tau, known = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
+        tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
         joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
         flat = joined.reshape(-1, joined.shape[2])
         matrix = flat.T @ flat
-        matrix[:known, :known] += self._precision
+        matrix[:count, :count] += self._precision
         vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
-        vector[:known] += self._precision @ (self.prior_mean - fit.parameters)
-        return solution(matrix, vector)[known:]
+        vector[:count] += self._precision @ (self.prior_mean - fit.parameters)
+        return solution(matrix, vector)[count:]
 
     def descend(
         self,
