@@ -182,7 +182,7 @@ class GeometryProblem:
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains, correlated = mean, np.ones(len(normal)), np.ones(len(normal), bool)
         initial, lowest = gains, np.inf
-        # Six reweightings: further ones change the cost by less than 0.1. With uncorrelated gains, the first six iterations
+        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
         # alternate between gains and parameters, and the others are steps of both together, which converge faster near
         # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
         for iteration in range(14 if self._has_free_gains else 6):
