@@ -155,6 +155,7 @@ class Estimator:
         self.contact = self.observer.step(t, at, self.payload, self.drift.x)
         block = None if refusal == "saturated" else self.blocks.add(t, at)
         if block is not None:
+            self.observer.level.end_block()
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
             if self.half is not None:
                 self.estimate.start(self.half.joined(block))

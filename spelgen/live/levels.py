@@ -21,7 +21,7 @@ from spelgen.fitting.fitted import Fit, required_spec
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING as TORQUE
-from spelgen.live.contact import ContactObserver
+from spelgen.live.contact import ContactObserver, ResidualLevel
 from spelgen.live.filters import Block, Blocks, JointFilters, LoadFilter
 from spelgen.live.intake import Intake, balance_along
 from spelgen.live.momentum import Balance
@@ -263,15 +263,33 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     residuals = [_observer_residuals(levels, samples) for samples in tested]
     signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
-    peaks = []
-    for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
-        beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
-        ratio = beyond / np.sqrt(variance + np.square(levels.observer))
-        # Large residuals at neighbouring samples are one event, so a peak is the largest value in a time window.
-        times = np.array([sample.t for sample in samples])
-        starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
-        peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
+    peaks = [_peaks(levels, *pair) for pair in zip(tested, residuals, strict=True)]
     return levels.model_copy(update=held_out_tail(peaks, levels))
+
+
+def _peaks(levels: NoiseLevels, samples: Sequence[HeldOutSample], residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the largest normalised residuals of the momentum observer in W time windows of a log, (W, n) [1].
+
+    They are normalised as the external torques that are compared with `NoiseLevels.thresholds`.
+
+    levels: noise levels, with the noise of the observer. samples, residuals: held-out samples of the log, and
+    `_observer_residuals` at these samples.
+    """
+    signal, variance, qd = residuals
+    beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
+    rows = beyond / np.sqrt(variance + np.square(levels.observer))
+    level, untouched, factors = ResidualLevel(len(qd[0])), np.zeros(len(qd[0]), dtype=bool), []
+    for row, sample in zip(rows, samples, strict=True):
+        if sample.is_resumed:
+            level = ResidualLevel(len(row))
+        factors.append(level.factor)
+        level.add(row, untouched)
+        if sample.block is not None:
+            level.end_block()
+    # Large residuals at neighbouring samples are one event, so a peak is the largest value in a time window.
+    times = np.array([sample.t for sample in samples])
+    starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
+    return np.maximum.reduceat(rows / np.array(factors), starts, axis=0)
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
