@@ -173,9 +173,11 @@ class Estimator:
         """
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
-        self.payload = find_payload(
+        self.payload = found = find_payload(
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
+        if before.status != "payload" and found.status == "payload" and self.estimate.misfit > TUNING.misfit:
+            self.payload = Payload("not yet", found.log_odds, found.limit)
         if (before.status == "payload") != (self.payload.status == "payload"):
             # The drift filter has assumed a wrong payload so far, and has attributed its torques to friction. The drift
             # filter is restarted from the friction scale of the payload filter.

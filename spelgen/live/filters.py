@@ -255,13 +255,14 @@ class PayloadEstimate:
         filters: the filter without a hypothesis, then the two copies, if any.
         moved: time in motion since the start or the last change of the payload [s].
         changed: True if a change of the payload was accepted, until the caller sets it to False.
+        misfit: mean of the normalised squared residuals of moving joints in about the last second [1].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
         self.filters = [LoadFilter(levels.load, levels.effort)]
         self.rows: Iterator[None] = iter(())
         self.moved = self.hypotheses_moved = 0.0
-        self.changed = False
+        self.changed, self.misfit = False, 1.0
         self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
@@ -301,11 +302,14 @@ class PayloadEstimate:
         moving: number of joints that moved in the block.
         """
         main = self.filters[0]
+        if moving:
+            self.misfit += TUNING.misfit_weight * (main.surprise / moving - self.misfit)
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
             ratio = candidate.log_likelihood - max(main.log_likelihood, contact.log_likelihood)
             if self.hypotheses_moved >= TUNING.changed_after and ratio > TUNING.changed:
                 self.filters, self.changed, self.moved = [candidate], True, self.hypotheses_moved
+                self.misfit = 1.0
                 return
             least = TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
             if self.hypotheses_moved >= least:
