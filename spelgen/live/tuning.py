@@ -55,7 +55,7 @@ class LiveTuning:
     # part: it is the lower bound of the variance of the torque of the estimated payload, divided by the variance of
     # torque errors. Without this bound, the squared error of the payload estimated for an arm without payload, divided
     # by its variance, grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e.
-    recurring: float = 0.03
+    recurring: float = 0.1
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
 
