@@ -27,35 +27,6 @@ class ContactState(NamedTuple):
     force: np.ndarray
 
 
-class ResidualLevel:
-    """Recent level of the normalised residual of the momentum observer per joint, a factor on the contact thresholds.
-
-    Residuals of a model are larger in some motions than in others, for example if the structure vibrates. The level is
-    the mean of the squared residuals of the last second or so. It does not contain the last two blocks of samples (see
-    `Block`), so that a contact does not raise the threshold before it is detected. Squares above `TUNING.level_limit`
-    are reduced to this limit, so that thresholds are at most doubled after contacts that begin slowly.
-    """
-
-    def __init__(self, n: int) -> None:
-        self.mean, self.recent, self.squares, self.count = np.ones(n), np.ones(n), np.zeros(n), 0
-
-    @property
-    def factor(self) -> np.ndarray:
-        """Factor on the standard deviation of the residual, (n,) [1]: 1 if residuals are as in the training logs."""
-        return np.sqrt(np.maximum(self.mean, 1.0))
-
-    def add(self, normalised: np.ndarray, touched: np.ndarray) -> None:
-        """Add the normalised residuals of a sample, (n,); residuals of joints in contact, `touched` (n,), are omitted."""
-        limited = np.minimum(np.square(normalised), TUNING.level_limit)
-        self.squares = self.squares + np.where(touched, self.mean, limited)
-        self.count += 1
-
-    def end_block(self) -> None:
-        """Update the level at the end of a block of samples."""
-        self.mean = self.mean + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.mean)
-        self.recent, self.squares, self.count = self.squares / self.count, 0.0 * self.squares, 0
-
-
 class ContactObserver:
     """Momentum observer of external torques: first-order low-pass filters of the terms of the momentum balance.
 
@@ -72,7 +43,13 @@ class ContactObserver:
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
-        level: Recent level of the residual, which raises the thresholds.
+        level: Mean square of the normalised residual in about the last half second, which multiplies its variance if it
+            exceeds 1, (n,). Residuals are larger in some motions than in others, for example if the arm vibrates. The
+            last two blocks of samples (see `Block`) are not part of the level, so that a contact does not raise the
+            threshold before it is detected. The squares are limited to `TUNING.level_limit`, so that slow contacts
+            raise the thresholds by a factor of at most two.
+        normalised: Magnitude of the external torque beyond the bound at rest, divided by its standard deviation, which
+            is compared with `NoiseLevels.thresholds`, (n,) [1].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -84,8 +61,8 @@ class ContactObserver:
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.baseline = np.zeros_like(self.levels.speed)
-        self.touched = np.zeros(len(self.baseline), dtype=bool)
-        self.level = ResidualLevel(len(self.baseline))
+        self.level = self.recent = np.ones_like(self.baseline)
+        self.touched, self.squares, self.count = self.baseline > 0, np.zeros_like(self.baseline), 0
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Update the observer with a sample; return the external torques and the detected contact.
@@ -97,12 +74,25 @@ class ContactObserver:
             drift: Estimates of the drift filter, (n, 2): friction scale minus one [1], and disturbance [Nm, N].
         """
         signal, variance = self.residual(t, at, payload, drift)
-        noise, resting = np.sqrt(variance + np.square(self.levels.observer)), self.levels.resting_torque(at.velocity)
-        threshold = self.levels.thresholds(self.alarms_per_minute) * self.level.factor * noise + resting
-        self.touched = np.abs(signal) > threshold
-        self.level.add(np.maximum(np.abs(signal) - resting, 0.0) / noise, self.touched)
+        noise, resting = (
+            np.sqrt(variance + np.square(self.levels.observer)),
+            self.levels.resting_torque(at.velocity),
+        )
+        factor, normalised = (
+            np.sqrt(np.maximum(self.level, 1.0)),
+            np.maximum(np.abs(signal) - resting, 0.0) / noise,
+        )
+        threshold = self.levels.thresholds(self.alarms_per_minute) * factor * noise + resting
+        self.normalised, self.touched = normalised / factor, np.abs(signal) > threshold
+        limited = np.minimum(np.square(normalised), TUNING.level_limit)
+        self.squares, self.count = self.squares + np.where(self.touched, self.level, limited), self.count + 1
         force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)
+
+    def end_block(self) -> None:
+        """Update the level of the residual at the end of a block of samples."""
+        self.level = self.level + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.level)
+        self.recent, self.squares, self.count = self.squares / self.count, 0.0 * self.squares, 0
 
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray

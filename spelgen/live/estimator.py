@@ -87,16 +87,16 @@ class Estimator:
 
     def reset(self) -> None:
         """Reset all estimates: payload, friction drift and friction state are unknown afterwards."""
-        n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
         self.estimate = PayloadEstimate(self.levels)
         self.drift = JointFilters.of_drift(self.levels.drift)
         self.observer = ContactObserver(self.levels, self.alarms_per_minute)
-        self.payload = NO_REPORT
         self.half: Block | None = None
-        self.reported = 0.0
-        self.contact = ContactState(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
+        self.payload, self.reported = NO_REPORT, 0.0
+        self.contact = ContactState(
+            *np.zeros((2, self.model.n)), np.zeros(self.model.n, dtype=bool), np.zeros(3)
+        )
 
     @property
     def refused(self) -> dict[str, int]:
@@ -112,8 +112,9 @@ class Estimator:
             qd: Velocities, (n,) [rad/s, m/s].
             tau: Measured torques, (n,) [Nm, N].
         """
-        (state,) = self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
-        return state
+        return next(
+            self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
+        )
 
     def replay(self, log: Trajectory) -> list[EstimatorState]:
         """Process all samples of a log; return the estimates after each sample."""
@@ -155,7 +156,7 @@ class Estimator:
         self.contact = self.observer.step(t, at, self.payload, self.drift.x)
         block = None if refusal == "saturated" else self.blocks.add(t, at)
         if block is not None:
-            self.observer.level.end_block()
+            self.observer.end_block()
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
             if self.half is not None:
                 self.estimate.start(self.half.joined(block))
@@ -208,8 +209,8 @@ class Estimator:
             friction = self.model.friction_torque(cache, at[1], *past)
             # The payload is fixed to the last body: its regressor is the last ten columns of the arm's regressor, which
             # belong to the last body.
-            regressor = regressor_of(self.model.chain, *at)[..., -10:]
-            load = regressor @ torch.from_numpy(self.payload.parameters)
+            parameters = torch.from_numpy(self.payload.parameters)
+            load = regressor_of(self.model.chain, *at)[..., -10:] @ parameters
             decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:
@@ -237,7 +238,5 @@ def torque_model(fit: Fit) -> RigidBodyDynamics:
             do="build the module with --preset hybrid and fit it",
         )  # fmt: skip
     if model.servo is not None:
-        raise RunError(
-            "a fit to position commands", element="estimator", expected="a fit to measured torques"
-        )
+        raise RunError("a fit to position commands", element="estimator", expected="a fit to torques")
     return copy.deepcopy(model).double().cpu().requires_grad_(False).eval()
