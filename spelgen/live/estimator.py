@@ -87,6 +87,7 @@ class Estimator:
 
     def reset(self) -> None:
         """Reset all estimates: payload, friction drift and friction state are unknown afterwards."""
+        n = self.model.n
         self.intake = Intake(self.levels, self.reach)
         self.blocks = Blocks(self.levels.rest_speed)
         self.estimate = PayloadEstimate(self.levels)
@@ -94,9 +95,7 @@ class Estimator:
         self.observer = ContactObserver(self.levels, self.alarms_per_minute)
         self.half: Block | None = None
         self.payload, self.reported = NO_REPORT, 0.0
-        self.contact = ContactState(
-            *np.zeros((2, self.model.n)), np.zeros(self.model.n, dtype=bool), np.zeros(3)
-        )
+        self.contact = ContactState(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
 
     @property
     def refused(self) -> dict[str, int]:

@@ -127,11 +127,10 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
     for t, refusal, at in zip(log.t.tolist(), refusals, terms, strict=True):
-        if at is None:
-            continue
-        if refusal == "gap":
-            blocks.restart()
-        samples.append(HeldOutSample(t, at, refusal == "gap", blocks.add(t, at)))
+        if at is not None:
+            if refusal == "gap":
+                blocks.restart()
+            samples.append(HeldOutSample(t, at, refusal == "gap", blocks.add(t, at)))
     return samples
 
 
