@@ -570,3 +570,49 @@ def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_pat
     assert content["payload"]["mass_interval"][0] < 2.0 < content["payload"]["mass_interval"][1]
     assert any(abs(contact["begin"] - 9.0) < 0.1 for contact in content["contacts"])
     assert set(content["friction_drift_percent"]) == set(model.joint_names)
+
+
+def test_a_contact_in_the_first_second_is_no_payload(arm, levels, run):
+    """A contact that acts while no payload is known is not reported as a payload: a payload would not explain it."""
+    _model, log, _ = arm
+    for begin in (0.0, 0.3):
+        acts = (log.t >= begin) & (log.t < begin + 1.0)
+        tau = log.tau + np.outer(acts, 0.1 * EFFORT * (np.arange(6) == 3))
+        _, states = estimates(run, levels, log[:900], tau[:900])
+        assert not any(state.payload.status == "payload" for state in states)
+        assert any(state.contact.touched[3] for state in states)
+
+
+def test_thresholds_rise_while_the_arm_vibrates_and_not_by_a_contact(arm, levels, run):
+    """Thresholds of a vibrating joint rise by at most a factor of two; a contact does not raise them within 0.1 s."""
+    _model, log, _ = arm
+    vibrates = (log.t > 4.0) & (log.t < 7.0)
+    noise = levels.observer[0]
+    vibration = 12 * noise * np.sin(2 * np.pi * 6.0 * log.t) * vibrates
+    _, states = estimates(run, levels, log, log.tau + np.outer(vibration, np.arange(6) == 0))
+    _, calm = estimates(run, levels, log, log.tau)
+    ratio = np.array([a.contact.threshold / b.contact.threshold for a, b in zip(states, calm, strict=True)])[
+        :, 0
+    ]
+    assert np.median(ratio[(log.t > 5.0) & vibrates]) > 1.3
+    assert ratio.max() < 2.05
+    np.testing.assert_allclose(ratio[(log.t > 0.5) & (log.t < 4.0)], 1.0, rtol=1e-6)
+    begin = 9.0
+    pushed = np.outer(log.t >= begin, 0.1 * EFFORT * (np.arange(6) == 0))
+    _, states = estimates(run, levels, log, log.tau + pushed)
+    early = (log.t >= begin) & (log.t < begin + 0.1)
+    found, expected = (np.array([x.contact.threshold[0] for x in rows])[early] for rows in (states, calm))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_logs_that_the_estimator_cannot_use_are_refused_or_marked(arm, levels, run):
+    """Torques of another unit are an error; external torques in most of a log are stated, and a load is no contact."""
+    model, log, qdd = arm
+    fit = load_run(run)
+    with pytest.raises(LogError, match=r"2399 of 2400 samples .*2399 saturated.*torques in Nm"):
+        replay(fit, [dataclasses.replace(log, tau=1000 * log.tau)])
+    (reversed_sense,) = replay(fit, [dataclasses.replace(log, tau=-log.tau)])
+    assert "check that it is a log of this arm" in " ".join(reversed_sense.text().split())
+    (lifted,) = replay(fit, [dataclasses.replace(log, tau=loaded(model, log, qdd, PAYLOAD))])
+    assert "load before its report at 0" in lifted.text() and "  contact at 0." not in lifted.text()
+    assert "check that" not in lifted.text()

@@ -1,5 +1,6 @@
 """External torques by a first-order momentum observer (De Luca and Mattone, ICRA 2005), and detection of contacts."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,13 @@ class ContactObserver:
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
+        level: Mean square of the normalised residual in about the last half second, which multiplies its variance if it
+            exceeds 1, (n,). Residuals are larger in some motions than in others, for example if the arm vibrates. The
+            last two blocks of samples (see `Block`) are not part of the level, so that a contact does not raise the
+            threshold before it is detected. The squares are limited to `TUNING.level_limit`, so that slow contacts
+            raise the thresholds by a factor of at most two.
+        normalised: Magnitude of the external torque beyond the bound at rest, divided by its standard deviation, which
+            is compared with `NoiseLevels.thresholds`, (n,) [1].
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -53,7 +61,8 @@ class ContactObserver:
         self.t: float | None = None
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.baseline = np.zeros_like(self.levels.speed)
-        self.touched = np.zeros(len(self.baseline), dtype=bool)
+        self.level = self.recent = np.ones_like(self.baseline)
+        self.touched, self.squares, self.count = self.baseline > 0, np.zeros_like(self.baseline), 0
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Update the observer with a sample; return the external torques and the detected contact.
@@ -65,12 +74,25 @@ class ContactObserver:
             drift: Estimates of the drift filter, (n, 2): friction scale minus one [1], and disturbance [Nm, N].
         """
         signal, variance = self.residual(t, at, payload, drift)
-        noise = np.sqrt(variance + np.square(self.levels.observer))
-        threshold = self.levels.thresholds(self.alarms_per_minute) * noise
-        threshold += self.levels.resting_torque(at.velocity)
-        self.touched = np.abs(signal) > threshold
+        noise, resting = (
+            np.sqrt(variance + np.square(self.levels.observer)),
+            self.levels.resting_torque(at.velocity),
+        )
+        factor, normalised = (
+            np.sqrt(np.maximum(self.level, 1.0)),
+            np.maximum(np.abs(signal) - resting, 0.0) / noise,
+        )
+        threshold = self.levels.thresholds(self.alarms_per_minute) * factor * noise + resting
+        self.normalised, self.touched = normalised / factor, np.abs(signal) > threshold
+        limited = np.minimum(np.square(normalised), TUNING.level_limit)
+        self.squares, self.count = self.squares + np.where(self.touched, self.level, limited), self.count + 1
         force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)
+
+    def end_block(self) -> None:
+        """Update the level of the residual at the end of a block of samples."""
+        self.level = self.level + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.level)
+        self.recent, self.squares, self.count = self.squares / self.count, 0.0 * self.squares, 0
 
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray

@@ -93,9 +93,8 @@ class Estimator:
         self.estimate = PayloadEstimate(self.levels)
         self.drift = JointFilters.of_drift(self.levels.drift)
         self.observer = ContactObserver(self.levels, self.alarms_per_minute)
-        self.payload = NO_REPORT
         self.half: Block | None = None
-        self.reported = 0.0
+        self.payload, self.reported = NO_REPORT, 0.0
         self.contact = ContactState(np.zeros(n), np.zeros(n), np.zeros(n, dtype=bool), np.zeros(3))
 
     @property
@@ -112,8 +111,9 @@ class Estimator:
             qd: Velocities, (n,) [rad/s, m/s].
             tau: Measured torques, (n,) [Nm, N].
         """
-        (state,) = self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
-        return state
+        return next(
+            self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
+        )
 
     def replay(self, log: Trajectory) -> list[EstimatorState]:
         """Process all samples of a log; return the estimates after each sample."""
@@ -155,6 +155,7 @@ class Estimator:
         self.contact = self.observer.step(t, at, self.payload, self.drift.x)
         block = None if refusal == "saturated" else self.blocks.add(t, at)
         if block is not None:
+            self.observer.end_block()
             self.drift.update(block, block.y - block.load @ self.payload.parameters)
             if self.half is not None:
                 self.estimate.start(self.half.joined(block))
@@ -172,9 +173,11 @@ class Estimator:
         """
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
-        self.payload = find_payload(
+        self.payload = found = find_payload(
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
+        if before.status != "payload" and found.status == "payload" and self.estimate.misfit > TUNING.misfit:
+            self.payload = Payload("not yet", found.log_odds, found.limit)
         if (before.status == "payload") != (self.payload.status == "payload"):
             # The drift filter has assumed a wrong payload so far, and has attributed its torques to friction. The drift
             # filter is restarted from the friction scale of the payload filter.
@@ -205,8 +208,8 @@ class Estimator:
             friction = self.model.friction_torque(cache, at[1], *past)
             # The payload is fixed to the last body: its regressor is the last ten columns of the arm's regressor, which
             # belong to the last body.
-            regressor = regressor_of(self.model.chain, *at)[..., -10:]
-            load = regressor @ torch.from_numpy(self.payload.parameters)
+            parameters = torch.from_numpy(self.payload.parameters)
+            load = regressor_of(self.model.chain, *at)[..., -10:] @ parameters
             decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:
@@ -234,7 +237,5 @@ def torque_model(fit: Fit) -> RigidBodyDynamics:
             do="build the module with --preset hybrid and fit it",
         )  # fmt: skip
     if model.servo is not None:
-        raise RunError(
-            "a fit to position commands", element="estimator", expected="a fit to measured torques"
-        )
+        raise RunError("a fit to position commands", element="estimator", expected="a fit to torques")
     return copy.deepcopy(model).double().cpu().requires_grad_(False).eval()

@@ -123,8 +123,7 @@ class LoadFilter:
 
     def forget_load(self) -> None:
         """Reset the payload's parameters theta to their prior distribution, for a new payload."""
-        self.x[:10] = 0.0
-        self.P[:10] = self.P[:, :10] = 0.0
+        self.x[:10] = self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
@@ -152,12 +151,14 @@ class LoadFilter:
         residual = float(block.y[joint] - self.x[columns] @ row)
         # The influence of an outlier is bounded by a larger variance, which corresponds to Huber's weights.
         variance = max(expected, residual**2 / TUNING.outlier**2)
-        gain = covariance / variance
+        # Products have the order of the C code, so that rounding errors are equal.
+        weight = 1 / variance
+        gain = covariance * weight
         if block.moving[joint]:
             self.surprise += residual**2 / expected
             self.x += gain * residual
             # The product is exactly symmetric. An asymmetry of P from rounding errors would grow with each update.
-            product = np.outer(covariance, covariance) / variance
+            product = np.outer(covariance, covariance) * weight
             recurring = TUNING.recurring * (noise + self.disturbance[joint])
             kept = recurring / max(float(row[:10] @ self.P[:10, :10] @ row[:10]), recurring)
             self.P -= product
@@ -255,14 +256,14 @@ class PayloadEstimate:
         filters: the filter without a hypothesis, then the two copies, if any.
         moved: time in motion since the start or the last change of the payload [s].
         changed: True if a change of the payload was accepted, until the caller sets it to False.
+        misfit: mean of the normalised squared residuals of moving joints in about the last second [1].
     """
 
     def __init__(self, levels: NoiseLevels) -> None:
         self.filters = [LoadFilter(levels.load, levels.effort)]
         self.rows: Iterator[None] = iter(())
         self.moved = self.hypotheses_moved = 0.0
-        self.changed = False
-        self.samples = self.per_sample = 0
+        self.changed, self.misfit, self.samples, self.per_sample = False, 1.0, 0, 0
 
     def start(self, block: Block) -> None:
         """Finish the filter updates of the previous block, and prepare the updates of `block` for calls of `step`."""
@@ -301,14 +302,18 @@ class PayloadEstimate:
         moving: number of joints that moved in the block.
         """
         main = self.filters[0]
+        if moving:
+            self.misfit += 2 * TUNING.block / TUNING.report * (main.surprise / moving - self.misfit)
         if len(self.filters) > 1:
             _, candidate, contact = self.filters
             ratio = candidate.log_likelihood - max(main.log_likelihood, contact.log_likelihood)
             if self.hypotheses_moved >= TUNING.changed_after and ratio > TUNING.changed:
                 self.filters, self.changed, self.moved = [candidate], True, self.hypotheses_moved
+                self.misfit = 1.0
                 return
-            least = TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
-            if self.hypotheses_moved >= least:
+            if self.hypotheses_moved >= (
+                TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
+            ):
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
         # Hypotheses are not started in the first second of motion, in which residuals are large because the payload is

@@ -41,8 +41,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
     Raises RunError if they cannot be read, or if there are neither stored levels nor logs.
     """
-    levels = stored_levels(fit)
-    if levels is None:
+    if (levels := stored_levels(fit)) is None:
         if not fit.logs:
             raise RunError(
                 "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
@@ -73,10 +72,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         # body, at the origin of the last body.
         if tip.carrier == len(arm.chain.bodies) - 1:
             point = tip.pose[:3, 3]
-    tested = []
-    for k, fold in enumerate(folds):
-        others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
-        tested.append((fitted_to(fit, others), fold))
+    others = [[log for fold in folds[:k] + folds[k + 1 :] for log in fold] for k in range(len(folds))]
+    tested = [(fitted_to(fit, logs), fold) for logs, fold in zip(others, folds, strict=True)]
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
     # Serialization rounds the noise levels. The rounded levels are returned, so that they are equal to the levels that
     # are later read from the run folder.
@@ -130,11 +127,10 @@ def held_out(model: RigidBodyDynamics, log: Trajectory, levels: NoiseLevels) -> 
     refusals, terms = balance_along(model, levels, intake, log.t, (log.q, log.qd, log.tau))
     samples = []
     for t, refusal, at in zip(log.t.tolist(), refusals, terms, strict=True):
-        if at is None:
-            continue
-        if refusal == "gap":
-            blocks.restart()
-        samples.append(HeldOutSample(t, at, refusal == "gap", blocks.add(t, at)))
+        if at is not None:
+            if refusal == "gap":
+                blocks.restart()
+            samples.append(HeldOutSample(t, at, refusal == "gap", blocks.add(t, at)))
     return samples
 
 
@@ -151,22 +147,21 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # `levels` has no noise values at first, but the limits by which samples are accepted or refused: the noise is
     # estimated from the accepted samples.
+    # The torque limit in the URDF is replaced if logged torques exceed it.
+    limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
+    encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
-        speed=np.abs(joined_column(logs, "qd")).max(axis=0),
-        encoder=np.min([encoder_step(log.q) for log in logs], axis=0),
-        # The torque limit in the URDF is replaced if logged torques exceed it.
-        effort=np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest),
-        minutes=sum(log.duration for log in logs) / 60,
-        point=point,
-        delay=delay,
-    )
+        speed=np.abs(joined_column(logs, "qd")).max(axis=0), encoder=encoder, effort=limit,
+        minutes=sum(log.duration for log in logs) / 60, point=point, delay=delay,
+    )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
-    return _with_observer(levels, tested)
+    return _with_observer(
+        levels.model_copy(update={"load_variance": factor, "load_freedom": freedom}), tested
+    )
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
@@ -215,8 +210,7 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
     typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
     scale = np.tile(typical, (len(grid), 1))
     for _ in range(3):
-        _cost, squares = _likelihood(segments, grid, scale)
-        scale = scale * np.sqrt(squares)
+        scale = scale * np.sqrt(_likelihood(segments, grid, scale)[1])
     best = _likelihood(segments, grid, scale)[0].argmin(axis=0)
     white = scale[best, np.arange(len(best))]
     return BlockNoise(white=white, disturbance=white * grid[best, 1], time_constant=grid[best, 0])
@@ -260,18 +254,34 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     The new fields `observer`, `resting`, `resting_speed`, `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`
     determine the contact thresholds. levels: noise levels without these fields. tested: held-out samples of each log.
     """
-    residuals = [_observer_residuals(levels, samples) for samples in tested]
-    signal, _variance, qd = (np.concatenate(column) for column in zip(*residuals, strict=True))
+    ones = np.ones(len(levels.speed))
+    # The logs have no contacts: with infinite thresholds the observer detects none.
+    names = ("observer", "resting", "resting_speed", "peak_start", "peak_scale", "peak_count")
+    values = (ones, 0 * ones, ones, np.inf * ones, 0 * ones, 1.0)
+    levels = levels.model_copy(update=dict(zip(names, values, strict=True)))
+    signal = np.concatenate([_observed(levels, samples)[0] for samples in tested])
+    qd = np.array([sample.at.velocity for samples in tested for sample in samples])
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))
     peaks = []
-    for samples, (signal, variance, qd) in zip(tested, residuals, strict=True):
-        beyond = np.maximum(np.abs(signal) - levels.resting_torque(qd), 0)
-        ratio = beyond / np.sqrt(variance + np.square(levels.observer))
+    for samples in tested:
         # Large residuals at neighbouring samples are one event, so a peak is the largest value in a time window.
-        times = np.array([sample.t for sample in samples])
-        starts = np.flatnonzero(np.diff(times // TUNING.window, prepend=np.nan))
-        peaks.append(np.maximum.reduceat(ratio, starts, axis=0))
+        starts = np.flatnonzero(np.diff([sample.t // TUNING.window for sample in samples], prepend=np.nan))
+        peaks.append(np.maximum.reduceat(_observed(levels, samples)[1], starts, axis=0))
     return levels.model_copy(update=held_out_tail(peaks, levels))
+
+
+def _observed(levels: NoiseLevels, samples: Sequence[HeldOutSample]) -> np.ndarray:
+    """Return external torques, and `ContactObserver.normalised`, at T held-out samples, (2, T, n)."""
+    observer, drift = ContactObserver(levels, TUNING.alarms_per_minute), JointFilters.of_drift(levels.drift)
+    rows = []
+    for t, at, is_resumed, block in samples:
+        if is_resumed:
+            observer.restart()
+        rows.append((observer.step(t, at, NO_REPORT, drift.x).external_torque, observer.normalised))
+        if block is not None:
+            observer.end_block()
+            drift.update(block, block.y)
+    return np.array(rows).swapaxes(0, 1)
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
@@ -295,26 +305,6 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
         excess += (peaks_of_log / others.thresholds(TUNING.alarms_per_minute)).max(axis=1).tolist()
     allowed = int(TUNING.alarms_per_minute * len(excess) * TUNING.window / 60)
     return _peak_tail(peaks, max(sorted(excess, reverse=True)[allowed], TUNING.other_days))
-
-
-def _observer_residuals(
-    levels: NoiseLevels, samples: Sequence[HeldOutSample]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the torque residual of the momentum observer, its variance, and qd, (T, n) each, at T held-out samples.
-
-    levels: noise levels; the noise of the observer is not yet known, and is not part of the variance.
-    """
-    observer = ContactObserver(levels, TUNING.alarms_per_minute)
-    drift = JointFilters.of_drift(levels.drift)
-    columns = []
-    for t, at, is_resumed, block in samples:
-        if is_resumed:
-            observer.restart()
-        columns.append((*observer.residual(t, at, NO_REPORT, drift.x), at.velocity))
-        if block is not None:
-            drift.update(block, block.y)
-    signal, variance, speed = (np.array(column) for column in zip(*columns, strict=True))
-    return signal, variance, speed
 
 
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
@@ -347,7 +337,7 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
     estimated for each grid point.
 
     Args:
-        signal: torque residual of the observer, (T, n) [Nm, N].
+        signal: external torques of logs without contacts, (T, n) [Nm, N].
         qd: velocities, (T, n) [rad/s, m/s].
         levels: the values of v on the grid are fractions of `speed`, the largest speeds; s has a lower bound
             proportional to `effort`, the torque limits.

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from spelgen.errors import LogError
 from spelgen.fitting.fitted import Fit
 from spelgen.labels import torque_units
 from spelgen.listing import WIDTH
@@ -15,6 +16,9 @@ from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import Trajectory, require_torques
+
+FOREIGN = """  external torques exceed their thresholds in most of the log: check that it is a log of this arm, and the
+units, senses and zeros of its positions and torques"""
 
 
 @dataclass(frozen=True)
@@ -67,36 +71,33 @@ class LogEstimate:
     def to_dict(self) -> dict[str, object]:
         """Return the estimates as content of a JSON file: times [s], payload, contacts, friction drift [%]."""
         return {
-            "log": self.log.name,
-            "seconds": self.log.duration,
-            "payload": payload_content(self.payload),
-            "payload_since": self.since,
-            "load_changes": list(self.changes),
-            "contacts": [vars(contact) for contact in self.contacts],
-            "friction_drift_percent": self.drift,
+            "log": self.log.name, "seconds": self.log.duration, "payload": payload_content(self.payload),
+            "payload_since": self.since, "load_changes": list(self.changes),
+            "contacts": [vars(contact) for contact in self.contacts], "friction_drift_percent": self.drift,
             "refused": self.refused,
-        }
+        }  # fmt: skip
 
     def text(self) -> str:
         """Return the estimates as text for users, with a line per contact."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
-        if self.since is not None:
-            lines.append(f"  a payload was reported first at {self.since:.1f} s")
+        reports = [] if self.since is None else [self.since]
+        lines += [f"  a payload was reported first at {at:.1f} s" for at in reports]
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
-        for contact in self.contacts:
-            pairs = zip(contact.joints, contact.torques, strict=True)
+        for each in self.contacts:
+            # Until its report, a payload is an external torque.
+            is_load = any(each.begin < at < each.end + TUNING.merged for at in (*reports, *self.changes))
+            name = "load before its report" if is_load else "contact"
+            pairs = zip(each.joints, each.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
-            lines.append(
-                f"  contact at {contact.begin:.2f} to {contact.end:.2f} s: {torques} {self.unit}; "
-                f"{contact.force:.3g} N at the tip"
-            )
-        if not self.contacts:
-            lines.append("  no contact")
+            span = f"{each.begin:.2f} to {each.end:.2f} s"
+            lines.append(f"  {name} at {span}: {torques} {self.unit}; {each.force:.3g} N at the tip")
+        lines += [] if self.contacts else ["  no contact"]
+        if np.mean([state.contact.touched.any() for state in self.states]) > 0.5:
+            lines.append(FOREIGN)
         drift = ", ".join(f"{joint} {percent:+.1f} %" for joint, percent in self.drift.items())
         lines.append(f"  friction at the end, relative to the model: {drift}")
-        if self.refused:
-            refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
-            lines.append(f"  samples that were not used, or only in part: {refused}")
+        refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
+        lines += [f"  samples that were not used, or only in part: {refused}"] if refused else []
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
@@ -106,9 +107,8 @@ def payload_content(payload: Payload) -> dict[str, object]:
     if np.isfinite(payload.limit):
         content["mass_limit"] = payload.limit
     if payload.status == "payload":
-        for name in ("mass", "center", "inertia"):
-            for field in (name, f"{name}_interval"):
-                content[field] = np.asarray(vars(payload)[field]).tolist()
+        fields = [f"{name}{end}" for name in ("mass", "center", "inertia") for end in ("", "_interval")]
+        content |= {name: np.asarray(vars(payload)[name]).tolist() for name in fields}
         content["parameters"] = payload.parameters.tolist()
     return content
 
@@ -136,7 +136,7 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         logs: logs of the same arm.
         alarms_per_minute: rate of false contact alarms [1/min]; None: default.
 
-    Raises LogError for logs that cannot be used, such as positions in degrees.
+    Raises LogError for logs that cannot be used, such as positions in degrees or torques in other units.
     """
     require_torques(logs)
     joints, results = fit.model.joint_names, []
@@ -145,20 +145,22 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     for log in logs:
         estimator.reset()
         states = estimator.replay(log)
+        unused = sum(estimator.refused.values())
+        if unused > len(log) / 2:
+            counts = ", ".join(f"{count} {reason}" for reason, count in estimator.refused.items())
+            raise LogError(
+                f"{unused} of {len(log)} samples that the estimator cannot use ({counts})", element=log.name,
+                expected="torques below the limits and speeds as in the training logs, at least every 0.25 s",
+                do="check that it is a log of this arm, and its units: torques in Nm, positions in rad",
+            )  # fmt: skip
         times = log.t - log.t[0]
-        reported = [state.payload.status == "payload" for state in states]
-        drift = 100 * (states[-1].friction_scale - 1)
+        found = times[[state.payload.status == "payload" for state in states]].tolist()
+        changes = tuple(times[[state.load_changed for state in states]].tolist())
+        drift = dict(zip(joints, np.round(100 * (states[-1].friction_scale - 1), 2).tolist(), strict=True))
+        contacts, unit = tuple(contact_events(states, joints)), torque_units(fit.model.joint_types)
         results.append(LogEstimate(
-            log=log,
-            joints=joints,
-            unit=torque_units(fit.model.joint_types),
-            states=states,
-            payload=states[-1].payload,
-            since=float(times[reported][0]) if any(reported) else None,
-            changes=tuple(times[[state.load_changed for state in states]].tolist()),
-            contacts=tuple(contact_events(states, joints)),
-            drift={joint: round(percent, 2) for joint, percent in zip(joints, drift.tolist(), strict=True)},
-            refused=estimator.refused,
+            log, joints, unit, states, states[-1].payload, next(iter(found), None), changes, contacts, drift,
+            estimator.refused,
         ))  # fmt: skip
     return results
 
@@ -191,13 +193,8 @@ def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> l
         # `peaks` are the samples of the largest external torque of each joint in contact, among the samples at which
         # the torque exceeds the threshold of the joint.
         peaks = np.where(touched, np.abs(torques), 0.0).argmax(axis=0)[named]
-        events.append(
-            ContactEvent(
-                begin=group[0].t - states[0].t,
-                end=group[-1].t - states[0].t,
-                joints=tuple(joints[k] for k in named),
-                torques=tuple(torques[peaks, named].tolist()),
-                force=float(max(np.linalg.norm(state.contact.force) for state in group)),
-            )
-        )
+        force = float(max(np.linalg.norm(state.contact.force) for state in group))
+        begin, end = group[0].t - states[0].t, group[-1].t - states[0].t
+        names, largest = tuple(joints[k] for k in named), tuple(torques[peaks, named].tolist())
+        events.append(ContactEvent(begin, end, names, largest, force))
     return events

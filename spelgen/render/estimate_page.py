@@ -63,12 +63,10 @@ def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
         ("threshold, other direction", -threshold, "hold"),
     ]
     # Friction is shown as change in percent: a drift of a few percent is not visible on an axis that starts at zero.
-    scale = 100 * (np.array([state.friction_scale for state in result.states]) - 1)
+    friction = [("friction drift", 100 * (np.array([x.friction_scale for x in result.states]) - 1), "c3")]
     rows = [
         JointRow("external torque", "external torque", "torque", torque),
-        JointRow(
-            "friction relative to the model", "friction [%]", "", [("friction drift", scale, "c3")], 100
-        ),
+        JointRow("friction relative to the model", "friction [%]", "", friction, 100),
     ]
     return stacks(_times(result), rows, named_joints(result.joints, fit.model.joint_types))
 
