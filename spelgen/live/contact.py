@@ -62,7 +62,8 @@ class ContactObserver:
         self.inputs = self.low = np.zeros((15, len(self.levels.speed)))
         self.baseline = np.zeros_like(self.levels.speed)
         self.level = self.recent = np.ones_like(self.baseline)
-        self.touched, self.squares, self.count = self.baseline > 0, np.zeros_like(self.baseline), 0
+        self.touched = np.zeros(len(self.baseline), dtype=bool)
+        self.squares, self.count = np.zeros_like(self.baseline), 0
 
     def step(self, t: float, at: Balance, payload: Payload, drift: np.ndarray) -> ContactState:
         """Update the observer with a sample; return the external torques and the detected contact.
@@ -74,25 +75,25 @@ class ContactObserver:
             drift: Estimates of the drift filter, (n, 2): friction scale minus one [1], and disturbance [Nm, N].
         """
         signal, variance = self.residual(t, at, payload, drift)
-        noise, resting = (
-            np.sqrt(variance + np.square(self.levels.observer)),
-            self.levels.resting_torque(at.velocity),
-        )
-        factor, normalised = (
-            np.sqrt(np.maximum(self.level, 1.0)),
-            np.maximum(np.abs(signal) - resting, 0.0) / noise,
-        )
+        noise = np.sqrt(variance + np.square(self.levels.observer))
+        resting = self.levels.resting_torque(at.velocity)
+        factor = np.sqrt(np.maximum(self.level, 1.0))
         threshold = self.levels.thresholds(self.alarms_per_minute) * factor * noise + resting
-        self.normalised, self.touched = normalised / factor, np.abs(signal) > threshold
+        self.touched = np.abs(signal) > threshold
+        normalised = np.maximum(np.abs(signal) - resting, 0.0) / noise
+        self.normalised = normalised / factor
+        # A detected contact does not change the level.
         limited = np.minimum(np.square(normalised), TUNING.level_limit)
-        self.squares, self.count = self.squares + np.where(self.touched, self.level, limited), self.count + 1
+        self.squares = self.squares + np.where(self.touched, self.level, limited)
+        self.count += 1
         force = tip_force(at.jacobian, -signal, threshold) if self.touched.any() else np.zeros(3)
         return ContactState(-signal, threshold, self.touched, force)
 
     def end_block(self) -> None:
         """Update the level of the residual at the end of a block of samples."""
         self.level = self.level + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.level)
-        self.recent, self.squares, self.count = self.squares / self.count, 0.0 * self.squares, 0
+        self.recent = self.squares / self.count
+        self.squares, self.count = np.zeros_like(self.squares), 0
 
     def residual(
         self, t: float, at: Balance, payload: Payload, drift: np.ndarray

@@ -111,9 +111,8 @@ class Estimator:
             qd: Velocities, (n,) [rad/s, m/s].
             tau: Measured torques, (n,) [Nm, N].
         """
-        return next(
-            self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
-        )
+        (state,) = self.steps(np.array([t], dtype=float), *(np.array([x], dtype=float) for x in (q, qd, tau)))
+        return state
 
     def replay(self, log: Trajectory) -> list[EstimatorState]:
         """Process all samples of a log; return the estimates after each sample."""
@@ -173,11 +172,13 @@ class Estimator:
         """
         main, before = self.estimate.filters[0], self.payload
         self.reported = self.estimate.moved
-        self.payload = found = find_payload(
+        payload = find_payload(
             main.x[:10], main.P[:10, :10], self.levels.load_variance, self.levels.load_quantile
         )
-        if before.status != "payload" and found.status == "payload" and self.estimate.misfit > TUNING.misfit:
-            self.payload = Payload("not yet", found.log_odds, found.limit)
+        is_new = before.status != "payload" and payload.status == "payload"
+        if is_new and self.estimate.misfit > TUNING.misfit:
+            payload = Payload("not yet", payload.log_odds, payload.limit)
+        self.payload = payload
         if (before.status == "payload") != (self.payload.status == "payload"):
             # The drift filter has assumed a wrong payload so far, and has attributed its torques to friction. The drift
             # filter is restarted from the friction scale of the payload filter.

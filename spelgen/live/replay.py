@@ -83,21 +83,23 @@ class LogEstimate:
         reports = [] if self.since is None else [self.since]
         lines += [f"  a payload was reported first at {at:.1f} s" for at in reports]
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
-        for each in self.contacts:
+        for event in self.contacts:
             # Until its report, a payload is an external torque.
-            is_load = any(each.begin < at < each.end + TUNING.merged for at in (*reports, *self.changes))
+            is_load = any(event.begin < at < event.end + TUNING.merged for at in (*reports, *self.changes))
             name = "load before its report" if is_load else "contact"
-            pairs = zip(each.joints, each.torques, strict=True)
+            pairs = zip(event.joints, event.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
-            span = f"{each.begin:.2f} to {each.end:.2f} s"
-            lines.append(f"  {name} at {span}: {torques} {self.unit}; {each.force:.3g} N at the tip")
-        lines += [] if self.contacts else ["  no contact"]
+            span = f"{event.begin:.2f} to {event.end:.2f} s"
+            lines.append(f"  {name} at {span}: {torques} {self.unit}; {event.force:.3g} N at the tip")
+        if not self.contacts:
+            lines.append("  no contact")
         if np.mean([state.contact.touched.any() for state in self.states]) > 0.5:
             lines.append(FOREIGN)
         drift = ", ".join(f"{joint} {percent:+.1f} %" for joint, percent in self.drift.items())
         lines.append(f"  friction at the end, relative to the model: {drift}")
-        refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
-        lines += [f"  samples that were not used, or only in part: {refused}"] if refused else []
+        if self.refused:
+            refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
+            lines.append(f"  samples that were not used, or only in part: {refused}")
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
@@ -154,13 +156,14 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
                 do="check that it is a log of this arm, and its units: torques in Nm, positions in rad",
             )  # fmt: skip
         times = log.t - log.t[0]
-        found = times[[state.payload.status == "payload" for state in states]].tolist()
-        changes = tuple(times[[state.load_changed for state in states]].tolist())
-        drift = dict(zip(joints, np.round(100 * (states[-1].friction_scale - 1), 2).tolist(), strict=True))
-        contacts, unit = tuple(contact_events(states, joints)), torque_units(fit.model.joint_types)
+        reported = times[[state.payload.status == "payload" for state in states]].tolist()
+        drift = np.round(100 * (states[-1].friction_scale - 1), 2).tolist()
         results.append(LogEstimate(
-            log, joints, unit, states, states[-1].payload, next(iter(found), None), changes, contacts, drift,
-            estimator.refused,
+            log=log, joints=joints, unit=torque_units(fit.model.joint_types), states=states,
+            payload=states[-1].payload, since=next(iter(reported), None),
+            changes=tuple(times[[state.load_changed for state in states]].tolist()),
+            contacts=tuple(contact_events(states, joints)), drift=dict(zip(joints, drift, strict=True)),
+            refused=estimator.refused,
         ))  # fmt: skip
     return results
 
