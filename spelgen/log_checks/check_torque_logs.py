@@ -271,11 +271,14 @@ class TorqueLogs:
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
-        # If a hypothesis changes the unit of only one joint's torque, the evidence is the magnitude of gravity in this
-        # torque. A wrong link of the URDF changes it as well, so warnings about links are added.
+        # If a hypothesis changes only the units of the torques of some joints, a wrong link of the URDF may explain
+        # these torques as well, so warnings about links are added. Fewer links than joints are the simpler explanation.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
-        if changed.sum() == 1 and not any(fault.needed for fault in faults):
-            yield from _link_notes(problem, unchanged)
+        if not changed.all(axis=1).any() and not any(fault.needed for fault in faults):
+            notes = list(_link_notes(problem, unchanged))
+            yield from notes
+            if 0 < len(notes) < changed.sum():
+                return
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
     def _faults(self, problem: GeometryProblem) -> tuple[Fault, ...]:
