@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import cast
+from typing import Self, cast
 
 import torch
 from pydantic import TypeAdapter, ValidationError
@@ -39,8 +39,8 @@ Errors = dict[str, dict[str, float | None]]
 class RunResult:
     """Figures of a finished run.
 
-    seconds: duration of the training [s]. parameters: number of
-    trained parameters that the model uses. errors: {measure: {predictor: error}}; the first measure ranks the models.
+    seconds: duration of the training [s]. parameters: number of trained parameters that the model uses. errors:
+    {measure: {predictor: error}}; the first measure ranks the models.
     sizes: further figures of the model of a simulated arm, see `simulated_figures`; {} for logs of the user.
     """
 
@@ -52,6 +52,14 @@ class RunResult:
     parameters: int
     errors: Errors
     sizes: Figures
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Return the result in a file result.json. Raises RunError if the file is malformed."""
+        try:
+            return TypeAdapter(cls).validate_python(read_json(path, RunError))
+        except ValidationError as error:
+            raise RunError("not the values of a result", file=path, do="remove it") from error
 
 
 class Job(Group):
@@ -109,10 +117,7 @@ class Job(Group):
         path = self.folder / "result.json"
         if not path.is_file():
             return None
-        try:
-            return TypeAdapter(RunResult).validate_python(read_json(path, RunError))
-        except ValidationError as error:
-            raise RunError("not the values of a result", file=path, do="remove it") from error
+        return RunResult.read(path)
 
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
         """Return the configuration of the fit of the model.

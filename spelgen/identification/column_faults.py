@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from spelgen.arm.arm import Chain
 from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
@@ -234,19 +235,32 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield least-squares fits of torques with a common factor, with factors of few joints, and of all joints.
 
-        A factor of a single joint must clearly lower the cost: the load of the last joint, for example, is determined
-        only by the masses of the URDF.
+        A factor of a single joint must lower the cost by more than `rarity`: only the masses of the URDF determine the
+        load of the last joint, for example.
         """
         extended, reading = problem.with_free_gains(), base.hypothesis
-        opposite = extended.fit(reading.changed(self, scale=reading.scale * np.array([[1.0], [-1.0]]))).gains
-        if is_other_unit(self._common(opposite)):
-            yield self._scaled(problem, base, np.full(len(opposite), -rounded_factor(self._common(opposite))))
+        signals = reading.signals(problem.samples)
+        of_urdf = signals.tau + problem.residual(reading, problem.prior_mean)
+        correlated = np.where((signals.tau * of_urdf).sum(axis=0) < 0, -1.0, 1.0)
+        # The torques of all joints, or of those whose torque opposes the URDF's, may also have the opposite sense.
+        for sense in np.unique([-np.ones_like(correlated), correlated], axis=0):
+            opposite = extended.fit(
+                reading.changed(self, scale=reading.scale * np.stack([np.ones_like(sense), sense]))
+            )
+            factors = opposite.gains
+            if (sense < 0).all():
+                factors = np.full_like(factors, self._common(factors))
+            is_changed = (sense < 0) & self._is_open & is_other_unit(factors)
+            if is_changed.any():
+                factors = np.where(is_changed, [-rounded_factor(x) for x in factors], 1.0)
+                scaled = self._of_masses if is_changed.all() else self._scaled
+                yield scaled(problem, base, factors)
         gains = np.where(self._is_open, extended.fit(reading).gains, 1.0)
         common = self._common(gains)
         shared = rounded_factor(common) if is_other_unit(common) else 1.0
         factors, best = np.full(len(gains), shared), base
         if shared != 1.0:
-            best = self._scaled(problem, base, factors)
+            best = self._of_masses(problem, base, factors)
             yield best
         differing = is_other_unit(gains / common)
         # relative to the other joints or by the masses of the URDF, whichever explains the torques better
@@ -257,7 +271,7 @@ class TorqueUnit(WrongScale):
         for k in np.flatnonzero(differing):
             fewer = np.where(np.arange(len(gains)) == k, shared, factors)
             without = self._scaled(problem, base, fewer)
-            if without.cost < fit.cost + GEOMETRY.ambiguous:
+            if without.cost < fit.cost + self.rarity:
                 factors, fit, gains[k] = fewer, without, common
         if (factors != shared).any():
             yield fit
@@ -271,6 +285,18 @@ class TorqueUnit(WrongScale):
             is_better = min(best.cost - fit.cost, 2 * (best.misfit - fit.misfit)) > GEOMETRY.needed
             if is_better and fit.errors.max() <= GEOMETRY.unexplained:
                 yield fit
+
+    def _of_masses(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
+        """Return the fit of lowest cost if a number from 1/3 to 3 multiplies all factors (n,) that are not 1."""
+
+        def multiplied(exponent: float) -> HypothesisFit:
+            return self._scaled(problem, fit, np.where(factors == 1.0, 1.0, factors * np.exp(exponent)))
+
+        options = {"xatol": 0.05}
+        found = minimize_scalar(
+            lambda x: multiplied(x).cost, bounds=(-np.log(3), np.log(3)), method="bounded", options=options
+        )
+        return multiplied(found.x)
 
     def _common(self, gains: np.ndarray) -> float:
         """Return the gain with which most of n gains agree, up to a ratio of 2, and the one nearest to 1 of several.

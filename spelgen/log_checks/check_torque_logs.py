@@ -273,13 +273,14 @@ class TorqueLogs:
             return
         # If a hypothesis changes only the units of the torques of some joints, a wrong link of the URDF may explain
         # these torques as well, so warnings about links are added. Fewer links than joints are the simpler explanation.
+        finding = geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if not changed.all(axis=1).any() and not any(fault.needed for fault in faults):
             notes = list(_link_notes(problem, unchanged))
             yield from notes
-            if 0 < len(notes) < changed.sum():
+            if isinstance(finding, Diagnostic) and 0 < len(notes) < changed.sum():
                 return
-        yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
+        yield finding
 
     def _faults(self, problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test, see `kinds_of_faults`.
@@ -323,9 +324,9 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
         # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
-        # The cost without gravity must be clearly lower: a wrong centre of mass of the last link has a similar effect.
+        # The cost must fall by a penalty of rare faults: a wrong centre of mass of the last link has a similar effect.
         without = problem.without_gravity(k).fit(problem.unchanged).cost
-        if fit.errors[k] > 0.1 or without < fit.cost - GEOMETRY.ambiguous:
+        if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
                 f"torque varies {deviation:.2g} times as much as tau"

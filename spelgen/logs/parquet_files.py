@@ -76,7 +76,8 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
     for names in (states, actions):
         missing = [name for name in logged.values() if name not in names]
         if missing:
-            do = names_line(logged, names) if names else f"write them as 'names' of the features into {INFO}"
+            absent = {joint: name for joint, name in logged.items() if name in missing}
+            do = names_line(absent, names) if names else f"write them as 'names' of the features into {INFO}"
             raise LogError(
                 f"the motors {', '.join(names) or 'without names'}", file=folder / INFO,
                 expected=f"{', '.join(missing)} among them", do=do,
