@@ -229,33 +229,6 @@ def test_another_unit_is_offered_as_gain(arm):
     np.testing.assert_allclose(np.log(gains), np.log(0.003), atol=np.log(2))
 
 
-def gains_in(text, arm):
-    """Return the gains (n,) that a finding advises; 1 for joints without one."""
-    told = dict(re.findall(r"(\w+): \{gain: ([\d.e-]+)\}", text))
-    return np.array([float(told.get(joint, 1.0)) for joint in arm.chain.joint_names])
-
-
-@pytest.mark.parametrize("arm", ["four_dof", "ur10e"], indirect=True)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_each_joint_of_another_unit_gets_its_own_gain(arm, seed):
-    """Percent of the rated torque of each joint: ratios are known from the coupling of the joints."""
-    log, rng = recorded(arm, seed), np.random.default_rng(seed)
-    rated = np.abs(log.tau).max(axis=0) * rng.uniform(1.5, 4.0, log.q.shape[1]) / 100
-    errors = np.log(gains_in(told(arm, replace(log, tau=log.tau / rated)), arm) / rated)
-    # gains are rounded to 10 %
-    assert np.ptp(errors) < 0.3 and np.abs(errors).max() < np.log(2.5), errors
-
-
-@pytest.mark.parametrize("arm", ["four_dof", "ur10e"], indirect=True)
-@pytest.mark.parametrize("factor", [0.02, 60.0])
-def test_a_single_joint_of_another_unit_has_the_only_gain(arm, factor):
-    log = recorded(arm, 4)
-    unit = np.where(np.arange(log.q.shape[1]) == 2, factor, 1.0)
-    gains = gains_in(told(arm, replace(log, tau=log.tau / unit)), arm)
-    assert (gains != 1.0).nonzero()[0].tolist() == [2]
-    assert abs(np.log(gains[2] / factor)) < 0.3
-
-
 @pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
 def test_effort_limits_of_a_draft_are_no_evidence_of_another_unit(arm):
     """Torques that agree with the URDF's gravity are in Nm, although the URDF states an effort limit of 1 Nm."""

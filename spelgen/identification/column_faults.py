@@ -213,112 +213,79 @@ class TorqueSense(WrongScale):
 class TorqueUnit(WrongScale):
     """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
-    The factors are fitted together with the inertial parameters: the dynamic coupling of the joints determines their
-    ratios, and the masses of the URDF determine their common factor. A common factor need not lower the cost, unlike
-    other faults: the fit without it may explain torques that are too small with bodies that are too light.
+    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
+    candidate need not lower the cost much, unlike other faults: the fit without it may explain torques that are too
+    small with bodies that are too light.
     """
 
     code = "torque-unit"
     rarity = 2
     needed = 0.0
-    evidence = "by the URDF's masses"
+    evidence = "by the URDF's gravity"
 
-    def __init__(self, is_open: np.ndarray, is_milli: np.ndarray) -> None:
-        """Define the joints that are tested.
+    def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
+        """Define the candidates for corrections of the torques' unit.
 
-        is_open: (n,) True for joints whose torque may have another unit: the mapping states mNm or none. is_milli: (n,)
-        True for torques declared in mNm.
+        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
+        may have another unit: the mapping states mNm or none. is_milli: (n,) True for torques declared in mNm.
         """
         super().__init__([])
-        self._is_open, self._is_milli = is_open, is_milli
+        self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of torques with a common factor, with factors of few joints, and of all joints.
+        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        A factor of a single joint must lower the cost by more than `rarity`: only the masses of the URDF determine the
-        load of the last joint, for example.
+        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
+        yielded, too.
         """
-        extended, reading = problem.with_free_gains(), base.hypothesis
-        signals = reading.signals(problem.samples)
-        of_urdf = signals.tau + problem.residual(reading, problem.prior_mean)
-        correlated = np.where((signals.tau * of_urdf).sum(axis=0) < 0, -1.0, 1.0)
-        # The torques of all joints, or of those whose torque opposes the URDF's, may also have the opposite sense.
-        for sense in np.unique([-np.ones_like(correlated), correlated], axis=0):
-            opposite = extended.fit(
-                reading.changed(self, scale=reading.scale * np.stack([np.ones_like(sense), sense]))
-            )
-            factors = opposite.gains
-            if (sense < 0).all():
-                factors = np.full_like(factors, self._common(factors))
-            is_changed = (sense < 0) & self._is_open & is_other_unit(factors)
-            if is_changed.any():
-                factors = np.where(is_changed, [-rounded_factor(x) for x in factors], 1.0)
-                scaled = self._of_masses if is_changed.all() else self._scaled
-                yield scaled(problem, base, factors)
-        gains = np.where(self._is_open, extended.fit(reading).gains, 1.0)
-        common = self._common(gains)
-        shared = rounded_factor(common) if is_other_unit(common) else 1.0
-        factors, best = np.full(len(gains), shared), base
-        if shared != 1.0:
-            best = self._of_masses(problem, base, factors)
+        is_open, is_found = self._is_open, self in base.hypothesis.faults
+        candidates = [] if is_found else [x.copy() for x in self._torque_factors]
+        if is_open.all():
+            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
+            # torque to the URDF's. The torque factor is therefore computed again from this ratio; this also corrects an
+            # earlier factor with a wrong sense.
+            fitted, of_urdf = problem.gravity_torques(base)
+            ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
+            if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
+                candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+        if not candidates:
+            return
+        for factor in candidates:
+            # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
+            # is inexact because the masses of the URDF are.
+            is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
+            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
+        fits = list(self._scaled_by(scales, problem, base))
+        yield from fits
+        if is_found:
+            return
+        best = lowest = min(fits, key=lambda fit: fit.cost)
+        # The torque factors are optimised for one joint after the other: the dynamic coupling of the joints determines
+        # their ratios. Then a common factor of all joints is optimised, which the masses of the URDF determine.
+        for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
+            exponent = minimize_scalar(
+                lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
+                bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
+            ).x  # fmt: skip
+            best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
+        # Separate factors of the joints are accepted under three conditions. They also correct errors of the URDF's
+        # masses, which lowers the cost a little: (1) therefore at least one factor must be large enough for another
+        # unit, and (2) the cost decrease must be significant. (3) The relative residual of each joint must be small,
+        # since no factor explains torques with another fault, such as a lost sign.
+        is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
+        is_explained = best.errors.max() <= GEOMETRY.unexplained
+        if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
             yield best
-        differing = is_other_unit(gains / common)
-        # relative to the other joints or by the masses of the URDF, whichever explains the torques better
-        options = []
-        for ratio in (shared / common, 1.0):
-            options.append(np.where(differing, list(map(rounded_factor, ratio * gains)), factors))
-        fit, factors = min(((self._scaled(problem, base, x), x) for x in options), key=lambda x: x[0].cost)
-        for k in np.flatnonzero(differing):
-            fewer = np.where(np.arange(len(gains)) == k, shared, factors)
-            without = self._scaled(problem, base, fewer)
-            if without.cost < fit.cost + self.rarity:
-                factors, fit, gains[k] = fewer, without, common
-        if (factors != shared).any():
-            yield fit
-            best = min(best, fit, key=lambda x: x.cost)
-        # Separate factors also correct errors of the URDF's masses, which lowers the prior term of the cost: they must
-        # be large enough for another unit, lower the torque residual, too, and explain the torque of each joint. Joints
-        # with about the same factor get the same one.
-        gains[np.abs(np.log(gains / common)) < np.log(1.5)] = common
-        if is_other_unit(gains / gains[:, None]).any() or is_other_unit(gains).any():
-            fit = self._scaled(problem, base, gains)
-            is_better = min(best.cost - fit.cost, 2 * (best.misfit - fit.misfit)) > GEOMETRY.needed
-            if is_better and fit.errors.max() <= GEOMETRY.unexplained:
-                yield fit
-
-    def _of_masses(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the fit of lowest cost if a number from 1/3 to 3 multiplies all factors (n,) that are not 1."""
-
-        def multiplied(exponent: float) -> HypothesisFit:
-            return self._scaled(problem, fit, np.where(factors == 1.0, 1.0, factors * np.exp(exponent)))
-
-        options = {"xatol": 0.05}
-        found = minimize_scalar(
-            lambda x: multiplied(x).cost, bounds=(-np.log(3), np.log(3)), method="bounded", options=options
-        )
-        return multiplied(found.x)
-
-    def _common(self, gains: np.ndarray) -> float:
-        """Return the gain with which most of n gains agree, up to a ratio of 2, and the one nearest to 1 of several.
-
-        1 is returned if the unit of some joints is right.
-        """
-        logarithms = np.log(gains)
-        agreeing = (np.abs(logarithms[:, None] - logarithms) < np.log(2)).sum(axis=1)
-        best = np.lexsort((np.abs(logarithms), -agreeing))[0]
-        return float(gains[best]) if self._is_open.all() else 1.0
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the least-squares fit of the torques after multiplication by `factors` (n,), rounded to three digits.
+        """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
 
-        For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor is
-        inexact because the masses of the URDF are.
+        The product of `factors` and the correction factors in `fit` is rounded to two digits before the fit.
         """
-        rounded = np.array([float(f"{x:.3g}") for x in factors])
-        is_unit = self._is_milli & ~is_other_unit(rounded / 1e3)
-        rounded[is_unit] = np.copysign(1e3, rounded[is_unit])
-        motion, torque = fit.hypothesis.scale
-        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * torque])))
+        (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
+        rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
+        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose torque has another unit than the mapping states.

@@ -122,6 +122,15 @@ class GeometryProblem:
         other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
         return other
 
+    def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
+        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
+
+        The hypothesis of `fit` determines the positions and the vector of gravity.
+        """
+        weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
+        columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
+        return columns @ fit.parameters, columns @ self.prior_mean
+
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of a fit's torques due to the covariance of its parameters."""
         rows, _ = self.equations(fit.hypothesis)

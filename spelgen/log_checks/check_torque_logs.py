@@ -36,6 +36,7 @@ from spelgen.log_checks.robot_checks import (
     TUNING,
     JointEvidence,
     fit_gravity,
+    torque_factors,
 )
 from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
@@ -258,7 +259,7 @@ class TorqueLogs:
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
-        unchanged, *better = compare_hypotheses(problem, self._faults(problem))
+        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
@@ -271,32 +272,33 @@ class TorqueLogs:
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
-        # If a hypothesis changes only the units of the torques of some joints, a wrong link of the URDF may explain
-        # these torques as well, so warnings about links are added. Fewer links than joints are the simpler explanation.
-        finding = geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
+        # If a hypothesis changes the unit of only one joint's torque, the evidence is the magnitude of gravity in this
+        # torque. A wrong link of the URDF changes it as well, so warnings about links are added.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
-        if not changed.all(axis=1).any() and not any(fault.needed for fault in faults):
-            notes = list(_link_notes(problem, unchanged))
-            yield from notes
-            if isinstance(finding, Diagnostic) and 0 < len(notes) < changed.sum():
-                return
-        yield finding
+        if changed.sum() == 1 and not any(fault.needed for fault in faults):
+            yield from _link_notes(problem, unchanged)
+        yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
-    def _faults(self, problem: GeometryProblem) -> tuple[Fault, ...]:
-        """Return the kinds of faults to test, see `kinds_of_faults`.
+    def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
+        """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
-        A unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
+        The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
+        unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
         is_milli = np.array([unit == "mNm" for unit in units])
         is_open = is_milli | np.array([unit is None for unit in units])
+        coarse = problem.thinned(GEOMETRY.coarse_samples)
+        _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
+        loads = of_urdf.std(axis=0)
+        factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
         # Units of positions are tested only if velocities have the same unit per second, so that one factor changes
         # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
         scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, TorqueUnit(is_open, is_milli), scale)
+        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

@@ -1,5 +1,6 @@
 """Checks of logs against the robot's URDF: limits of the joints, and the gravity torque of the URDF."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import inf, pi
@@ -10,7 +11,7 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.identification.column_faults import is_other_unit
+from spelgen.identification.column_faults import is_other_unit, rounded_factor
 from spelgen.identification.motion_samples import MotionSamples
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
@@ -18,7 +19,7 @@ from spelgen.log_checks.statistics import has_few_levels
 from spelgen.logs.checks import Check
 from spelgen.logs.joint_signals import mapping_line, plain_number
 from spelgen.logs.trajectory import QUANTITIES
-from spelgen.logs.tuning import SAMPLES
+from spelgen.logs.tuning import SAMPLES, SIGNALS
 
 SAY_UNIT = "write 'units: {tau: ...}' or a 'gain' under 'logs' in the robot's YAML; 'Nm' confirms the unit"
 
@@ -39,6 +40,10 @@ class RobotCheckTuning:
     # sliding may then determine the torques. At a range of 0.02, wrong hypotheses fit best on simulated arms; at 0.1,
     # none does.
     smallest_motion: float = 0.05
+    # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
+    # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
+    # multiply the gravity torque.
+    loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
     dependent: float = 1e-8
@@ -165,6 +170,43 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
     if not bound or largest <= bound * 1.01:
         return None
     return f"{limit} up to {largest:.4g} {unit}, the limit is {bound:.4g}"
+
+
+def torque_factors(
+    joints: Sequence[JointEvidence], undeclared: Sequence[bool], loaded: Sequence[bool] | np.ndarray
+) -> list[np.ndarray]:
+    """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
+
+    For joints that are True in both masks and show gravity clearly, let r be the gravity in the logged torques divided
+    by the gravity torque of the URDF; r is negative if the torques have the opposite sense. If |r| is above five or
+    below a fifth, wrong inertials do not explain it. For each joint with such an r there is a candidate with the factor
+    1 / r for this joint and 1 for all others. If the magnitude of the median of r over the joints is beyond these
+    bounds, and all joints are `undeclared`, there is also a candidate with 1 / median for all joints.
+
+    Args:
+        joints: the joints with their fits of gravity.
+        undeclared: (n,) True for joints whose torque may have another unit: the mapping states no unit, or mNm.
+        loaded: (n,) True for joints that gravity loads enough.
+    """
+    seen: list[float] = []
+    factors = []
+    for k, joint in enumerate(joints):
+        factor, correlation = joint.report.gravity.factor, abs(joint.report.gravity.correlation or 0.0)
+        # The ratio of the logged torque to the URDF's gravity torque is known only if the torque contains much gravity,
+        # or is nearly proportional to it.
+        share = abs(factor or 0.0) * (joint.report.gravity.relative_deviation or 0.0)
+        is_known = (correlation > TUNING.seen and share > TUNING.visible) or correlation > SIGNALS.agreement
+        if factor is None or not (is_known and undeclared[k] and loaded[k]):
+            continue
+        seen.append(factor)
+        if is_other_unit(factor):
+            single = np.ones(len(joints))
+            single[k] = rounded_factor(1 / factor)
+            factors.append(single)
+    median = float(np.median(seen)) if seen else 1.0
+    if all(undeclared) and is_other_unit(median):
+        factors.append(np.full(len(joints), rounded_factor(1 / median)))
+    return factors
 
 
 def find_beyond_drive(joint: JointEvidence) -> str | None:

@@ -384,12 +384,15 @@ def _roughness(positions: np.ndarray) -> float:
 def _continues(rows: Rows) -> bool:
     """Return True if the motion continues at each row whose time is before the time of the row above.
 
-    There some joint moves, and the change of each position is at most twice its largest change in the rows around.
+    There some joint moves, and the change of each position is at most twice its largest change in the rows around. A
+    time that follows a gap is a wrong time, after which the clock is right again.
     """
-    changes = np.abs(np.diff(rows.positions, axis=0))
+    changes, steps = np.abs(np.diff(rows.positions, axis=0)), np.diff(rows.t)
     if len(changes) < 2 * TUNING.jump_window:
         return False
-    for row in np.flatnonzero(np.diff(rows.t) < 0).tolist():
+    for row in np.flatnonzero(steps < 0).tolist():
+        if row and steps[row - 1] > TUNING.gap * np.median(steps):
+            return False
         around = slice(max(0, row - TUNING.jump_window), row + TUNING.jump_window + 1)
         largest = np.delete(changes[around], row - around.start, axis=0).max(axis=0, initial=0.0)
         if (changes[row] > 2 * largest + SIGNALS.rest_range).any() or largest.max() < SIGNALS.rest_range:
