@@ -121,7 +121,6 @@ class HypothesisFit:
         parameters: (K,) inertial parameters, then friction and rotor inertias.
         covariance: (K, K) posterior covariance of the parameters.
         errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
-        gains: (n,) estimated factors on the torques; 1 unless the problem has free gains.
     """
 
     hypothesis: Hypothesis
@@ -130,7 +129,6 @@ class HypothesisFit:
     parameters: np.ndarray
     covariance: np.ndarray
     errors: np.ndarray
-    gains: np.ndarray
 
     @property
     def rank(self) -> float:

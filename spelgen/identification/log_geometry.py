@@ -189,8 +189,7 @@ class GeometryProblem:
         variance = len(tau) * _variance(tau)
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
-        x, gains, correlated = mean, np.ones(len(normal)), np.ones(len(normal), bool)
-        initial, lowest = gains, np.inf
+        x, gains, lowest = mean, np.ones(len(normal)), np.inf
         # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
         # alternate between gains and parameters, and the others are steps of both together, which converge faster near
         # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
@@ -200,8 +199,6 @@ class GeometryProblem:
                 load = np.maximum((normal @ x) @ x, 1e-9 * total)
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
-                if iteration == 0:
-                    initial, correlated = gains, correlation > 0.5
             weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ normal.reshape(len(normal), -1)).reshape(precision.shape)
             matrix += scale * precision
@@ -221,16 +218,11 @@ class GeometryProblem:
             misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
             cost = misfit + freedom * float(np.log1p(distance / freedom))
             if iteration == 0 or cost < lowest or not self._has_free_gains:
-                lowest, best = cost, (x, gains, errors, misfit, matrix)
-        cost, (x, gains, errors, misfit, matrix) = lowest, best
+                lowest, best = cost, (x, errors, misfit, matrix)
+        cost, (x, errors, misfit, matrix) = lowest, best
         covariance = inverse(matrix)
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
-        # The cost hardly determines a common factor of all gains. It is therefore the factor of the initial gains, from
-        # regressions on the torques by the prior mean, of the joints at which both torques are correlated. Without such
-        # joints, the median of the gains is 1.
-        factors = initial[correlated] / gains[correlated] if correlated.any() else 1 / gains
-        gains = gains * np.exp(np.median(np.log(factors)))
-        return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors, gains)
+        return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
