@@ -40,8 +40,8 @@ class RunResult:
     """Figures of a finished run.
 
     seconds: duration of the training [s]. parameters: number of trained parameters that the model uses. errors:
-    {measure: {predictor: error}}; the first measure ranks the models.
-    sizes: further figures of the model of a simulated arm, see `simulated_figures`; {} for logs of the user.
+    {measure: {predictor: error}}; the first measure ranks the models. sizes: further figures of the model of a
+    simulated arm, see `simulated_figures`; {} for logs of the user.
     """
 
     arm: str

@@ -99,10 +99,15 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay"):
             tables[name] = np.ravel(level)
     values = {
-        "name": model.name, "upper": model.name.upper(), "n": model.n, "tuning": TUNING, "levels": levels,
+        "name": model.name,
+        "upper": model.name.upper(),
+        "n": model.n,
+        "tuning": TUNING,
+        "levels": levels,
         "tables": {name: _numbers(row) for name, row in tables.items()},
-        "motors": list(map(_numbers, model.motors)), "inverse_inputs": list(map(_numbers, model.input_inverse)),
-    }  # fmt: skip
+        "motors": list(map(_numbers, model.motors)),
+        "inverse_inputs": list(map(_numbers, model.input_inverse)),
+    }
     # The generated C code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
     # with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())

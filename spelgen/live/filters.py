@@ -123,7 +123,8 @@ class LoadFilter:
 
     def forget_load(self) -> None:
         """Reset the payload's parameters theta to their prior distribution, for a new payload."""
-        self.x[:10] = self.P[:10] = self.P[:, :10] = 0.0
+        self.x[:10] = 0.0
+        self.P[:10] = self.P[:, :10] = 0.0
         self.P[:10, :10] = np.diag(TUNING.load_prior**2)
 
     def predict(self, duration: float) -> None:
@@ -263,7 +264,8 @@ class PayloadEstimate:
         self.filters = [LoadFilter(levels.load, levels.effort)]
         self.rows: Iterator[None] = iter(())
         self.moved = self.hypotheses_moved = 0.0
-        self.changed, self.misfit, self.samples, self.per_sample = False, 1.0, 0, 0
+        self.changed, self.misfit = False, 1.0
+        self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
         """Finish the filter updates of the previous block, and prepare the updates of `block` for calls of `step`."""
@@ -311,9 +313,8 @@ class PayloadEstimate:
                 self.filters, self.changed, self.moved = [candidate], True, self.hypotheses_moved
                 self.misfit = 1.0
                 return
-            if self.hypotheses_moved >= (
-                TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
-            ):
+            least = TUNING.changed_after if ratio < TUNING.unlikely else TUNING.dropped_after
+            if self.hypotheses_moved >= least:
                 self.filters = [main]
         is_surprise = moving and main.surprise > moving + TUNING.surprise * math.sqrt(2 * moving)
         # Hypotheses are not started in the first second of motion, in which residuals are large because the payload is

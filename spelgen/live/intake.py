@@ -59,7 +59,8 @@ class Intake:
     """
 
     def __init__(self, levels: NoiseLevels, bristles: BristleReach) -> None:
-        self.levels, self.bristles, self.limit = levels, bristles, bristles.values
+        self.levels, self.bristles = levels, bristles
+        self.limit = bristles.values
         self.counts = dict.fromkeys(REFUSALS, 0)
         self.t, self.ignored = -np.inf, 0
         self.q = self.path = np.zeros(len(self.limit))

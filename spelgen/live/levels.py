@@ -41,7 +41,8 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
     Raises RunError if they cannot be read, or if there are neither stored levels nor logs.
     """
-    if (levels := stored_levels(fit)) is None:
+    levels = stored_levels(fit)
+    if levels is None:
         if not fit.logs:
             raise RunError(
                 "no noise levels of the estimator", file=fit.folder, expected="a run with estimator.json",
@@ -72,8 +73,10 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         # body, at the origin of the last body.
         if tip.carrier == len(arm.chain.bodies) - 1:
             point = tip.pose[:3, 3]
-    others = [[log for fold in folds[:k] + folds[k + 1 :] for log in fold] for k in range(len(folds))]
-    tested = [(fitted_to(fit, logs), fold) for logs, fold in zip(others, folds, strict=True)]
+    tested = []
+    for k, fold in enumerate(folds):
+        others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
+        tested.append((fitted_to(fit, others), fold))
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
     # Serialization rounds the noise levels. The rounded levels are returned, so that they are equal to the levels that
     # are later read from the run folder.
@@ -159,9 +162,8 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    return _with_observer(
-        levels.model_copy(update={"load_variance": factor, "load_freedom": freedom}), tested
-    )
+    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
+    return _with_observer(levels, tested)
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
@@ -210,7 +212,8 @@ def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
     typical = np.median(np.abs([x.y for blocks in segments for x in blocks]), axis=0) + 1e-9
     scale = np.tile(typical, (len(grid), 1))
     for _ in range(3):
-        scale = scale * np.sqrt(_likelihood(segments, grid, scale)[1])
+        _cost, squares = _likelihood(segments, grid, scale)
+        scale = scale * np.sqrt(squares)
     best = _likelihood(segments, grid, scale)[0].argmin(axis=0)
     white = scale[best, np.arange(len(best))]
     return BlockNoise(white=white, disturbance=white * grid[best, 1], time_constant=grid[best, 0])
@@ -254,11 +257,13 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
     The new fields `observer`, `resting`, `resting_speed`, `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`
     determine the contact thresholds. levels: noise levels without these fields. tested: held-out samples of each log.
     """
-    ones = np.ones(len(levels.speed))
+    zeros, ones = np.zeros_like(levels.speed), np.ones_like(levels.speed)
     # The logs have no contacts: with infinite thresholds the observer detects none.
-    names = ("observer", "resting", "resting_speed", "peak_start", "peak_scale", "peak_count")
-    values = (ones, 0 * ones, ones, np.inf * ones, 0 * ones, 1.0)
-    levels = levels.model_copy(update=dict(zip(names, values, strict=True)))
+    no_contact = {
+        "observer": ones, "resting": zeros, "resting_speed": ones, "peak_start": np.full_like(ones, np.inf),
+        "peak_scale": zeros, "peak_count": 1.0,
+    }  # fmt: skip
+    levels = levels.model_copy(update=no_contact)
     signal = np.concatenate([_observed(levels, samples)[0] for samples in tested])
     qd = np.array([sample.at.velocity for samples in tested for sample in samples])
     levels = levels.model_copy(update=_observer_noise(signal, qd, levels))

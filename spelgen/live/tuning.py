@@ -33,7 +33,9 @@ class LiveTuning:
     # Prior standard deviations of the payload's inertial parameters in the payload filter: mass [kg], first moments
     # [kg m] and inertia [kg m^2]. The filter's prior is removed from the final estimate, so a wider prior would only
     # add rounding errors.
-    load_deviations: tuple[float, float, float] = (10.0, 2.0, 0.4)
+    load_mass: float = 10.0
+    load_moment: float = 2.0
+    load_inertia: float = 0.4
     # [1] Prior standard deviation of the friction scale, current friction divided by friction of the model.
     friction: float = 0.02
     # [1/s] Increase of the variance of the friction scale per second, as a random walk.
@@ -164,7 +166,7 @@ class LiveTuning:
     @property
     def load_prior(self) -> np.ndarray:
         """Prior standard deviations of a payload's inertial parameters in the payload filter, (10,)."""
-        return np.repeat(self.load_deviations, [1, 3, 6])
+        return np.repeat([self.load_mass, self.load_moment, self.load_inertia], [1, 3, 6])
 
     @property
     def evidence(self) -> float:

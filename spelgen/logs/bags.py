@@ -249,10 +249,8 @@ def _joint_states_in(files: Sequence[Path], path: Path) -> Iterator[RawState]:
     """
     messages = list(chain(*(mcap_messages(file, MESSAGE) for file in files)))
     if not messages:
-        got, do = (
-            "no complete message of joint states",
-            "if the recording was not closed, try `mcap recover FILE`",
-        )
+        got = "no complete message of joint states"
+        do = "if the recording was not closed, try `mcap recover FILE`"
         raise LogError(got, file=path, expected=f"messages of {MESSAGE}", do=do)
     yield from messages
 
@@ -273,10 +271,8 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
                 topics[number] = _text(body, 4)
                 encoding = _text(body, 8 + len(topics[number].encode()))
                 if encoding != "cdr":
-                    got, do = (
-                        f"joint states encoded as {encoding}",
-                        "export them to CSV, or record by `ros2 bag record`",
-                    )
+                    got = f"joint states encoded as {encoding}"
+                    do = "export them to CSV, or record by `ros2 bag record`"
                     raise LogError(got, file=path, expected="messages of ROS 2 (cdr)", do=do)
         elif code == MESSAGE_RECORD:
             number, _, recorded = struct.unpack_from("<HIQ", body)

@@ -136,16 +136,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
         x: _by_joint(_of_one_signal(named, len(joints)), joints, order) for x, named in columns_of.items()
     }
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
-    unstated = [x.name for x in columns if x.quantity is None and x.name in table.column_names]
-    for name in unstated if not by_joint["q"] else ():
-        if _names_signals(table[name].to_pylist(), len(joints)):
-            do = (
-                f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
-                "wide.columns = [f'{x}_{y}' for x, y in wide.columns]"
-            )
-            raise LogError(
-                f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do
-            )
+    if not by_joint["q"]:
+        _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
@@ -179,6 +171,22 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     return _suggestion(lines, missing, "column")
 
 
+def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
+    """Raise LogError if one of the columns `names` names the joint or the signal of each row of the log `file`.
+
+    joints: number of joints.
+    """
+    for name in names:
+        if name in table.column_names and _names_signals(table[name].to_pylist(), joints):
+            do = (
+                f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
+                "wide.columns = [f'{x}_{y}' for x, y in wide.columns]"
+            )
+            raise LogError(
+                f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do
+            )
+
+
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
     """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
 
@@ -191,15 +199,13 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     clock = min(
         seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
     )
-    stem = re.sub(r"secs?$", "", clock.name)
-    fraction = next(
-        (x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0] if nanoseconds else None
-    )
     times = _numbers(table, clock.name)
     # Seconds of a stamp are whole numbers that repeat.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
-    if fraction is None or not is_whole:
+    if not nanoseconds or not is_whole:
         return clock
+    stem = re.sub(r"secs?$", "", clock.name)
+    fraction = next((x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0])
     return ColumnName(f"{clock.name} + {fraction.name}", clock.words, "s")
 
 
