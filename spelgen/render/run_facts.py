@@ -44,9 +44,11 @@ def training_facts(fit: Fit) -> dict[str, str]:
         "objective": record.objective,
         "training logs": _names(record.training),
         "validation logs": _names(record.validation),
-        "windows": f"{record.training_windows:,} for training, {record.validation_windows:,} for validation",
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
+    # A fit to torques uses single samples.
+    if record.objective != "torque":
+        facts["windows"] = f"{record.training_windows:,} for training, {record.validation_windows:,} for validation"
     if isinstance(fit.model, ResidualDynamics):
         facts["residual terms"] = "; ".join(terms_in_use(fit.model)) or "none selected"
     # Only fits with epochs have metrics; fits to torques have none.
