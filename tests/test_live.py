@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
 from spelgen.live.payload import find_payload
-from spelgen.live.replay import replay
+from spelgen.live.replay import load_changes, replay
 from spelgen.live.tuning import TUNING
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -196,6 +197,27 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
     # both at once: the load is found after the end of the contact
     _, states = estimates(run, levels, log, picked + touched - log.tau)
     assert abs(states[-1].payload.mass - 2.0) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("reports", "changes"),
+    [
+        (["not yet", "no payload"], []),
+        (["no payload", "no payload"], []),
+        (["no payload", "payload"], [3]),
+        (["payload", "payload"], [3]),
+        (["payload", "no payload"], [3]),
+        (["no payload", "not yet"], [3]),
+        (["no payload", "no payload", "payload"], [6]),
+    ],
+)
+def test_a_change_between_two_states_without_payload_is_not_listed(reports, changes):
+    """The list of another load never contradicts the line that reports no payload."""
+    states = [
+        SimpleNamespace(load_changed=k % 3 == 0 and k > 0, payload=SimpleNamespace(status=report))
+        for k, report in enumerate(report for report in reports for _ in range(3))
+    ]
+    assert load_changes(states) == changes
 
 
 def test_contacts_are_found_at_their_joint_with_their_force(arm, levels, run):

@@ -51,7 +51,7 @@ class LogEstimate:
         states: Estimates after each sample.
         payload: Estimated payload at the end of the log.
         since: Time at which a payload was first reported [s]; None without a payload.
-        changes: Times of detected changes of the payload [s].
+        changes: Times of changes of the payload [s], see `load_changes`.
         contacts: Contacts along the log.
         drift: {joint: relative difference of friction at the end of the log from friction of the model [%]}.
         refused: {reason: number of samples that were refused or only partly used}.
@@ -161,7 +161,7 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         results.append(LogEstimate(
             log=log, joints=joints, unit=torque_units(fit.model.joint_types), states=states,
             payload=states[-1].payload, since=next(iter(reported), None),
-            changes=tuple(times[[state.load_changed for state in states]].tolist()),
+            changes=tuple(times[load_changes(states)].tolist()),
             contacts=tuple(contact_events(states, joints)), drift=dict(zip(joints, drift, strict=True)),
             refused=estimator.refused,
         ))  # fmt: skip
@@ -178,6 +178,25 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
         begin = float(t[-1]) + 2 * TUNING.gap
         estimator.replay(replace(log, t=t))
     return estimator.report()
+
+
+def load_changes(states: Sequence[EstimatorState]) -> list[int]:
+    """Return the indices of the samples at which the load changes.
+
+    A change is omitted if no payload is reported before it and "no payload" is reported later: the two loads differ by
+    less than the errors of the model.
+
+    states: estimates after each sample of a log.
+    """
+    changed = [k for k, state in enumerate(states) if state.load_changed]
+    # Each segment ends with the sample before the next change; its last estimate is the most certain one.
+    ends = [*(k - 1 for k in changed), len(states) - 1]
+    reports = [states[end].payload.status for end in ends]
+    return [
+        k
+        for k, (before, after) in zip(changed, pairwise(reports), strict=True)
+        if before == "payload" or after != "no payload"
+    ]
 
 
 def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:

@@ -48,7 +48,9 @@ def training_facts(fit: Fit) -> dict[str, str]:
     }
     # A fit to torques uses single samples.
     if record.objective != "torque":
-        facts["windows"] = f"{record.training_windows:,} for training, {record.validation_windows:,} for validation"
+        facts["windows"] = (
+            f"{record.training_windows:,} for training, {record.validation_windows:,} for validation"
+        )
     if isinstance(fit.model, ResidualDynamics):
         facts["residual terms"] = "; ".join(terms_in_use(fit.model)) or "none selected"
     # Only fits with epochs have metrics; fits to torques have none.
