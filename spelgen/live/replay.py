@@ -20,6 +20,13 @@ from spelgen.logs.trajectory import Trajectory, require_torques
 FOREIGN = """  external torques exceed their thresholds in most of the log: check that it is a log of this arm, and the
 units, senses and zeros of its positions and torques"""
 
+REASONS = {
+    "jump": f"jumps, or {TUNING.jump:g} times faster than the training logs",
+    "gap": f"after a gap or {TUNING.restart} refused samples",
+    "saturated": "torque at its limit",
+}
+"""Texts for users of the reasons of `live.intake.Refusal` that are not clear by themselves."""
+
 
 @dataclass(frozen=True)
 class ContactEvent:
@@ -98,7 +105,7 @@ class LogEstimate:
         drift = ", ".join(f"{joint} {percent:+.1f} %" for joint, percent in self.drift.items())
         lines.append(f"  friction at the end, relative to the model: {drift}")
         if self.refused:
-            refused = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
+            refused = "; ".join(f"{count} {REASONS.get(name, name)}" for name, count in self.refused.items())
             lines.append(f"  samples that were not used, or only in part: {refused}")
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
