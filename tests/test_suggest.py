@@ -249,6 +249,34 @@ def test_units_are_found_anywhere_in_a_name(scara, tmp_path, form):
     require_same(suggested(written(tmp_path / "log.csv", head, rows), arm)[0])
 
 
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("kgf.cm", 0.0980665), ("kg·cm", 0.0980665), ("N cm", 0.01), ("N·m", 1.0), ("mN-m", 1e-3)],
+)
+def test_units_of_torques_are_products(scara, tmp_path, unit, factor):
+    """Units of torques are recognised with any sign between their factors."""
+    (tmp_path / "arm.urdf").write_text(
+        scara.robot.path.read_text().replace('type="prismatic"', 'type="revolute"')
+    )
+    head = [
+        "t",
+        *(f"{word}{k}" for word in ("q", "qd") for k in range(4)),
+        *(f"tau{k}({unit})" for k in range(4)),
+    ]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU / factor]))
+    require_same(suggested(path, load_arm(tmp_path / "arm.urdf"))[0])
+
+
+def test_a_unit_that_is_not_known_is_named_in_the_draft(scara, tmp_path):
+    head = [
+        "t",
+        *(f"{word}{k}" for word in ("q", "qd") for k in range(4)),
+        *(f"tau{k} (lbf in)" for k in range(4)),
+    ]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU]))
+    assert "# not a known unit of tau: lbfin" in suggested(path, scara)[1]
+
+
 def test_cells_with_lists_and_names_as_texts(scara, tmp_path):
     order, names = [3, 1, 0, 2], [x.name for x in scara.chain.coordinates]
     texts = [str([names[k] for k in order])] * len(T)

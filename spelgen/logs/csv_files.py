@@ -17,7 +17,7 @@ from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import STATED_KEY, LogTable
 from spelgen.logs.values import is_number, stamps
-from spelgen.settings.log_mapping import PLAIN, UNIT_NAMES, LogMapping
+from spelgen.settings.log_mapping import PLAIN, UNIT_NAMES, LogMapping, plain_unit
 
 # First columns of a file that `ros2 topic echo --csv` writes: the fields of the message header.
 STAMP = ("sec", "nanosec", "frame_id")
@@ -118,7 +118,7 @@ def _beginning(file: Path) -> Beginning:
     if not is_number(names[0]):
         names, start = _column_names(lines, cells, header)
         names = names + [""] * (width - len(names))
-        units = [x.strip(" []()").lower() for x in cells[start - 1]]
+        units = [plain_unit(x) for x in cells[start - 1]]
         # Names, and the header itself, may contain words such as `deg`.
         units = units if sum(x in ALL_UNITS for x in units) > len(units) / 2 else []
     return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))

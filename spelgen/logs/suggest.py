@@ -23,7 +23,7 @@ from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
-from spelgen.settings.log_mapping import CURRENTS, LogMapping
+from spelgen.settings.log_mapping import CURRENTS, LogMapping, plain_unit
 from spelgen.settings.log_mapping import UNIT_NAMES as UNITS
 
 WORDS = {
@@ -167,6 +167,13 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     lines += [
         f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
     ]
+    unknown = {
+        (quantity, column.unit)
+        for quantity, named in by_joint.items()
+        for column in named.values()
+        if column.unit and column.unit not in UNITS["q" if quantity == "u" else quantity]
+    }
+    lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in sorted(unknown)]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     return _suggestion(lines, missing, "column")
 
@@ -272,11 +279,11 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
     # a number or a joint.
     for bracket in re.finditer(r"\s*[\[(]([^\])]+)[\])]", name):
-        is_unit = bracket[1].lower() in unit_names
+        is_unit = plain_unit(bracket[1]) in unit_names
         if is_unit or (
             bracket.end() == len(name) and not re.search(r"[\d',]", bracket[1]) and bracket[1] not in labels
         ):
-            unit, name_without = bracket[1].strip().lower(), name.replace(bracket[0], "", 1)
+            unit, name_without = plain_unit(bracket[1]), name.replace(bracket[0], "", 1)
             return _column_name(name_without, labels, unit, words)._replace(name=name)
     matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")

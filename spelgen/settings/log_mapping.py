@@ -7,6 +7,7 @@ Register values of motors, such as signed magnitudes, are first decoded by `sign
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from itertools import product
 from math import pi
@@ -22,13 +23,14 @@ TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"
 # LENGTHS, SPEEDS and SCALES: {unit that is no SI unit: factor to the SI unit}.
 LENGTHS = {"deg": pi / 180, "turns": 2 * pi, "mrad": _MILLI, "mm": _MILLI}
 SPEEDS = {f"{name}/s": scale for name, scale in LENGTHS.items()} | {"rpm": 2 * pi / 60}
-SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "mA": _MILLI}
+# 1 kgf is the weight of 1 kg at the standard gravity of 9.80665 m/s^2; datasheets of small servos state kgf cm.
+SCALES = {**LENGTHS, **SPEEDS, "mNm": _MILLI, "Ncm": 1e-2, "kgf.cm": 9.80665e-2, "mA": _MILLI}
 # Units of `tau` that need a gain: currents, and fractions of a rated torque that the log does not contain.
 CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-# For each quantity: units as written in logs, in lower case, and the corresponding units of a mapping.
+# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping.
 UNIT_NAMES = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
@@ -37,12 +39,14 @@ UNIT_NAMES = {
     "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
            "deg/sec": "deg/s", "rad/sec": "rad/s", "rev/s": "turns/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm",
            "mm/s": "mm/s", "m/s": "m/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "n": "N", "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
+    "tau": {"nm": "Nm", "mnm": "mNm", "ncm": "Ncm", "kgfcm": "kgf.cm", "kgcm": "kgf.cm", "n": "N",
+            "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
-    "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", *LENGTHS, *SPEEDS} - {"mm", "mm/s"},
+    "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
+    - {"mm", "mm/s"},
 }
 
 LONGEST_DELAY = 1.0  # [s] Largest magnitude of a delay in the settings.
@@ -60,9 +64,14 @@ Accepted = Literal[
 Time = Literal["s", "ms", "us", "ns"]
 Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
 Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
-Effort = Literal["Nm", "mNm", "N", "A", "mA", "percent", "permille"]
+Effort = Literal["Nm", "mNm", "Ncm", "kgf.cm", "N", "A", "mA", "percent", "permille"]
 Decoding = Literal["period", "sign_bit"]
 """Settings of the raw values of registers and wrapped angles."""
+
+
+def plain_unit(text: str) -> str:
+    """Return a unit as written in a log in lower case and without brackets and signs of products: N·m is nm."""
+    return re.sub(r"[\s.·⋅*-]", "", text.strip(" []()").lower())
 
 
 class LogColumns(Group):
