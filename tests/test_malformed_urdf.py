@@ -51,7 +51,7 @@ READ = {
     ),
     "fingerpro_two_inertials": (
         "finger_base_to_upper_joint finger_upper_to_middle_joint finger_middle_to_lower_joint",
-        {"repeated-element"},
+        {"repeated-element", "density"},
         set(),
     ),
     "wam7_nonPSD_inertia": (

@@ -404,6 +404,7 @@ class TestLint:
             ("inertial-without-mass", '<inertial><inertia ixx="1" iyy="1" izz="1"/></inertial>'),
             ("repeated-element", INERTIAL + INERTIAL),
             ("millimetres", INERTIAL.replace('"1"', '"0.001"', 1)),
+            ("density", INERTIAL.replace('"1"', '"1e5"', 1).replace("1.5", "1").replace('="1"', '="1e-2"')),
             ("millimetres", INERTIAL.replace("<mass", '<origin xyz="0 -150 0"/><mass')),
         ],
     )

@@ -17,6 +17,10 @@ _SMALLEST_INERTIA = 1e-15
 _LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
+# [kg/m^3] Largest plausible density of a sphere with the mass and the largest radius of gyration of a link. Metals are
+# below 2.3e4; of 1,296 links in 200 URDFs only a placeholder, 1 kg with a radius of 2 mm, exceeds 2e5. With masses in
+# grams the density of a link is 3e7 times as large.
+_LARGEST_DENSITY = 1e6
 
 Finding = tuple[str, str, int, str]
 """Code, place, line and message of a warning."""
@@ -63,6 +67,14 @@ def _lint_inertial(link: str, inertial: Inertial) -> Iterator[Finding]:
             f"a radius of gyration of {gyration:.3g} m: perhaps the tensor is in kg mm2, or the mass in g"
         )
         yield "millimetres", where, line, message
+    # A solid sphere of radius r has the radius of gyration r sqrt(2/5).
+    volume = 4 / 3 * pi * (gyration * np.sqrt(5 / 2)) ** 3
+    if inertial.mass > _LARGEST_DENSITY * volume > 0:
+        message = (
+            f"a mass of {inertial.mass:.3g} kg with a radius of gyration of {1e3 * gyration:.3g} mm is denser than any "
+            "metal: perhaps the mass is in g, or the tensor is a placeholder"
+        )
+        yield "density", where, line, message
     if smallest < -_ROUNDING * abs(largest):
         fault = "the inertia tensor is not positive semidefinite"
         yield "non-psd-inertia", where, line, f"{fault}: its least principal moment is {smallest:.3g}"
