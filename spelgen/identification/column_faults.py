@@ -271,11 +271,13 @@ class TorqueUnit(WrongScale):
             best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
         # Separate factors of the joints are accepted under three conditions. They also correct errors of the URDF's
         # masses, which lowers the cost a little: (1) therefore at least one factor must be large enough for another
-        # unit, and (2) the cost decrease must be significant. (3) The relative residual of each joint must be small,
-        # since no factor explains torques with another fault, such as a lost sign.
+        # unit, and (2) the cost must decrease significantly, below the other candidates and below the present units,
+        # although each factor is rare. (3) The relative residual of each joint must be small, since no factor explains
+        # torques with another fault, such as a lost sign.
         is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
         is_explained = best.errors.max() <= GEOMETRY.unexplained
-        if is_unit and is_explained and best.cost < lowest.cost - GEOMETRY.needed:
+        decrease = min(lowest.cost, base.cost) - best.cost
+        if is_unit and is_explained and decrease > GEOMETRY.needed + self.rarity * is_open.sum():
             yield best
 
     def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:

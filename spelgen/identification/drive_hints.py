@@ -129,6 +129,18 @@ class DriveProblem:
         rows = self.rows[::stride]
         return replace(self, samples=self.samples.every(stride), rows=rows, products=block_products(rows, 1))
 
+    def with_hysteresis(self) -> DriveProblem:
+        """Return the least-squares problem with the deflections of bristles as additional columns of the regressor.
+
+        Its dry friction depends on the past motion. The columns are after those of the bodies.
+        """
+        drives = len(FRICTION.effects) * len(self.size) + 1
+        # C_ji is the factor from the torque of drive j to the torque of joint i.
+        bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]  # (S, n, n, bristles)
+        flat = bristles.reshape(*self.rows.shape[:2], -1)
+        rows = np.concatenate([self.rows[..., :-drives], flat, self.rows[..., -drives:]], axis=2)
+        return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
+
     @cached_property
     def errors(self) -> np.ndarray:
         """Squared torque residual of each of n joints, summed over each of B blocks of samples, (B, n) [1].
@@ -204,6 +216,12 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     # torques, and a smaller error than without the coupling is no evidence.
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
+        return None
+    # A friction model without a state has a residual after each reversal. If the joints move at the same times, a
+    # coupling explains this residual, too; it must therefore also lower the residual with hysteresis.
+    stateful = problem.with_hysteresis()
+    without, with_coupling = (x.errors[:, best.pair].mean(axis=1) for x in (stateful, stateful.coupled(best)))
+    if not _is_sure(without, with_coupling, HINTS.coupling_gain, 1):
         return None
     return best, float(coupled.mean() / logged.mean())
 
