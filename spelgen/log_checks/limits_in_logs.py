@@ -155,8 +155,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - certain * deviation)[rows, k])
-            # A controller that pushes against a stop needs a large torque. Smaller differences occur in pauses of joints
-            # whose friction is not determined because they move one way only.
+            # A controller that pushes against a stop needs a large torque. Smaller differences occur in pauses of a
+            # joint that moves one way only, so that its friction is not determined.
             sure = max(certain * noise[k], 0.5 * samples.tau[:, k].std())
             if difference > sure + 2 * abs(friction[k]):
                 message = (

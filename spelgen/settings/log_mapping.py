@@ -241,6 +241,10 @@ class JointLog(Group):
         return self
 
 
+# Settings are immutable, so that one object serves all joints.
+_DEFAULT = JointLog()
+
+
 class LogMapping(Group):
     """Mapping of logged columns to t, q, qd, tau in SI units, or to t, q and commanded positions u.
 
@@ -303,7 +307,7 @@ class LogMapping(Group):
 
     def joint(self, name: str) -> JointLog:
         """Return the settings of the columns of a joint, by its name in the URDF; the defaults if it has none."""
-        return self.joints.get(name, JointLog())
+        return self.joints.get(name, _DEFAULT)
 
     def log_name(self, joint: str) -> str:
         """Return the name that a joint has in the log. joint: name of the joint in the URDF."""
