@@ -95,8 +95,12 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
             fit = problem.with_signs(signs).fit(problem.unchanged)
             torque = problem.residual(problem.unchanged, fit.parameters) + tau
-        fits.append((fit.cost, fit.errors * (signs * tau).var(axis=0), signs))
-    _, squares, signs = min(fits, key=itemgetter(0))
+        fits.append((fit.cost, fit.errors, signs))
+    _, errors, signs = min(fits, key=itemgetter(0))
+    if errors.max() > GEOMETRY.no_advice:
+        # Signs do not explain the torques of all joints: the log has another fault, such as exchanged columns.
+        return []
+    squares = errors * (signs * tau).var(axis=0)
     ratio = squares / np.maximum(problem.fit(problem.unchanged).errors * tau.var(axis=0), 1e-30)
     both = np.minimum((signs > 0).mean(axis=0), (signs < 0).mean(axis=0)) > 0.05
     joints = np.flatnonzero(suspects & both & (ratio < GEOMETRY.unsigned_gain))
