@@ -262,7 +262,7 @@ class Posterior:
 
         The square root is (10 B + n, k), see `Propagated`.
         """
-        return self.propagate(_constants)
+        return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     @cached_property
     def _base_values(self) -> Propagated:
@@ -329,11 +329,6 @@ def posterior_of(
     from spelgen.fitting.servo.posterior import ServoPosterior
 
     return ServoPosterior(model, covariance, std, delay_interval)
-
-
-def _constants(model: ArmModel) -> Tensor:
-    """Return the inertial parameters of all B bodies of a model, then the n armatures, (10 B + n,)."""
-    return torch.cat([model.inertial_parameters.flatten(), model.armature])
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:

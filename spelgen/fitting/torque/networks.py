@@ -11,12 +11,7 @@ from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import ALL, rms_per_joint
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.selection import (
-    SelectedTerm,
-    block_squares,
-    significant_reduction,
-    split_halves,
-)
+from spelgen.fitting.torque.selection import SelectedTerm, block_squares, significant_reduction, split_halves
 from spelgen.fitting.torque.tuning import SELECTION
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
