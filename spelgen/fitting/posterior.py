@@ -288,9 +288,7 @@ class Posterior:
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
 
-def posterior_of(
-    model: ArmModel, content: Content | None, delay: float, file: Path | None = None
-) -> Posterior:
+def posterior_of(model: ArmModel, content: Content | None, delay: float, file: Path | None) -> Posterior:
     """Return the posterior of a fitted model.
 
     Args:
@@ -298,7 +296,7 @@ def posterior_of(
         content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), delay_std [s], and, unless
             the model has position servos, torque_std, (n,) [Nm, N].
         delay: delay of the torques relative to the positions [s].
-        file: path of the checkpoint, for error messages.
+        file: path of the checkpoint, for error messages; None for a fit without a folder.
 
     Raises RunError if the content is None, or if it belongs to another model.
     """

@@ -28,7 +28,7 @@ BLOCK = 2**16
 def fit_networks(
     model: ArmModel,
     samples: TorqueSamples,
-    weight_decay: float = DEFAULTS.lbfgs_decay,
+    weight_decay: float,
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
 ) -> int:
