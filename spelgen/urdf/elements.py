@@ -125,10 +125,15 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 
 
 def _read_axis(joint: Element, kind: str | None) -> Vector:
-    axis, error_count = joint.child("axis"), len(joint.notes.errors)
+    error_count = len(joint.notes.errors)
+    axis = joint.child("axis")
     xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default of the joint axis.
+    if len(joint.notes.errors) > error_count:
+        return xyz
+    if axis.xml is not None and axis.text("xyz") is None:
+        axis.error("no xyz", "a direction", 'write <axis xyz="..."/>')
     # A joint axis of length zero is an error, because it cannot be normalised.
-    if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
+    elif kind in MOVING and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
         joint.notes.error(axis.line, joint.where, f"the axis {axis.text('xyz')!r}", "a direction", do)
     return xyz
