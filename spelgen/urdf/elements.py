@@ -99,10 +99,17 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     dynamics = motion.child("dynamics")
     damping, friction = dynamics.number("damping") or 0.0, dynamics.number("friction") or 0.0
     mimic = _read_mimic(joint.child("mimic")) if kind in MOVING else None
+    # Only motions need the soft limits, so that their errors become warnings, too.
+    safety = Element(optional, xml, joint.where).child("safety_controller")
+    low, high = safety.number("soft_lower_limit"), safety.number("soft_upper_limit")
+    # Exporters write two zeros for no soft limits.
+    soft = (low, high) if low is not None and high is not None and low < high else None
     notes.add_as_warnings(optional)
     if kind not in JOINT_TYPES or parent is None or child is None:
         return None
-    return UrdfJoint(name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, joint.line)
+    return UrdfJoint(
+        name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, joint.line, soft
+    )
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
