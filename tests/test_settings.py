@@ -163,8 +163,8 @@ def test_a_wrong_value_is_reported_with_its_place(urdf, text, message):
             "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:python/object/apply:os.system",
         ),
         (
-            "joints:\n  joint1:\n    gear: 1:100",
-            "arm.yaml:3: not plain YAML: the number 1:100, which is not decimal",
+            "joints:\n  joint1:\n    gear: 1:50",
+            "arm.yaml:3: not plain YAML: the number 1:50, which is not decimal",
         ),
         (
             "joints: {joint1: {gear: 0100}}",

@@ -27,7 +27,7 @@ def arm_dynamics(
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
 
-    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>, or a negative mass,
+    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>, or negative mass,
     for which Pinocchio returns meaningless numbers.
     """
     error = partial(
@@ -37,7 +37,9 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     )
     mass = {body.name: float(body.inertia[0]) if body.inertia else None for body in arm.bodies}
     faults = {name: "a link without <inertial>" for name, value in mass.items() if value is None}
-    faults |= {name: f"a body of {value:g} kg" for name, value in mass.items() if value is not None and value < 0}
+    faults |= {
+        name: f"a body of {value:g} kg" for name, value in mass.items() if value is not None and value < 0
+    }
     collect([error(got, element=f"joint {name!r}") for name, got in faults.items()])
     model = kinematic_model(arm)
     # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.

@@ -83,7 +83,7 @@ def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | Non
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """The safe loader of PyYAML, for which tags, aliases, deep nesting, repeated keys and 1:100 are errors."""
+    """The safe loader of PyYAML, for which tags, aliases, deep nesting, repeated keys and 1:50 are errors."""
 
     depth = 0
 
@@ -103,7 +103,7 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
-        # YAML 1.1 reads 1:100 as 160 (base 60) and 0100 as 64 (octal): a gear ratio written so would be wrong silently.
+        # YAML 1.1 reads 1:50 as 110 (base 60) and 0100 as 64 (octal): a gear ratio written so would be wrong silently.
         is_number = str(node.tag).endswith((":int", ":float"))
         if is_number and (":" in node.value or _OCTAL.fullmatch(node.value)):
             raise ComposerError(None, None, f"the number {node.value}, which is not decimal", mark)

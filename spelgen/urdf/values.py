@@ -121,7 +121,9 @@ class Element:
         if self.xml is None:
             for other in parent.iterchildren(etree.Element):
                 name = etree.QName(other).localname
-                if other.tag not in _LEAVES and (_is_spelling(name, tag) or (name, tag) == ("pose", "origin")):
+                if other.tag not in _LEAVES and (
+                    _is_spelling(name, tag) or (name, tag) == ("pose", "origin")
+                ):
                     got = f"the element <{f'{other.prefix}:' if other.prefix else ''}{name}>"
                     self.notes.error(other.sourceline, self.where, got, f"<{tag}>", "correct or remove it")
         elif tag in _LEAVES:
