@@ -127,8 +127,8 @@ def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
         ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi, 2 * pi),
         ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", _LARGEST_LENGTH, inf),
     )
-    # Angles in radians are rarely whole numbers: in 200 URDFs no angle of an <origin> of at least 2 rad is one, and no
-    # position limit above 2 pi.
+    # Angles in radians are rarely whole numbers: in the URDFs of ../shared no angle of an <origin> of at least 2 rad is
+    # one, and no position limit between 2 pi and 1000.
     for code, element, quantity, size, unit, largest, largest_whole in sizes:
         if size > largest or (size >= largest_whole and size.is_integer()):
             message = f"{quantity} of {size:g} {unit}: perhaps {code}"
