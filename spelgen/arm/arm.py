@@ -300,7 +300,7 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
     # One remark lists all locked joints, because a humanoid robot has about thirty locked joints.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
-        # A pose with a joint outside its limits is impossible, so that the real arm has other inertias.
+        # The real joint is never at 0 in this case, so that the real arm has other inertias.
         limits = [joint.safe_limits or (0.0, 0.0) for joint in outside]
         names = ", ".join(
             repr(joint.name) + (" (0 is outside its limits)" if low > 0 or high < 0 else "")
