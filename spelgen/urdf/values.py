@@ -37,7 +37,7 @@ _LEAVES = {
     "inertia": ("ixy", "ixz", "iyz"),
 }
 # [1] Two names of at least this similarity are spellings of one name. In the URDFs of ../shared
-# (arms, nasty, cases), no element or attribute beyond the URDF format resembles an absent one of the format as much.
+# (arms and cases), no element or attribute beyond the URDF format resembles an absent one of the format as much.
 _SIMILARITY = 0.75
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
