@@ -115,7 +115,9 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     if joint.lower is not None and joint.upper is not None and joint.lower >= joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         if joint.lower == joint.upper:
-            message = f"lower and upper are both {joint.lower:g}: the joint cannot move, perhaps its type is fixed"
+            message = (
+                f"lower and upper are both {joint.lower:g}: the joint cannot move, perhaps its type is fixed"
+            )
         yield "lower-above-upper", f"{where} limit", line, message
 
 
