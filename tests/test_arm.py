@@ -111,6 +111,21 @@ class TestChain:
         assert names(arm) == (["a"] if kind == "prismatic" else ["a", "j7"])
         assert "ambiguous-chain" in codes(arm)
 
+    def test_a_last_joint_that_fingers_elsewhere_follow_is_stated(self, robot):
+        """One drive with mimic joints on other links is typical of adaptive grippers: it may be no joint of the arm."""
+        drive = joint("drive", "palm", "l").replace('lower="-1" upper="2"', 'lower="0" upper="0.8"')
+        followers = [joint("m1", "palm", "r", inside='<mimic joint="drive" multiplier="-1"/>')]
+        followers += [joint("m2", "l", "t", inside='<mimic joint="drive"/>')]
+        arm = make_arm(robot(joint("a", "0", "palm"), drive, *followers))
+        (remark,) = [x for x in arm.diagnostics if x.code == "ambiguous-chain"]
+        assert "'--tip palm'" in remark.message
+
+    @pytest.mark.parametrize("lower, is_outside", [("0.5", True), ("-0.5", False)])
+    def test_a_joint_locked_outside_its_limits_is_stated(self, robot, lower, is_outside):
+        outer = joint("b", "1", "2").replace('lower="-1"', f'lower="{lower}"')
+        arm = make_arm(robot(joint("a", "0", "1"), outer), joints=["a"])
+        assert any("'b' (0 is outside its limits)" in x.message for x in arm.diagnostics) == is_outside
+
     @pytest.mark.parametrize("travel", [0.04, 0.4])
     def test_a_short_slide_at_the_end_may_open_a_gripper(self, robot, travel):
         slide = joint("b", "1", "2", "prismatic")

@@ -1,6 +1,7 @@
 """Errors of an evaluation equal the errors of exact solutions, baselines are exact, and results are valid JSON."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +87,17 @@ def test_the_urdf_baseline_has_the_dynamics_of_the_urdf(cart):
     tau = cart_torque(q, qd, qdd)
     torch.testing.assert_close(dynamics.inverse_dynamics(q, qd, qdd), tau, atol=1e-12, rtol=0)
     torch.testing.assert_close(dynamics.forward_dynamics(q, qd, tau), qdd, atol=1e-11, rtol=0)
+
+
+def test_the_urdf_baseline_reads_every_encoding(robots, tmp_path):
+    text = (robots / "two_link.urdf").read_text()
+    text = re.sub(r"<\?xml.*?\?>", "", text)
+    path = tmp_path / "arm.urdf"
+    path.write_bytes(text.encode("utf-16"))
+    q = np.array([[0.3, -0.4]])
+    names = load_arm(path).chain.joint_names
+    expected = urdf_dynamics(robots / "two_link.urdf", names).mass_matrix(q)
+    np.testing.assert_array_equal(urdf_dynamics(path, names).mass_matrix(q), expected)
 
 
 def test_pinocchios_configurations_of_any_batch_are_those_of_each_state(cart):

@@ -160,6 +160,25 @@ def test_joints_that_follow_keep_their_limits_too(tmp_path):
     assert 0.1 < np.abs(found.motion.qd).max() <= 0.2
 
 
+@pytest.mark.parametrize(
+    ("soft", "range_"),
+    [((-0.5, 0.4), (-0.5, 0.4)), ((-9, 0.4), (-2, 0.4)), ((0, 0), (-2, 2)), ((3, 4), (-2, 2))],
+)
+def test_motions_keep_the_soft_limits_of_a_safety_controller(tmp_path, soft, range_):
+    """Soft limits narrow the range of a motion; two zeros, and limits outside the range, are no soft limits."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
+        '<child link="b"/><limit lower="-2" upper="2" effort="1" velocity="1"/>'
+        f'<safety_controller soft_lower_limit="{soft[0]}" soft_upper_limit="{soft[1]}"/></joint></robot>'
+    )
+    loaded = load_arm(path)
+    bounds = motion_bounds(loaded.chain, 1.0, 1.0, loaded.robot.joint)
+    assert (bounds.low[0], bounds.high[0]) == pytest.approx(range_)
+    bounds = motion_bounds(loaded.chain, 1.0, 1.0, loaded.robot.joint, {"j": (-1.0, 1.0)})
+    assert (bounds.low[0], bounds.high[0]) == pytest.approx((-1, 1))
+
+
 def test_a_joint_without_room_is_refused(robots, tmp_path):
     text = (robots / "two_link.urdf").read_text()
     (tmp_path / "stuck.urdf").write_text(

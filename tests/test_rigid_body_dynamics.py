@@ -130,6 +130,13 @@ def test_bodies_without_inertials_are_all_named():
     assert all(isinstance(each, ArmError) for each in error.value.errors)
 
 
+def test_a_negative_mass_is_refused():
+    """Pinocchio returns meaningless numbers for it, and no error."""
+    negative = arm([coordinate()], [body(inertia=(-1, 0, 0, 0, 1, 0, 0, 1, 0, 1))])
+    with pytest.raises(ArmError, match=r"joint 'a': got a body of -1 kg, expected mass.*write estimates"):
+        pinocchio_model(negative, Settings())
+
+
 # A lift with mimic joints: stage 2 slides twice as far as stage 1, and rod 2 of the pendulum on it turns against
 # rod 1. The leader of the mimic finger is no coordinate of the arm, so the finger is locked at its offset.
 LIFT = """<robot name="lift"><link name="base"/>

@@ -162,6 +162,14 @@ def test_a_wrong_value_is_reported_with_its_place(urdf, text, message):
             "about: !!python/object/apply:os.system [ls]",
             "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:python/object/apply:os.system",
         ),
+        (
+            "joints:\n  joint1:\n    gear: 1:50",
+            "arm.yaml:3: not plain YAML: the number 1:50, which is not decimal",
+        ),
+        (
+            "joints: {joint1: {gear: 0100}}",
+            "arm.yaml:1: not plain YAML: the number 0100, which is not decimal",
+        ),
         ("about: !!bool maybe", "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:bool"),
         ("about: !!timestamp maybe", "arm.yaml:1: not plain YAML: the tag tag:yaml.org,2002:timestamp"),
         (

@@ -179,6 +179,11 @@ DOCUMENTS = {
         "start of the "
         "file; delete the text before it",
     ),
+    "late declaration behind a byte order mark": (
+        b'\xef\xbb\xbf\n<?xml version="1.0"?>\n<robot name="r"/>',
+        "FILE:2: got text or blank lines before the XML declaration, expected <?xml ...?> at the very "
+        "start of the file; delete the text before it",
+    ),
     "unbound prefix": (
         '<robot name="r">\n<sensor:camera/></robot>',
         "FILE:2: <sensor:camera>: got the prefix 'sensor', which nothing declares, expected well-formed XML; "
@@ -257,7 +262,7 @@ CONTENTS = {
     "circle": (
         LINKS + JOINT + joint(name="k", parent="arm", child="base"),
         "FILE:1: <robot>: got no root link: the joints form a circle, expected one link that is no "
-        "joint's child",
+        "joint's child; loops are out of URDF's scope: open them and add <mimic>",
     ),
     "circle beside the tree": (
         LINKS
@@ -265,8 +270,10 @@ CONTENTS = {
         + '<link name="x"/>\n<link name="y"/>'
         + joint(name="k", parent="x", child="y")
         + joint(name="l", parent="y", child="x"),
-        "FILE:5: link 'x': got a circle of joints that never meets the root 'base', expected a tree\n"
-        "FILE:6: link 'y': got a circle of joints that never meets the root 'base', expected a tree",
+        "FILE:5: link 'x': got a circle of joints that never meets the root 'base', expected a tree; loops are out "
+        "of URDF's scope: open them and add <mimic>\n"
+        "FILE:6: link 'y': got a circle of joints that never meets the root 'base', expected a tree; loops are out "
+        "of URDF's scope: open them and add <mimic>",
     ),
     "no type": (
         LINKS + JOINT.replace(' type="revolute"', ""),
@@ -344,6 +351,47 @@ CONTENTS = {
         f'<link name="base"/><link name="arm">{INERTIAL.replace("iyy=", "iy=")}</link>' + JOINT,
         "FILE:2: link 'arm' inertial inertia: got no iyy, expected ixx, ixy, ixz, iyy, iyz, izz [kg m2]",
     ),
+    "axis as text": (
+        LINKS + joint("<axis>0 0 1</axis>"),
+        "FILE:5: joint 'j' axis: got text or elements inside it, expected only attributes; write its values as "
+        "attributes",
+    ),
+    "axis as elements of SDF": (
+        LINKS + joint("<axis><xyz>0 0 1</xyz></axis>"),
+        "FILE:5: joint 'j' axis: got text or elements inside it, expected only attributes; write its values as "
+        "attributes",
+    ),
+    "misspelt axis": (
+        LINKS + joint('<Axis xyz="0 0 1"/>'),
+        "FILE:5: joint 'j' axis: got the element <Axis>, expected <axis>; correct or remove it",
+    ),
+    "axis without direction": (
+        LINKS + joint('<axis zyx="0 0 1"/>'),
+        "FILE:5: joint 'j' axis: got no xyz, expected a direction; write <axis xyz=\"...\"/>",
+    ),
+    "misspelt origin": (
+        LINKS + joint('<orgin xyz="0 0 1"/>'),
+        "FILE:5: joint 'j' origin: got the element <orgin>, expected <origin>; correct or remove it",
+    ),
+    "pose of SDF": (
+        LINKS + joint("<pose>0 0 1 0 0 0</pose>"),
+        "FILE:5: joint 'j' origin: got the element <pose>, expected <origin>; correct or remove it",
+    ),
+    "misspelt multiplier": (
+        LINKS
+        + '<link name="tip"/>'
+        + joint('<mimic joint="k" multipler="-1"/>')
+        + joint(name="k", parent="arm", child="tip"),
+        "FILE:5: joint 'j' mimic: got the attribute 'multipler', expected 'multiplier'; correct or remove it",
+    ),
+    "inertial in a namespace": (
+        '<link name="base"/><link name="arm" xmlns:u="http://u"><u:inertial/></link>' + JOINT,
+        "FILE:2: link 'arm' inertial: got the element <u:inertial>, expected <inertial>; correct or remove it",
+    ),
+    "capital product of inertia": (
+        f'<link name="base"/><link name="arm">{INERTIAL.replace("ixy=", "Ixy=")}</link>' + JOINT,
+        "FILE:2: link 'arm' inertial inertia: got the attribute 'Ixy', expected 'ixy'; correct or remove it",
+    ),
     "everything is told once": (
         LINKS + joint('<origin rpy="0"/>') + joint(name="k", kind="ball", parent="arm", child="no"),
         "FILE:5: joint 'j' origin rpy: got 1 numbers ('0'), expected three numbers\n"
@@ -378,7 +426,12 @@ class TestLint:
             ("negative-friction", LINKS + joint('<dynamics damping="-1"/>')),
             ("non-unit-axis", LINKS + joint('<axis xyz="0 1 0.5"/>')),
             ("lower-above-upper", LINKS + joint('<limit lower="1" upper="0" effort="1" velocity="1"/>')),
+            ("lower-above-upper", LINKS + joint('<limit lower="1" upper="1" effort="1" velocity="1"/>')),
             ("unlimited", LINKS + joint('<limit lower="0" upper="1"/>')),
+            ("unusable-value", LINKS + JOINT.replace("<limit", "<limits")),
+            ("unusable-value", LINKS + joint('<dynamics dampening="1"/>')),
+            ("degrees", LINKS + joint('<origin rpy="0 5 0"/>')),
+            ("degrees", LINKS + joint('<limit lower="-20" upper="20" effort="1" velocity="1"/>')),
             ("degrees", LINKS + joint('<origin rpy="0 90 0"/>')),
             ("degrees", LINKS + joint('<limit lower="-170" upper="170" effort="1" velocity="1"/>')),
             ("millimetres", LINKS + joint('<origin xyz="0 0 330"/>')),

@@ -1,5 +1,6 @@
 """The numerical verification confirms the derived structure and reports each false statement."""
 
+import re
 from dataclasses import replace
 from fractions import Fraction
 
@@ -96,3 +97,14 @@ def test_an_arm_that_is_not_the_file_s_is_reported(rpr, true):
 def test_same_seed_same_proof(rpr, true):
     assert verify(rpr.robot, rpr.chain, true) == verify(rpr.robot, rpr.chain, true)
     assert verify(rpr.robot, rpr.chain, true, seed=1) != verify(rpr.robot, rpr.chain, true)
+
+
+def test_a_negative_mass_leaves_the_reading_undecided(robots, tmp_path):
+    """Pinocchio reads a negative mass as other numbers: this is no contradiction, and no defect to report."""
+    path = tmp_path / "arm.urdf"
+    text = (robots / "rpr.urdf").read_text()
+    path.write_text(re.sub('<mass value="', '<mass value="-', text, count=1))
+    loaded = load_arm(path)
+    checks = verify(loaded.robot, loaded.chain, derive(loaded.chain)).checks
+    assert [x.verdict for x in checks if x.verdict != "agrees"] == ["undecided"]
+    assert "negative mass of a link" in str(checks[-1])

@@ -125,15 +125,16 @@ class TestExpansion:
         (arm.parent / "parts" / "segment.xacro").write_text(SEGMENT.replace("0.02", "0.03"))
         assert f"{arm} has changed since the module was built" in check(module).reasons
 
-    @pytest.mark.parametrize("place", ["above", "beside", "without-manifest"])
+    @pytest.mark.parametrize("place", ["above", "beside", "without-manifest", "other-repository"])
     def test_packages_above_the_file_are_found_without_ros(self, arm, tmp_path, place):
-        package = tmp_path / "ws" / ("my_arm" if place != "above" else "checkout")
+        package = tmp_path / "ws" / ("vendor" if place == "other-repository" else "")
+        package /= "my_arm" if place != "above" else "checkout"
         (package / "urdf").mkdir(parents=True)
         if place != "without-manifest":
             (package / "package.xml").write_text("<package><name> my_arm </name></package>")
         shutil.copytree(arm.parent / "parts", package / "urdf" / "parts")
         (package / "urdf" / "part.xacro").write_bytes(arm.read_bytes())
-        other = tmp_path / "ws" / "app" if place == "beside" else package
+        other = tmp_path / "ws" / "app" if place in ("beside", "other-repository") else package
         (other / "robots").mkdir(parents=True, exist_ok=True)
         top = other / "robots" / "top.urdf.xacro"
         top.write_text(
@@ -178,6 +179,16 @@ def test_a_failure_of_xacro_is_reported_in_one_line(arm, case):
         "; correct it, or expand it where that works: xacro FILE name:=value ... > ROBOT.urdf"
     )
     assert "\n" not in told
+
+
+@installed
+def test_a_file_of_macros_is_named_as_one(arm):
+    library = arm.with_name("macros.xacro")
+    library.write_text(ARM.split("\n")[0] + "<robot xmlns:xacro='http://www.ros.org/wiki/xacro'>"
+                       "<xacro:macro name='m' params='x'><link name='${x}'/></xacro:macro></robot>")  # fmt: skip
+    assert refusal(library).endswith(
+        "; this xacro file only defines macros or properties: name the xacro file that includes it"
+    )
 
 
 @installed

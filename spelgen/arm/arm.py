@@ -300,7 +300,12 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
     # One remark lists all locked joints, because a humanoid robot has about thirty locked joints.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
-        names = ", ".join(repr(joint.name) for joint in outside)
+        # The real joint is never at 0 in this case, so that the real arm has other inertias.
+        limits = [joint.safe_limits or (0.0, 0.0) for joint in outside]
+        names = ", ".join(
+            repr(joint.name) + (" (0 is outside its limits)" if low > 0 or high < 0 else "")
+            for joint, (low, high) in zip(outside, limits, strict=True)
+        )
         message = f"locked at 0, not part of the chain: {names}"
         yield Diagnostic("info", "locked-joint", "joints", outside[0].line, message)
     for joint in locked:

@@ -171,7 +171,7 @@ def _longest(robot: Robot) -> ChainChoice:
         message = f"{names} slide side by side at the end of the chain: taken as a gripper's and locked"
         return ChainChoice(first[:-1], _remark(last, "info", message))
     if len(longest) == 1:
-        return ChainChoice(first, _possible_gripper(robot, last, is_pair))
+        return ChainChoice(first, _possible_gripper(robot, last, len(jaws) > 1))
     # A joint without effort limit (absent, or 0 in the file) probably has no motor: the chain without such joints is
     # the arm.
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
@@ -186,17 +186,17 @@ def _longest(robot: Robot) -> ChainChoice:
     raise ArmError(got, file=robot.source, expected="one longest chain", do=do)
 
 
-def _possible_gripper(robot: Robot, last: UrdfJoint, is_pair: bool) -> tuple[Diagnostic, ...]:
+def _possible_gripper(robot: Robot, last: UrdfJoint, is_mimicked: bool) -> tuple[Diagnostic, ...]:
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
-    The joint may open a gripper in three cases: it is prismatic and moves by at most 0.1 m; it is one of a pair of jaws
-    (``is_pair``); or its child link has the name of a gripper. Names of links are used only if no joint of the robot
-    has the name of a gripper: joints with such names are excluded from the chain already. A joint with a range of more
-    than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
+    The joint may open a gripper in three cases: it is prismatic and moves by at most 0.1 m; other jaws or finger joints
+    follow it (``is_mimicked``); or its child link has the name of a gripper. Names of links are used only if no joint
+    of the robot has the name of a gripper: joints with such names are excluded from the chain already. A joint with a
+    range of more than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
     """
     travel = last.upper - last.lower if last.lower is not None and last.upper is not None else 0.0
     is_named = bool(_GRIPPER.search(last.child)) and not any(map(_GRIPPER.search, robot.joint))
-    is_jaw = is_pair or (last.type == "prismatic" and 0 < travel <= _LARGEST_JAW)
+    is_jaw = is_mimicked or (last.type == "prismatic" and 0 < travel <= _LARGEST_JAW)
     if travel > math.pi or not (is_jaw or is_named):
         return ()
     message = (

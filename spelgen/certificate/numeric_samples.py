@@ -150,7 +150,12 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tup
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
-    """Return the dynamics of the URDF as Pinocchio reads it. Raises ValueError if the file has changed."""
+    """Return the dynamics of the URDF as Pinocchio reads it.
+
+    Raises ValueError if the file has changed, or if a mass is negative, which Pinocchio reads as other numbers.
+    """
+    if any(link.inertial is not None and link.inertial.mass < 0 for link in robot.links):
+        raise ValueError("negative mass of a link")
     document = read_document(robot.path)
     if hashlib.sha256(document.data).hexdigest() != robot.digest:
         raise ValueError("the file has changed since it was read")

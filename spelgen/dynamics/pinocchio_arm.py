@@ -27,15 +27,20 @@ def arm_dynamics(
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
 
-    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>.
+    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>, or negative mass,
+    for which Pinocchio returns meaningless numbers.
     """
     error = partial(
         ArmError,
-        "a link without <inertial>",
         expected="mass, center of mass and inertia of each moving body",
         do="write estimates into the URDF; a model that is trained on logs needs none",
     )
-    collect([error(element=f"joint {body.name!r}") for body in arm.bodies if body.inertia is None])
+    mass = {body.name: float(body.inertia[0]) if body.inertia else None for body in arm.bodies}
+    faults = {name: "a link without <inertial>" for name, value in mass.items() if value is None}
+    faults |= {
+        name: f"a body of {value:g} kg" for name, value in mass.items() if value is not None and value < 0
+    }
+    collect([error(got, element=f"joint {name!r}") for name, got in faults.items()])
     model = kinematic_model(arm)
     # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
     for index, body in enumerate(arm.bodies, start=1):

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from lxml import etree
 
 from spelgen.arm.actuation import derive_actuation
 from spelgen.dynamics.constraint import Constraint, mimic_constraint
 from spelgen.dynamics.friction import joint_friction
 from spelgen.settings.settings import load_settings
-from spelgen.urdf.document import urdf_bytes
+from spelgen.urdf.document import read_document
 from spelgen.urdf.read import read_urdf
 
 
@@ -159,7 +160,7 @@ def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) ->
     """
     robot, settings = read_urdf(urdf), load_settings(urdf)
     # Pinocchio parses the file itself, so the result is an independent reference for spelgen's own parser.
-    model = pin.buildModelFromXML(urdf_bytes(urdf).decode(errors="replace"))
+    model = pin.buildModelFromXML(etree.tostring(read_document(urdf).root, encoding="unicode"))
     model.gravity.linear = np.array(settings.gravity)
     constraint = mimic_constraint(robot, joints)
     missing = [name for name in constraint.names if not model.existJointName(name)]

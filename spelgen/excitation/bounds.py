@@ -52,8 +52,8 @@ def motion_bounds(
         arm: The arm.
         range_fraction: Fraction of each position range; the middle of the range is unchanged.
         speed_fraction: Fraction of each velocity limit.
-        joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits. None:
-            limits of mimic joints are ignored.
+        joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits, and to
+            the soft limits of <safety_controller>. None: limits of mimic joints and soft limits are ignored.
         ranges: {name of a joint: position range}, in place of the limits in the URDF. A continuous joint without a
             range has the range -pi to pi.
 
@@ -62,7 +62,8 @@ def motion_bounds(
     limits, speeds = np.zeros((len(arm.coordinates), 2)), np.zeros(len(arm.coordinates))
     for k, coordinate in enumerate(arm.coordinates):
         default = (-pi, pi) if coordinate.continuous else (nan, nan)
-        limits[k] = sorted((ranges or {}).get(coordinate.name) or coordinate.limits or default)
+        soft = joints[coordinate.name].safe_limits if joints else None
+        limits[k] = sorted((ranges or {}).get(coordinate.name) or soft or coordinate.limits or default)
         speeds[k] = coordinate.velocity or SPEEDS[coordinate.joint_type]
     # The position of a mimic joint is a linear function of the position of its driving joint. The range of the driving
     # joint is narrowed until both joints keep their limits.
@@ -71,8 +72,8 @@ def motion_bounds(
         mimic = (joints or {}).get(body.name)
         if mimic is None or body.name == arm.coordinates[k].name or not factor:
             continue
-        if mimic.type != "continuous" and mimic.lower is not None and mimic.upper is not None:
-            low, high = sorted((end - body.offset) / factor for end in (mimic.lower, mimic.upper))
+        if mimic.safe_limits is not None:
+            low, high = sorted((end - body.offset) / factor for end in mimic.safe_limits)
             limits[k] = max(low, limits[k, 0]), min(high, limits[k, 1])
         if mimic.velocity:
             speeds[k] = min(speeds[k], mimic.velocity / abs(factor))

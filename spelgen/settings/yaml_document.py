@@ -4,6 +4,7 @@ Unsafe or ambiguous constructs of YAML are errors. This module also defines the 
 the base class of their groups of keys.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +30,7 @@ EXPECTED = {
 }  # fmt: skip
 
 Checked = TypeVar("Checked", bound=BaseModel)
+_OCTAL = re.compile("[-+]?0[0-7]+")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | Non
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """The safe loader of PyYAML, for which tags, aliases, deep nesting and repeated keys are errors."""
+    """The safe loader of PyYAML, for which tags, aliases, deep nesting, repeated keys and 1:50 are errors."""
 
     depth = 0
 
@@ -101,6 +103,10 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
+        # YAML 1.1 reads 1:50 as 110 (base 60) and 0100 as 64 (octal): a gear ratio written so would be wrong silently.
+        is_number = str(node.tag).endswith((":int", ":float"))
+        if is_number and (":" in node.value or _OCTAL.fullmatch(node.value)):
+            raise ComposerError(None, None, f"the number {node.value}, which is not decimal", mark)
         return node
 
     def compose_mapping_node(self, anchor: str | None) -> yaml.Node:

@@ -112,7 +112,8 @@ def _refuse_damage(path: Path, data: bytes) -> None:
     if conflict:
         line, do = _line_of(data, conflict.start()), "resolve the merge conflict first"
         raise UrdfError("a merge-conflict marker", file=path, line=line, expected="XML", do=do)
-    if data.lstrip().startswith(b"<?xml") and not data.startswith(b"<?xml"):
+    text = data.removeprefix(b"\xef\xbb\xbf")  # UTF-8 byte order mark
+    if text.lstrip().startswith(b"<?xml") and not text.startswith(b"<?xml"):
         raise UrdfError(
             "text or blank lines before the XML declaration", file=path, line=_line_of(data, data.index(b"<?xml")),
             expected="<?xml ...?> at the very start of the file", do="delete the text before it",

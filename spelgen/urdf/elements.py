@@ -99,10 +99,17 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     dynamics = motion.child("dynamics")
     damping, friction = dynamics.number("damping") or 0.0, dynamics.number("friction") or 0.0
     mimic = _read_mimic(joint.child("mimic")) if kind in MOVING else None
+    # Only motions need the soft limits, so that their errors become warnings, too.
+    safety = Element(optional, xml, joint.where).child("safety_controller")
+    low, high = safety.number("soft_lower_limit"), safety.number("soft_upper_limit")
+    # Exporters write two zeros for no soft limits.
+    soft = (low, high) if low is not None and high is not None and low < high else None
     notes.add_as_warnings(optional)
     if kind not in JOINT_TYPES or parent is None or child is None:
         return None
-    return UrdfJoint(name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, joint.line)
+    return UrdfJoint(
+        name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, joint.line, soft
+    )
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
@@ -125,10 +132,15 @@ def _read_origin(parent: Element) -> tuple[Vector, Vector]:
 
 
 def _read_axis(joint: Element, kind: str | None) -> Vector:
-    axis, error_count = joint.child("axis"), len(joint.notes.errors)
+    error_count = len(joint.notes.errors)
+    axis = joint.child("axis")
     xyz = axis.triple("xyz", (1.0, 0.0, 0.0))  # URDF defines (1, 0, 0) as the default of the joint axis.
+    if len(joint.notes.errors) > error_count:
+        return xyz
+    if axis.xml is not None and axis.text("xyz") is None:
+        axis.error("no xyz", "a direction", 'write <axis xyz="..."/>')
     # A joint axis of length zero is an error, because it cannot be normalised.
-    if kind in MOVING and len(joint.notes.errors) == error_count and max(map(abs, xyz)) < 1e-9:
+    elif kind in MOVING and max(map(abs, xyz)) < 1e-9:
         do = f'give the {kind} joint an axis such as "0 0 1"'
         joint.notes.error(axis.line, joint.where, f"the axis {axis.text('xyz')!r}", "a direction", do)
     return xyz

@@ -1,7 +1,7 @@
 """Warnings about physically inconsistent values and probable mistakes in a URDF."""
 
 from collections.abc import Iterator, Sequence
-from math import pi
+from math import inf, pi
 
 import numpy as np
 
@@ -112,8 +112,12 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
         yield "non-unit-axis", f"{where} axis", line, f"its length is {length:.6g}: normalised"
     # A lower limit above the upper limit is reported and not corrected: the limits may be swapped, or one of the
     # numbers may be wrong.
-    if joint.lower is not None and joint.upper is not None and joint.lower > joint.upper:
+    if joint.lower is not None and joint.upper is not None and joint.lower >= joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
+        if joint.lower == joint.upper:
+            message = (
+                f"lower and upper are both {joint.lower:g}: the joint cannot move, perhaps its type is fixed"
+            )
         yield "lower-above-upper", f"{where} limit", line, message
 
 
@@ -121,12 +125,14 @@ def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
     """Yield warnings about angles that are probably in degrees, and lengths that are probably in millimetres."""
     limits = [abs(x) for x in (joint.lower, joint.upper) if x is not None and joint.type == "revolute"]
     sizes = (
-        ("degrees", "origin", "rpy", max(map(abs, joint.rpy)), "rad", 2 * pi + 0.01),
-        ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi),
-        ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", _LARGEST_LENGTH),
+        ("degrees", "origin", "rpy", max(map(abs, joint.rpy)), "rad", 2 * pi + 0.01, 2.0),
+        ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi, 2 * pi),
+        ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", _LARGEST_LENGTH, inf),
     )
-    for code, element, quantity, size, unit, largest in sizes:
-        if size > largest:
+    # Angles in radians are rarely whole numbers: in the URDFs of ../shared no angle of an <origin> of at least 2 rad is
+    # one, and no position limit between 2 pi and 1000.
+    for code, element, quantity, size, unit, largest, largest_whole in sizes:
+        if size > largest or (size >= largest_whole and size.is_integer()):
             message = f"{quantity} of {size:g} {unit}: perhaps {code}"
             yield code, f"joint {joint.name!r} {element}", joint.line, message
 

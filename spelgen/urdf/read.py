@@ -16,6 +16,7 @@ from spelgen.urdf.robot import Robot, UrdfJoint, UrdfLink
 from spelgen.urdf.values import Notes
 
 MAX_LINKS = 2000
+_OPEN_LOOPS = "loops are out of URDF's scope: open them and add <mimic>"
 Part = TypeVar("Part", UrdfLink, UrdfJoint)
 
 
@@ -42,7 +43,7 @@ def read_urdf(path: Path) -> Robot:
     if document.leftovers:
         message = f"{len(document.leftovers)} <xacro:property> elements were left behind by xacro: ignored"
         notes.warn(document.leftovers[0], "unexpanded-xacro", "robot", message)
-    links = _read_links(notes, root)
+    links = _read_links(notes, root, document.path != path)
     # Only direct children of <robot> are read: elements for Gazebo, and transmissions, contain <joint> elements too.
     joints = _unique(notes, [read_joint(notes, element) for element in root.findall("joint")])
     _check_ends(notes, links, joints)
@@ -78,7 +79,7 @@ def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     return tuple(sorted([*notes.diagnostics, *warnings], key=lambda remark: remark.line or 0))
 
 
-def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
+def _read_links(notes: Notes, root: etree._Element, is_expanded: bool) -> list[UrdfLink]:
     elements = root.findall("link")
     # The number of links is bounded, because the time of all later steps increases with it. Arms have at most a tenth
     # of the bound.
@@ -88,6 +89,8 @@ def _read_links(notes: Notes, root: etree._Element) -> list[UrdfLink]:
     if not elements:
         is_xacro = any(uri.endswith("/xacro") for uri in root.nsmap.values())
         do = "this is a xacro file: expand it with the xacro command first" if is_xacro else None
+        if is_expanded:
+            do = "this xacro file only defines macros or properties: name the xacro file that includes it"
         if root.find("group") is not None:
             do = "this is an SRDF file: name the URDF that it belongs to"
         notes.error(root.sourceline, "<robot>", "no <link>", "a tree of links and joints", do)
@@ -126,8 +129,7 @@ def _check_ends(notes: Notes, links: Sequence[UrdfLink], joints: Sequence[UrdfJo
         if joint.child in above:
             first = above[joint.child]
             got = f"the link {joint.child!r}, which hangs from {first.name!r} (line {first.line}) already"
-            do = "loops are out of URDF's scope: open them and add <mimic>"
-            notes.error(joint.line, f"{where} child", got, "one parent per link", do)
+            notes.error(joint.line, f"{where} child", got, "one parent per link", _OPEN_LOOPS)
         above.setdefault(joint.child, joint)
 
 
@@ -169,7 +171,7 @@ def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
     children = {joint.child for joint in robot.joints}
     tops = [link for link in robot.links if link.name not in children]
     if len(tops) != 1:
-        got, do = "no root link: the joints form a circle", None
+        got, do = "no root link: the joints form a circle", _OPEN_LOOPS
         if tops:
             listed = ", ".join(f"{top.name!r} (line {top.line})" for top in tops[:10])
             got, do = f"{len(tops)} root links: {listed}", "join the trees by a fixed joint"
@@ -182,5 +184,5 @@ def _rooted(notes: Notes, root: etree._Element, robot: Robot) -> Robot:
     for link in robot.links:
         if link.name not in connected:
             got = f"a circle of joints that never meets the root {robot.root!r}"
-            notes.error(link.line, f"link {link.name!r}", got, "a tree")
+            notes.error(link.line, f"link {link.name!r}", got, "a tree", _OPEN_LOOPS)
     return robot

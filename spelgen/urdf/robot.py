@@ -57,6 +57,7 @@ class UrdfJoint(NamedTuple):
     ``xyz`` [m] and ``rpy`` [rad] are the pose of the joint's frame in the frame of the parent link. ``axis`` is in the
     frame of the joint, as in the file (not normalised); (1, 0, 0) if absent. Limits: ``lower``, ``upper`` [rad, m],
     ``effort`` [Nm, N], ``velocity`` [rad/s, m/s]; None if absent. ``damping`` [Nm s/rad, N s/m], ``friction`` [Nm, N].
+    ``soft``: soft lower and upper limit of the <safety_controller> [rad, m]; None if absent.
     """
 
     name: str
@@ -74,6 +75,21 @@ class UrdfJoint(NamedTuple):
     friction: float
     mimic: Mimic | None
     line: int
+    soft: tuple[float, float] | None = None
+
+    @property
+    def safe_limits(self) -> tuple[float, float] | None:
+        """Position limits in increasing order, narrowed to the soft limits [rad, m]; None if one limit is absent.
+
+        Soft limits outside the position limits are ignored.
+        """
+        if self.lower is None or self.upper is None:
+            return None
+        low, high = sorted((self.lower, self.upper))
+        soft_low, soft_high = self.soft or (low, high)
+        return (
+            (max(low, soft_low), min(high, soft_high)) if soft_low < high and soft_high > low else (low, high)
+        )
 
     @property
     def moves(self) -> bool:

@@ -8,7 +8,8 @@ length, finiteness). Tests compare with yourdfpy all values that it does not cha
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from difflib import SequenceMatcher
 from math import isfinite
 from pathlib import Path
 
@@ -24,6 +25,20 @@ MAX_NAME = 256
 # [rad, m; Nm, N; rad/s, m/s] A limit of at least this magnitude means that the joint has no limit: exporters write 1e9,
 # 1e16 or DBL_MAX in this case.
 UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
+# {element of a joint or inertial: its optional attributes, of which a misspelt one would be ignored silently}. In
+# contrast to SDF, these elements have no text and no children. Readers of <origin> refuse all unknown attributes.
+_LEAVES = {
+    "origin": (),
+    "axis": (),
+    "limit": ("lower", "upper", "effort", "velocity"),
+    "dynamics": ("damping", "friction"),
+    "mimic": ("multiplier", "offset"),
+    "mass": (),
+    "inertia": ("ixy", "ixz", "iyz"),
+}
+# [1] Two names of at least this similarity are spellings of one name. In the URDFs of ../shared
+# (arms and cases), no element or attribute beyond the URDF format resembles an absent one of the format as much.
+_SIMILARITY = 0.75
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
 
@@ -89,7 +104,35 @@ class Element:
         if len(children) > 1:
             message = f"{len(children)} <{tag}> elements: the first is taken, the others are ignored"
             self.notes.warn(children[1].sourceline, "repeated-element", self.where, message)
-        return Element(self.notes, children[0] if children else None, f"{self.where} {tag}")
+        child = Element(self.notes, children[0] if children else None, f"{self.where} {tag}")
+        if self.xml is not None:
+            # Unusable limits and friction count as absent, and other content is an error: the geometry, for example,
+            # would be wrong without a message.
+            ignored = Notes(self.notes.path)
+            replace(child, notes=ignored)._find_ignored(tag, self.xml)
+            if tag in ("limit", "dynamics"):
+                self.notes.add_as_warnings(ignored)
+            else:
+                self.notes.errors += ignored.errors
+        return child
+
+    def _find_ignored(self, tag: str, parent: etree._Element) -> None:
+        """Add errors for content of ``parent`` that is probably intended as the element ``tag``, and would be ignored."""
+        if self.xml is None:
+            for sibling in parent.iterchildren(etree.Element):
+                name = etree.QName(sibling).localname
+                if sibling.tag not in _LEAVES and (
+                    _is_spelling(name, tag) or (name, tag) == ("pose", "origin")
+                ):
+                    got = f"the element <{f'{sibling.prefix}:' if sibling.prefix else ''}{name}>"
+                    self.notes.error(sibling.sourceline, self.where, got, f"<{tag}>", "correct or remove it")
+        elif tag in _LEAVES:
+            if (self.xml.text or "").strip() or next(self.xml.iterchildren(etree.Element), None) is not None:
+                self.error("text or elements inside it", "only attributes", "write its values as attributes")
+            for absent in set(_LEAVES[tag]) - set(self.xml.attrib):
+                for key in self.xml.attrib:
+                    if key not in _LEAVES[tag] and _is_spelling(key, absent):
+                        self.error(f"the attribute {key!r}", repr(absent), "correct or remove it")
 
     def text(self, key: str) -> str | None:
         """Return the text of an attribute; None if the attribute or the element is absent."""
@@ -186,3 +229,8 @@ class Element:
             do = "expand the file with the xacro command first"
             self.error(f"the xacro expression {text[:64]!r}", "a plain value", do, key)
         return is_unexpanded
+
+
+def _is_spelling(text: str, name: str) -> bool:
+    """Whether ``text`` is probably a misspelling of ``name``; upper and lower case count as equal."""
+    return SequenceMatcher(None, text.lower(), name).ratio() >= _SIMILARITY

@@ -65,14 +65,15 @@ def _failure(path: Path, code: int, lines: list[str]) -> UrdfError:
 def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path) -> None:
     """Replace xacro's function for $(find PACKAGE), so that packages are found without ROS.
 
-    A package is searched in the folders above the file ``path`` and in their subfolders PACKAGE, and then by xacro.
+    A package is searched in the folders above the file ``path``, in their subfolders PACKAGE and */PACKAGE (another
+    repository of the workspace), and then by xacro.
     functions: xacro's functions by name, of which ``_eval_find`` is replaced.
     """
     installed = functions["_eval_find"]
 
     def find(package: str) -> str:
         for folder in path.parents:
-            for candidate in (folder, folder / package):
+            for candidate in (folder, folder / package, *(x / package for x in folder.glob("*/"))):
                 manifest = candidate / "package.xml"
                 if manifest.is_file():
                     name = re.search(r"<name>\s*(.*?)\s*</name>", manifest.read_text(errors="replace"))
