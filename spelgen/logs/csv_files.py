@@ -28,7 +28,17 @@ COMMENT = re.compile(r"^(#|% )\s*")
 
 
 # Texts that are no value, in addition to the texts that Arrow recognises.
-NO_VALUE = [*pa.csv.ConvertOptions().null_values, "-", "--", "---", "None"]
+NO_VALUE = [
+    *pa.csv.ConvertOptions().null_values,
+    "-",
+    "--",
+    "---",
+    "None",
+    "missing",
+    "nan(ind)",
+    "-nan(ind)",
+]
+NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", "1.#INF", "-1.#INF"]
 
 
 class Beginning(NamedTuple):
@@ -77,10 +87,12 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
         return "skip" if len(wrong) == 1 else "error"
 
     source, encoding = file, text.encoding
-    # Several spaces, which align columns, are replaced by one: Arrow does not treat them as one delimiter.
-    if text.delimiter == " " and re.search("^ |  ", text.rows, re.MULTILINE):
-        aligned = re.sub("^ +| +$| +(?= )", "", file.read_text(encoding), flags=re.MULTILINE)
-        source, encoding = pa.BufferReader(aligned.encode()), "utf-8"
+    # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
+    exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
+    spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
+    if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
+        plain = re.sub(spaces, "", re.sub(exponent, "E", file.read_text(encoding)), flags=re.MULTILINE)
+        source, encoding = pa.BufferReader(plain.encode()), "utf-8"
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
     rows = {"skip_rows": text.lines, "column_names": names or text.names}

@@ -147,6 +147,9 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
     samples = max(rows.values(), default=0)
+    for name in names:
+        if rows[name] != samples and arrays[name].shape[-1] == samples:
+            raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")
     table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
