@@ -509,7 +509,7 @@ def test_units_of_velocities_are_read_in_each_notation(robots, tmp_path, form, f
     ("measured", "computed"),
     [
         ("qfrc_actuator[{}]", "qfrc_bias[{}]"),
-        ("applied_torque/joint{}", "computed_torque/joint{}"),
+        ("applied_torque_{}", "computed_torque_{}"),
         ("tau_m{}", "tau_g{}"),
         ("tau{}_raw", "tau{}_filt"),
         ("actual_current_as_torque_{}", "actual_current_{}"),

@@ -28,17 +28,8 @@ COMMENT = re.compile(r"^(#|% )\s*")
 
 
 # Texts that are no value, in addition to the texts that Arrow recognises.
-NO_VALUE = [
-    *pa.csv.ConvertOptions().null_values,
-    "-",
-    "--",
-    "---",
-    "None",
-    "missing",
-    "nan(ind)",
-    "-nan(ind)",
-]
-NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", "1.#INF", "-1.#INF"]
+NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#INF", "-1.#INF"]
+NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
 
 
 class Beginning(NamedTuple):
@@ -81,10 +72,9 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     wrong: list[pa.csv.InvalidRow] = []
 
     def skipped(row: pa.csv.InvalidRow) -> str:
-        if COMMENT.match(row.text):
-            return "skip"
-        wrong.append(row)
-        return "skip" if len(wrong) == 1 else "error"
+        if not COMMENT.match(row.text):
+            wrong.append(row)
+        return "skip" if len(wrong) < 2 else "error"
 
     source, encoding = file, text.encoding
     # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).

@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, groupby, pairwise
-from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,7 +36,7 @@ WORDS = {
     )
 }  # fmt: skip
 # Words in names of columns that mark commanded values, measured values, signals other than those of joints, and values
-# that a model or a filter computed, which are used only if the log has no others.
+# that a model computed, which are used only if the log has no others.
 COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
@@ -46,7 +45,7 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
         "actual act measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
         "dot vol volt voltage temp temperature bias passive constraint residual",
-        "computed model predicted pred sim simulated filt filtered smooth smoothed g c f",
+        "computed model predicted pred sim simulated g c f",
     )
 )
 # Letters that are quantities in names such as `i_actual` and `m_actual`.
@@ -59,6 +58,7 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
+FILTERED = {"filt", "filtered", "smooth", "smoothed"}
 CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
 CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
 
@@ -227,11 +227,10 @@ def _is_rising(values: np.ndarray) -> bool:
     A counter of rows rises by one in each row, and is no clock.
     """
     steps = np.diff(values)
-    if len(steps) < 2 or not (steps > 0).all() or (steps == 1).all():
+    if len(steps) < 2 or (steps <= 0).any() or (steps == 1).all():
         return False
     middle = float(np.median(steps))
-    is_regular = (np.abs(steps - middle) < middle / 2).mean() > 0.9
-    return bool(is_regular and time_unit(middle))
+    return bool(np.mean(np.abs(steps - middle) < middle / 2) > 0.9 and time_unit(middle))
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
@@ -425,8 +424,9 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. Torques are preferred to currents, signals of joints to signals of motors,
-    measurements to values that a model or a filter computed, names with a word such as "actual" to others, and names with few words to longer ones: `tau_J` to
+    differ only in the words of the joint. Measurements are preferred to values that a model computed, torques to
+    currents, signals of joints to signals of motors, names with a word such as "actual" to others, values without a
+    filter to filtered ones, and names with few words to longer ones: `tau_J` to
     `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
@@ -434,21 +434,15 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         signals.setdefault(frozenset(column.words), []).append(column)
-    complete = [
-        (
-            (
-                *map(
-                    bool,
-                    (words & CURRENT, words & {"motor", "theta"}, words & COMPUTED, not words & MEASURED),
-                ),
-                len(words),
-            ),
-            named,
-        )
-        for words, named in signals.items()
-        if len(named) >= joints
-    ]
-    return min(reversed(complete), key=itemgetter(0), default=((), columns))[1]
+    complete = {words: named for words, named in signals.items() if len(named) >= joints}
+    best = min(reversed(complete), key=_rank, default=frozenset[str]())
+    return complete.get(best, columns)
+
+
+def _rank(words: frozenset[str]) -> list[int]:
+    """Return the order of preference of a signal with these words, the smallest first (see `_of_one_signal`)."""
+    ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
+    return [*ranks, words.isdisjoint(MEASURED), not words.isdisjoint(FILTERED), len(words)]
 
 
 def _by_joint(
@@ -461,8 +455,7 @@ def _by_joint(
     number}, the result of `_order_in_cells`.
     """
     named = {column.joint: column for column in columns if column.joint}
-    numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
-    numbered = {int(match[-1]): column for match, column in numbers if match}
+    numbered = {int(match[-1]): x for x in columns if (match := re.findall(r"\d+", x.name))}
     if named or len(numbered) < len(joints):
         return {joint: named[joint] for joint in joints if joint in named}
     if set(order) == set(joints):
