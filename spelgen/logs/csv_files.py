@@ -161,16 +161,15 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 
     lines, cells: text and cells of each line. header: index of the header.
     """
-    names, between = cells[header], header + 1
+    names, start = cells[header], header + 1
     is_repeated = len(set(names)) < len(names) - 1
-    start = between
     while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
         start += 1
-    if is_repeated and start > between:
+    if is_repeated and start > header + 1:
         filled = names[:1]
         for name in names[1:]:
             filled.append(name or filled[-1])
-        columns = zip_longest(filled, *cells[between:start], fillvalue="")
+        columns = zip_longest(filled, *cells[header + 1 : start], fillvalue="")
         names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
     return names, start
 
