@@ -548,7 +548,7 @@ def test_exponents_of_fortran_are_read(scara, tmp_path):
 
 @pytest.mark.parametrize("text", ["missing", "#DIV/0!", "nan(ind)", "1.#INF"])
 def test_texts_for_no_value_are_gaps(scara, tmp_path, text):
-    """The error proposes to leave out the rows."""
+    """The error states the setting that omits such rows."""
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU]).tolist()
     rows[5][3] = text
