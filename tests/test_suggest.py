@@ -482,3 +482,81 @@ def test_leaders_command_followers(scara, tmp_path):
         written(tmp_path / "log.csv", head, np.column_stack([T, Q, Q])), names, commands=True
     )
     assert f'"q": "follower_{names[0]}", "u": "leader_{names[0]}"' in draft.text
+
+
+@pytest.mark.parametrize(
+    ("form", "factor"),
+    [
+        (("q{} [turns]", "qd{} [turns/s]"), (1 / (2 * np.pi),) * 2),
+        (("pos_{}_turns", "vel_{}_turns_s"), (1 / (2 * np.pi),) * 2),
+        (("pos_{}_revolutions", "vel_{}_rps"), (1 / (2 * np.pi),) * 2),
+        (("q{}_rad", "qd{}_deg_s"), (1, 180 / np.pi)),
+        (("q{}_rad", "qd{}_deg_per_s"), (1, 180 / np.pi)),
+        (("q{} (rad)", "qd{} (deg s^-1)"), (1, 180 / np.pi)),
+        (("q{} [mrad]", "qd{}"), (1000, 1000)),
+    ],
+)
+def test_units_of_velocities_are_read_in_each_notation(robots, tmp_path, form, factor):
+    """A velocity without a unit has the unit of the position per second, and "deg_s" is deg/s."""
+    head = ["t", *(name.format(k) for name in (*form, "tau{}") for k in range(2))]
+    rows = np.column_stack([T, Q[:, :2] * factor[0], QD[:, :2] * factor[1], TAU[:, :2]])
+    log, _ = suggested(written(tmp_path / "log.csv", head, rows), load_arm(robots / "two_link.urdf"))
+    np.testing.assert_allclose(log.q, Q[:, :2], atol=1e-9)
+    np.testing.assert_allclose(log.qd, QD[:, :2], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("measured", "computed"),
+    [
+        ("qfrc_actuator[{}]", "qfrc_bias[{}]"),
+        ("applied_torque_{}", "computed_torque_{}"),
+        ("tau_m{}", "tau_g{}"),
+        ("tau{}_raw", "tau{}_filt"),
+        ("actual_current_as_torque_{}", "actual_current_{}"),
+    ],
+)
+@pytest.mark.parametrize("is_first", [True, False])
+def test_measured_torques_are_preferred_to_computed_ones_and_currents(
+    scara, tmp_path, measured, computed, is_first
+):
+    """The order of the columns does not matter."""
+    torques = [(measured, TAU), (computed, 3 * TAU)]
+    torques = torques if is_first else torques[::-1]
+    head = ["t", *(name.format(k) for name in ("q{}", "qd{}", *(x for x, _ in torques)) for k in range(4))]
+    rows = np.column_stack([T, Q, QD, *(x for _, x in torques)])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_current_as_a_word_for_present_is_no_unit(scara, tmp_path):
+    head = ["t", *(f"current_{x}{k}" for x in ("position", "velocity", "torque") for k in range(4))]
+    log, text = suggested(written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU])), scara)
+    require_same(log)
+    assert "gain" not in text
+
+
+def test_minutes_of_a_clock_are_named_in_the_draft(scara, tmp_path):
+    head = ["time [min]", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T / 60, Q, QD, TAU]))
+    assert "# not a known unit of t: min" in suggested(path, scara)[1]
+
+
+def test_exponents_of_fortran_are_read(scara, tmp_path):
+    head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = [[f"{x:.15E}".replace("E", "D") for x in row] for row in np.column_stack([T, Q, QD, TAU])]
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize("text", ["missing", "#DIV/0!", "nan(ind)", "1.#INF"])
+def test_texts_for_no_value_are_gaps(scara, tmp_path, text):
+    """The error states the setting that omits such rows."""
+    head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU]).tolist()
+    rows[5][3] = text
+    with pytest.raises(LogError, match="dropouts: dropped"):
+        suggested(written(tmp_path / "log.csv", head, rows), scara)
+
+
+def test_matrices_with_a_column_per_time_are_to_be_transposed(scara, tmp_path):
+    np.savez(tmp_path / "log.npz", t=T, q=Q.T, qd=QD.T, tau=TAU.T)
+    with pytest.raises(LogError, match="transpose it: rows are times"):
+        suggested(tmp_path / "log.npz", scara)

@@ -28,7 +28,8 @@ COMMENT = re.compile(r"^(#|% )\s*")
 
 
 # Texts that are no value, in addition to the texts that Arrow recognises.
-NO_VALUE = [*pa.csv.ConvertOptions().null_values, "-", "--", "---", "None"]
+NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#INF", "-1.#INF"]
+NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
 
 
 class Beginning(NamedTuple):
@@ -71,16 +72,17 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     wrong: list[pa.csv.InvalidRow] = []
 
     def skipped(row: pa.csv.InvalidRow) -> str:
-        if COMMENT.match(row.text):
-            return "skip"
-        wrong.append(row)
-        return "skip" if len(wrong) == 1 else "error"
+        if not COMMENT.match(row.text):
+            wrong.append(row)
+        return "skip" if len(wrong) < 2 else "error"
 
     source, encoding = file, text.encoding
-    # Several spaces, which align columns, are replaced by one: Arrow does not treat them as one delimiter.
-    if text.delimiter == " " and re.search("^ |  ", text.rows, re.MULTILINE):
-        aligned = re.sub("^ +| +$| +(?= )", "", file.read_text(encoding), flags=re.MULTILINE)
-        source, encoding = pa.BufferReader(aligned.encode()), "utf-8"
+    # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
+    exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
+    spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
+    if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
+        plain = re.sub(spaces, "", re.sub(exponent, "E", file.read_text(encoding)), flags=re.MULTILINE)
+        source, encoding = pa.BufferReader(plain.encode()), "utf-8"
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
     rows = {"skip_rows": text.lines, "column_names": names or text.names}
@@ -159,16 +161,15 @@ def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int)
 
     lines, cells: text and cells of each line. header: index of the header.
     """
-    names, between = cells[header], header + 1
+    names, start = cells[header], header + 1
     is_repeated = len(set(names)) < len(names) - 1
-    start = between
     while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
         start += 1
-    if is_repeated and start > between:
+    if is_repeated and start > header + 1:
         filled = names[:1]
         for name in names[1:]:
             filled.append(name or filled[-1])
-        columns = zip_longest(filled, *cells[between:start], fillvalue="")
+        columns = zip_longest(filled, *cells[header + 1 : start], fillvalue="")
         names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
     return names, start
 

@@ -38,10 +38,8 @@ class NpzArrays:
             # zipfile reads no more bytes than the archive states.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
-                got, limit = (
-                    f"{self._bytes / 1e9:.3g} GB of arrays",
-                    f"at most {TUNING.npz_bytes / 1e9:.3g} GB",
-                )
+                got = f"{self._bytes / 1e9:.3g} GB of arrays"
+                limit = f"at most {TUNING.npz_bytes / 1e9:.3g} GB"
                 raise self.error(member.filename, got, limit, "write larger logs as Parquet")
             with self._archive.open(member) as data:
                 try:
@@ -147,6 +145,9 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
     samples = max(rows.values(), default=0)
+    for name in names:
+        if rows[name] != samples and arrays[name].shape[-1] == samples:
+            raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")
     table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
@@ -168,7 +169,6 @@ def _order(matrix: str, arrays: NpzArrays, names: list[str]) -> list[int]:
             raise arrays.error(stored, f"the joints {', '.join(logged)}", expected)
         return [logged.index(name) for name in names]
     if width != len(names):
-        is_turned = rows == len(names)
-        do = "transpose it: rows are times" if is_turned else "name them by an array 'joints'"
+        do = "transpose it: rows are times" if rows == len(names) else "name them by an array 'joints'"
         raise arrays.error(matrix, f"{width} columns", f"{len(names)}, one for each joint", do)
     return list(range(width))

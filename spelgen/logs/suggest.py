@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, groupby, pairwise
-from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,15 +35,17 @@ WORDS = {
                 "curr cur drehmoment strom couple par 力矩 扭矩 电流"),
     )
 }  # fmt: skip
-# Words in names of columns that mark commanded values, measured values, and signals other than those of joints.
-COMMANDED, MEASURED, OTHERS = (
+# Words in names of columns that mark commanded values, measured values, signals other than those of joints, and values
+# that a model computed, which are used only if the log has no others.
+COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
         "ipo set soll u leader consigne 目标 指令 设定",
         "actual act measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
-        "dot vol volt voltage temp temperature",
+        "dot vol volt voltage temp temperature bias passive constraint residual",
+        "computed model predicted pred sim simulated g c f",
     )
 )
 # Letters that are quantities in names such as `i_actual` and `m_actual`.
@@ -57,6 +58,7 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
+FILTERED = {"filt", "filtered", "smooth", "smoothed"}
 CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
 CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
 
@@ -169,7 +171,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     ]
     unknown = {
         (quantity, column.unit)
-        for quantity, named in by_joint.items()
+        for quantity, named in [*by_joint.items(), ("t", {"": clock})]
         for column in named.values()
         if column.unit and column.unit not in UNITS["q" if quantity == "u" else quantity]
     }
@@ -225,11 +227,10 @@ def _is_rising(values: np.ndarray) -> bool:
     A counter of rows rises by one in each row, and is no clock.
     """
     steps = np.diff(values)
-    if len(steps) < 2 or not (steps > 0).all() or (steps == 1).all():
+    if len(steps) < 2 or (steps <= 0).any() or (steps == 1).all():
         return False
     middle = float(np.median(steps))
-    is_regular = (np.abs(steps - middle) < middle / 2).mean() > 0.9
-    return bool(is_regular and time_unit(middle))
+    return bool(np.mean(np.abs(steps - middle) < middle / 2) > 0.9 and time_unit(middle))
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
@@ -307,9 +308,9 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
-    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s)?)[\W\d_]*", bare)
-    if not unit and last and last[2].lower() in unit_names - BARE and last[2] != name[:1]:
-        bare, unit = last[1], last[2].lower()
+    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
+    if not unit and last and plain_unit(last[2]) in unit_names - BARE and last[2] != name[:1]:
+        bare, unit = last[1], plain_unit(last[2])
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
     # Chinese words are not separated by blanks.
     separated = re.sub("|".join(CHINESE), r" \g<0> ", separated)
@@ -318,7 +319,9 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     quantity = "t" if words & WORDS["t"] else None
     # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
     for word in reversed(texts):
-        quantity = quantity or next((x for x, of_quantity in WORDS.items() if word in of_quantity), None)
+        if quantity is None and (quantity := next((x for x, y in WORDS.items() if word in y), None)):
+            # The values of `current_torque` and `current_as_torque` are no currents.
+            words = words if word in CURRENT else words - CURRENT
     quantity = quantity or next((x for x, units in UNITS.items() if unit in units), None)
     if quantity is None and words & MEASURED:
         quantity = next((LETTERS[x] for x in texts if x in LETTERS), None)
@@ -357,8 +360,8 @@ def _units(
     for quantity, named in by_joint.items():
         for joint, column in named.items():
             unit = UNITS["q" if quantity == "u" else quantity].get(column.unit)
-            if unit is None and quantity == "qd":
-                unit = {"deg": "deg/s", "rad": "rad/s", "mm": "mm/s"}.get(units[joint].get("q", ""))
+            if unit is None and quantity == "qd" and "q" in units[joint]:
+                unit = f"{units[joint]['q']}/s"
             if unit is None and quantity == "tau" and column.words & CURRENT:
                 unit = "A"
             # The unit of positions also applies to commands.
@@ -421,8 +424,9 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. Torques are preferred to currents, signals of joints to signals of motors,
-    names with a word such as "actual" to others, and names with few words to longer ones: `tau_J` to
+    differ only in the words of the joint. Measurements are preferred to values that a model computed, torques to
+    currents, signals of joints to signals of motors, names with a word such as "actual" to others, values without a
+    filter to filtered ones, and names with few words to longer ones: `tau_J` to
     `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
@@ -430,15 +434,15 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         signals.setdefault(frozenset(column.words), []).append(column)
-    complete = [
-        (
-            (bool(words & CURRENT), bool(words & {"motor", "theta"}), not words & MEASURED, len(words)),
-            named,
-        )
-        for words, named in signals.items()
-        if len(named) >= joints
-    ]
-    return min(reversed(complete), key=itemgetter(0), default=((), columns))[1]
+    complete = {words: named for words, named in signals.items() if len(named) >= joints}
+    best = min(reversed(complete), key=_rank, default=frozenset[str]())
+    return complete.get(best, columns)
+
+
+def _rank(words: frozenset[str]) -> list[int]:
+    """Return the order of preference of a signal with these words, the smallest first (see `_of_one_signal`)."""
+    ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
+    return [*ranks, words.isdisjoint(MEASURED), not words.isdisjoint(FILTERED), len(words)]
 
 
 def _by_joint(
@@ -451,8 +455,7 @@ def _by_joint(
     number}, the result of `_order_in_cells`.
     """
     named = {column.joint: column for column in columns if column.joint}
-    numbers = [(re.findall(r"\d+", column.name), column) for column in columns]
-    numbered = {int(match[-1]): column for match, column in numbers if match}
+    numbered = {int(match[-1]): x for x in columns if (match := re.findall(r"\d+", x.name))}
     if named or len(numbered) < len(joints):
         return {joint: named[joint] for joint in joints if joint in named}
     if set(order) == set(joints):

@@ -34,11 +34,12 @@ NORMALISED = "normalised"
 UNIT_NAMES = {
     "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
-          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "rev": "turns", "mm": "mm",
+          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "turn": "turns",
+          "rev": "turns", "revs": "turns", "revolutions": "turns", "mm": "mm",
           "m": "m"},
     "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
-           "deg/sec": "deg/s", "rad/sec": "rad/s", "rev/s": "turns/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm",
-           "mm/s": "mm/s", "m/s": "m/s"},
+           "rev/s": "turns/s", "revs/s": "turns/s", "turns/s": "turns/s", "turn/s": "turns/s", "rps": "turns/s",
+           "counts/s": "counts/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
     "tau": {"nm": "Nm", "mnm": "mNm", "ncm": "Ncm", "kgfcm": "kgf.cm", "kgcm": "kgf.cm", "n": "N",
             "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
@@ -70,8 +71,12 @@ Decoding = Literal["period", "sign_bit"]
 
 
 def plain_unit(text: str) -> str:
-    """Return a unit as written in a log in lower case and without brackets and signs of products: N·m is nm."""
-    return re.sub(r"[\s.·⋅*-]", "", text.strip(" []()").lower())
+    """Return a unit as written in a log, in lower case, without brackets and signs of products.
+
+    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s.
+    """
+    unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", text.strip(" []()").lower())
+    return re.sub(r"[\s.·⋅*-]", "", unit)
 
 
 class LogColumns(Group):
