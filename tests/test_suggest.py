@@ -287,6 +287,27 @@ def test_times_without_a_known_name_are_found_by_their_steps(scara, tmp_path, sc
     assert f'units: {{"t": "{unit}"}}' in text
 
 
+@pytest.mark.parametrize(("first", "second"), [("left_", "right_"), ("robot1/", "robot2/")])
+@pytest.mark.parametrize("form", ["{}{}_{}", "{}{}{}"])
+def test_columns_of_two_arms_are_refused(scara, tmp_path, first, second, form):
+    """A draft never takes the columns of one of two arms that both fit the URDF."""
+    joints = [x.name for x in scara.chain.coordinates] if "_" in form else range(4)
+    head = [
+        "t",
+        *(
+            form.format(arm, word, k)
+            for arm in (first, second)
+            for word in ("q", "qd", "tau")
+            for k in joints
+        ),
+    ]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU, Q, QD, TAU]))
+    with pytest.raises(
+        LogError, match=f"got positions of 2 arms: {first}.*, {second}.* expected columns of one arm"
+    ):
+        suggested(path, scara)
+
+
 def test_cells_with_lists_and_names_as_texts(scara, tmp_path):
     order, names = [3, 1, 0, 2], [x.name for x in scara.chain.coordinates]
     texts = [str([names[k] for k in order])] * len(T)

@@ -58,6 +58,8 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
+# All words that state something about a signal; others may be the name of an arm.
+KNOWN = COMMANDED.union(MEASURED, OTHERS, COMPUTED, *WORDS.values())
 FILTERED = {"filt", "filtered", "smooth", "smoothed"}
 CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
 CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
@@ -129,6 +131,9 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, len(joints))["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
+    # An arm at rest, whose columns are constant, is no candidate.
+    moving = [x for x in columns_of["q"] if len(set(_numbers(table, x.name).tolist())) > 1]
+    _require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
@@ -431,12 +436,38 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
     """
+    complete = _complete_signals(columns, joints)
+    best = min(reversed(complete), key=_rank, default=frozenset[str]())
+    return complete.get(best, columns)
+
+
+def _complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozenset[str], list[ColumnName]]:
+    """Return {words of the names: columns} of the signals that have a column for each of the `joints`."""
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         signals.setdefault(frozenset(column.words), []).append(column)
-    complete = {words: named for words, named in signals.items() if len(named) >= joints}
-    best = min(reversed(complete), key=_rank, default=frozenset[str]())
-    return complete.get(best, columns)
+    return {words: named for words, named in signals.items() if len(named) >= joints}
+
+
+def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> None:
+    """Raise LogError for positions of several arms, such as `left_q1` and `right_q1`, or `arm1/q1` and `arm2/q1`.
+
+    columns: columns of changing positions in the log `file`. joints: number of joints.
+    """
+    signals = _complete_signals(columns, joints)
+    best = min(signals, key=_rank, default=frozenset[str]())
+    # The name of an arm states nothing about the signal. It may also be a number, which is not among the words.
+    arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
+    of_joint: dict[str, list[str]] = {}
+    for column in chain.from_iterable(signals[x] for x in arms):
+        numbers = re.findall(r"\d+", column.name) or [column.name]
+        of_joint.setdefault(column.joint or numbers[-1], []).append(column.name)
+    rivals = max(of_joint.values(), key=len, default=[])
+    if len(rivals) > 1 and len(of_joint) >= joints:
+        raise LogError(
+            f"positions of {len(rivals)} arms: {shortened(rivals, TUNING.listed)} are of one joint", file=file,
+            expected="columns of one arm", do="remove the columns of the other arms, or write the mapping by hand",
+        )  # fmt: skip
 
 
 def _rank(words: frozenset[str]) -> list[int]:

@@ -117,7 +117,7 @@ class Element:
         return child
 
     def _find_ignored(self, tag: str, parent: etree._Element) -> None:
-        """Add errors for content of ``parent`` that is probably intended as the element ``tag``, and would be ignored."""
+        """Add errors for content of ``parent`` that is probably meant as the element ``tag``, and would be ignored."""
         if self.xml is None:
             for sibling in parent.iterchildren(etree.Element):
                 name = etree.QName(sibling).localname
