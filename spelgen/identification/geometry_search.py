@@ -36,9 +36,7 @@ def kinds_of_faults(
     torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
     logged positions to SI units; None: the unit of positions is right.
     """
-    n, units = len(arm.coordinates), list[np.ndarray]()
-    if position_scale is not None:
-        units = position_factors(arm, position_scale)
+    n, units = len(arm.coordinates), [] if position_scale is None else position_factors(arm, position_scale)
     return (
         WrongOrder("joint-order", "the columns of other joints", (0, 1)),
         WrongOrder("torque-order", "the torques of other joints", (1,)),
