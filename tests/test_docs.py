@@ -36,11 +36,12 @@ HISTORY = re.compile(
     re.IGNORECASE,
 )
 SLOW = {"tutorial_servo.md"}  # a fit takes half a minute: only `pytest --update` runs the page
-# replacements in the code of pages, to shorten their runs: fewer rows of a table, shorter motions, no estimator
+# replacements in the code of pages, to shorten their runs: fewer rows of a table, shorter motions, longer steps
 SHORTER = {
     "control.md": {
         '("estimator", "learned", "URDF"):': '("estimator", "learned"):',
         "PICKED, END = 3.0, 11.0": "PICKED, END = 2.0, 6.5",
+        "substeps=8": "substeps=3",
         "END, dynamics=with_load": "END if estimator else 4.5, dynamics=with_load",
     },
 }

@@ -444,6 +444,16 @@ def test_a_velocity_that_other_columns_explain_is_an_error_with_their_line(traje
     assert f"; write '{line}' under 'logs' in the robot's YAML; --accept velocity-is" in str(caught.value)
 
 
+def test_exchanged_velocities_of_synchronous_joints_are_found_by_their_magnitude():
+    """Each joint gets the velocity of the right magnitude if the velocities of all joints are proportional."""
+    t, distances = swing().t, np.array([1.0, 2.0, -3.0])
+    q, qd = (np.outer(x, distances) for x in (np.sin(np.pi * t), np.pi * np.cos(np.pi * t)))
+    exchanged = Trajectory(t, q, qd[:, [1, 0, 2]], np.sin(np.outer(t, [2.0, 3.0, 5.0])), "x")
+    line = "joints: {a: {columns: {qd: qd_b}}, b: {columns: {qd: qd_a}}}"
+    with pytest.raises(LogError, match=re.escape(f"write '{line}' under 'logs'")):
+        check([exchanged], "abc", ("revolute",) * 3)
+
+
 def with_gap() -> Trajectory:
     whole = swing(jitter=0.4)
     t = whole.t + np.where(np.arange(200) >= 120, 0.5, 0.0)

@@ -277,6 +277,16 @@ def test_a_unit_that_is_not_known_is_named_in_the_draft(scara, tmp_path):
     assert "# not a known unit of tau: lbfin" in suggested(path, scara)[1]
 
 
+@pytest.mark.parametrize(("scale", "unit"), [(1.0, "s"), (1e3, "ms")])
+def test_times_without_a_known_name_are_found_by_their_steps(scara, tmp_path, scale, unit):
+    """A column that rises by regular steps is the clock, and a counter of rows is not."""
+    head = ["No", "X_Value", *(f"{word}{k}" for word in ("q", "qd", "tau") for k in range(4))]
+    rows = [[k, *row] for k, row in enumerate(np.column_stack([T * scale, Q, QD, TAU]).tolist())]
+    log, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(log)
+    assert f'units: {{"t": "{unit}"}}' in text
+
+
 def test_cells_with_lists_and_names_as_texts(scara, tmp_path):
     order, names = [3, 1, 0, 2], [x.name for x in scara.chain.coordinates]
     texts = [str([names[k] for k in order])] * len(T)

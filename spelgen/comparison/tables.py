@@ -40,7 +40,7 @@ def arm_sections(study: Study) -> list[ArmResults]:
     published = {job.arm: job.protocol.published for job in study.jobs}
     sections = []
     for name, results in arms.items():
-        runs, measure = _by_preset(results), _main_measure(results)
+        runs, measure = _by_preset(results), next(iter(results[0].errors))
         # The errors include baselines, which have no runs.
         best = next(model for model in _by_error(_medians(runs, measure)) if model in runs)
         tables = tuple(arm_tables(results, published[name]))
@@ -57,7 +57,7 @@ def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFi
 
 def arm_sentence(results: Sequence[RunResult]) -> str:
     """Return a sentence that names the best model of an arm and compares its error with the errors of all others."""
-    runs, measure = _by_preset(results), _main_measure(results)
+    runs, measure = _by_preset(results), next(iter(results[0].errors))
     medians = _by_error(_medians(runs, measure))
     errors = {name: error for name, error in medians.items() if error is not None}
     models = [name for name in errors if name in runs]
@@ -91,11 +91,6 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     wins = Counter(section.best for section in sections)
     counts = [f"{name} on {counted(count, 'arm')}" for name, count in wins.most_common()]
     return f"The preset with the smallest error is {listed(counts)}."
-
-
-def _main_measure(results: Sequence[RunResult]) -> str:
-    """Return the first error measure of the runs, which ranks the models."""
-    return next(iter(results[0].errors))
 
 
 def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:

@@ -81,7 +81,9 @@ def _serial_chain(root: str, path: Sequence[UrdfJoint], dtype: torch.dtype) -> S
 
     first = last = Frame(root, Link(root), Joint())
     for joint in path:
-        kind = "fixed" if not joint.moves else "prismatic" if joint.type == "prismatic" else "revolute"
+        kind = "fixed"
+        if joint.moves:
+            kind = "prismatic" if joint.type == "prismatic" else "revolute"
         axis = torch.tensor(joint.axis, dtype=torch.float64)
         rotation = Rotation.from_euler("xyz", joint.rpy).as_matrix()
         offset = pk.Transform3d(rot=rotation, pos=joint.xyz, dtype=dtype)

@@ -15,13 +15,7 @@ from spelgen.dynamics.protocol import RigidDynamics
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic, LogError, SpelgenError, in_one_line
-from spelgen.evaluation.horizons import (
-    EvaluatedLogs,
-    Horizon,
-    TipPosition,
-    horizon_lengths,
-    predict,
-)
+from spelgen.evaluation.horizons import EvaluatedLogs, Horizon, TipPosition, horizon_lengths, predict
 from spelgen.evaluation.replay import replays
 from spelgen.evaluation.results import Results
 from spelgen.evaluation.rollout import mass_errors
@@ -35,13 +29,7 @@ from spelgen.labels import MODEL
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
-from spelgen.logs.trajectory import (
-    Trajectory,
-    joined_column,
-    recordings,
-    require_commands,
-    require_torques,
-)
+from spelgen.logs.trajectory import Trajectory, joined_column, recordings, require_commands, require_torques
 
 STEPS: Sequence[int] = (1, 10)
 SECONDS: Sequence[float] = (1.0,)

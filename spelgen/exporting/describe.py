@@ -60,7 +60,11 @@ class Trained:
 
         Raises RunError for unknown names in ``entries``.
         """
-        return description.entry_points(self.described, self.entries)
+        available = list(description.ENTRY_POINTS)
+        if self.described.servos is None:
+            available.remove("servo_torque")
+        names = description.select_names(self.entries, available)
+        return {name: description.ENTRY_POINTS[name] for name in names}
 
 
 def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:

@@ -205,17 +205,6 @@ ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
 """All entry points by name."""
 
 
-def entry_points(model: TrainedModel, names: Sequence[str] = ()) -> dict[str, EntryPoint]:
-    """Return {name: entry point}, the functions of a model that an export contains. Raises RunError for unknown names.
-
-    names: names of entry points, such as inverse_dynamics; empty: all that the model has.
-    """
-    available = list(ENTRY_POINTS)
-    if model.servos is None:
-        available.remove("servo_torque")
-    return {name: ENTRY_POINTS[name] for name in select_names(names, available)}
-
-
 def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
     """Return the `names` of functions in the order of `available`; if `names` is empty, all available ones.
 

@@ -102,7 +102,8 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
-    q = sampled_positions(arm.chain)
+    # The seed is fixed, so that the result is reproducible.
+    q = torch.from_numpy(random_inputs(arm.chain.coordinates, TUNING.positions)["q"])
     # The model's own rigid bodies are used if it has some; its residual terms are omitted. The summary of the export
     # states this.
     exact = isinstance(model, RigidBodyDynamics)
@@ -120,14 +121,6 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
         gravity_error=_relative_rms(bodies.gravity(q), model.gravity(q)),
         bodies=bodies,
     )
-
-
-def sampled_positions(arm: Chain) -> Tensor:
-    """Return random positions (positions, n) [rad, m] in the joints' ranges, at which models are compared.
-
-    The seed is fixed, so that the result is reproducible.
-    """
-    return torch.from_numpy(random_inputs(arm.coordinates, TUNING.positions)["q"])
 
 
 def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:

@@ -184,10 +184,7 @@ class _Fitting:
         """Write the checkpoint, the best weights and the history into the run folder, if there is one."""
         if self.run is not None:
             checkpoint = self.objective.checkpoint()
-            # The metrics are written before the checkpoint: after an interruption between the two, a resumed run
-            # removes the surplus lines from the metrics.
-            self.run.write_metrics(self.objective.history)
-            self.run.save(checkpoint["best_weights"], checkpoint)
+            self.run.save(self.objective.history, checkpoint["best_weights"], checkpoint)
 
     def _run(self) -> Status:
         """Print the diagnostics, run the objective, fit the baselines, and return the status.

@@ -213,8 +213,7 @@ class Fit:
         run = RunFolder(folder)
         with locked(run.path):
             run.start(spec, self.urdf, force=force)
-            run.write_metrics(self.history)
-            run.save(self.model.state_dict(), self.checkpoint.content)
+            run.save(self.history, self.model.state_dict(), self.checkpoint.content)
             # config.json is written last: a folder with this file has all files of a run.
             if self.baselines:
                 write_json(run.baseline, self.baselines)

@@ -262,7 +262,7 @@ class Posterior:
 
         The square root is (10 B + n, k), see `Propagated`.
         """
-        return self.propagate(_constants)
+        return self.propagate(lambda model: torch.cat([model.inertial_parameters.flatten(), model.armature]))
 
     @cached_property
     def _base_values(self) -> Propagated:
@@ -288,9 +288,7 @@ class Posterior:
         return Uncertain(value.numpy(), (rows @ self._constants.root).norm(dim=-1).numpy())
 
 
-def posterior_of(
-    model: ArmModel, content: Content | None, delay: float, file: Path | None = None
-) -> Posterior:
+def posterior_of(model: ArmModel, content: Content | None, delay: float, file: Path | None) -> Posterior:
     """Return the posterior of a fitted model.
 
     Args:
@@ -298,7 +296,7 @@ def posterior_of(
         content: field ``posterior`` of a checkpoint: covariance of the K parameters, (K, K), delay_std [s], and, unless
             the model has position servos, torque_std, (n,) [Nm, N].
         delay: delay of the torques relative to the positions [s].
-        file: path of the checkpoint, for error messages.
+        file: path of the checkpoint, for error messages; None for a fit without a folder.
 
     Raises RunError if the content is None, or if it belongs to another model.
     """
@@ -329,11 +327,6 @@ def posterior_of(
     from spelgen.fitting.servo.posterior import ServoPosterior
 
     return ServoPosterior(model, covariance, std, delay_interval)
-
-
-def _constants(model: ArmModel) -> Tensor:
-    """Return the inertial parameters of all B bodies of a model, then the n armatures, (10 B + n,)."""
-    return torch.cat([model.inertial_parameters.flatten(), model.armature])
 
 
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:

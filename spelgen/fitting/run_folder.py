@@ -76,8 +76,11 @@ class RunFolder:
         for file, written in content.items():
             write_bytes(file, written)
 
-    def save(self, weights: Content, checkpoint: Content) -> None:
-        """Write the best weights to model.pt, and the checkpoint to checkpoint.pt."""
+    def save(self, history: Sequence[Content], weights: Content, checkpoint: Content) -> None:
+        """Write the history to metrics.jsonl, the best weights to model.pt, and the checkpoint to checkpoint.pt."""
+        # The metrics are written before the checkpoint: after an interruption between the two, a resumed run removes
+        # the surplus lines from the metrics.
+        self.write_metrics(history)
         write_state(self.weights, weights)
         write_state(self.checkpoint, checkpoint)
 

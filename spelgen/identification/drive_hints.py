@@ -132,7 +132,7 @@ class DriveProblem:
     def with_hysteresis(self) -> DriveProblem:
         """Return the least-squares problem with the deflections of bristles as additional columns of the regressor.
 
-        Its dry friction depends on the past motion. The columns of the bodies are first.
+        Its dry friction depends on the past motion. The columns are after the columns of the bodies.
         """
         drives = len(FRICTION.effects) * len(self.size) + 1
         # C_ji is the factor from the torque of drive j to the torque of joint i.

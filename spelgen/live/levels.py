@@ -158,8 +158,12 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
         minutes=sum(log.duration for log in logs) / 60, point=point, delay=delay,
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
-    segments = [[x.block for x in samples if x.block is not None] for samples in tested]
-    pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
+    segments, pairs = [], []
+    for samples in tested:
+        blocks = [x.block for x in samples if x.block is not None]
+        segments.append(blocks)
+        # A block of the payload filter has twice the length of a block of the drift filter.
+        pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
     levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})

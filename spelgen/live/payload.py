@@ -16,7 +16,7 @@ import torch
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp, softmax
 
-from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.body_regressor import about_center, pseudo_inertia
 from spelgen.live.tuning import TUNING
 
 Status = Literal["not yet", "no payload", "payload"]
@@ -167,6 +167,5 @@ def _mass_center_inertia(theta: np.ndarray) -> np.ndarray:
     theta: mass, first moment and inertia about the origin, (10,), real or complex. The elements of both inertias are
     (xx, xy, xz, yy, yz, zz).
     """
-    center = theta[1:4] / theta[0]
-    about_origin = theta[0] * (center @ center * np.eye(3) - np.outer(center, center))
-    return np.concatenate([theta[:1], center, theta[4:] - about_origin[np.triu_indices(3)]])
+    mass, center, inertia = about_center(theta)
+    return np.concatenate([[mass], center, inertia[np.triu_indices(3)]])

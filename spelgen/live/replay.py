@@ -201,8 +201,8 @@ def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     reports = [states[end].payload.status for end in ends]
     return [
         k
-        for k, (before, after) in zip(changed, pairwise(reports), strict=True)
-        if before == "payload" or after != "no payload"
+        for k, (previous, next_report) in zip(changed, pairwise(reports), strict=True)
+        if previous == "payload" or next_report != "no payload"
     ]
 
 

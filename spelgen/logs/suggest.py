@@ -197,12 +197,15 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
     """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
 
-    If it contains whole seconds, and ``columns`` (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
+    Without candidates, it is a column whose values rise like a clock. If it contains whole seconds, and ``columns``
+    (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
     """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
     nanoseconds = [x for x in columns if re.search(r"n(?:ano)?sec(?:ond)?s?$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
+    if not seconds:
+        seconds = [x for x in columns if not (x.quantity or x.joint) and _is_rising(_numbers(table, x.name))]
     clock = min(
         seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
     )
@@ -214,6 +217,19 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     stem = re.sub(r"secs?$", "", clock.name)
     fraction = next((x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0])
     return ColumnName(f"{clock.name} + {fraction.name}", clock.words, "s")
+
+
+def _is_rising(values: np.ndarray) -> bool:
+    """Return True if the values (T,) of a column rise by regular steps that are plausible as time between samples.
+
+    A counter of rows rises by one in each row, and is no clock.
+    """
+    steps = np.diff(values)
+    if len(steps) < 2 or not (steps > 0).all() or (steps == 1).all():
+        return False
+    middle = float(np.median(steps))
+    is_regular = (np.abs(steps - middle) < middle / 2).mean() > 0.9
+    return bool(is_regular and time_unit(middle))
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:

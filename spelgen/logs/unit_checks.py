@@ -232,10 +232,14 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
-    for joint, fit in zip(signals.joints, signals.correlations.tolist(), strict=True):
-        if fit > max(SIGNALS.agreement, correlation):
-            columns = {"qd": mapping.column("qd", joint)}
-            return Advice(f"{message}; that of joint {joint!r} is", {"columns": columns})
+    # In synchronous motion the velocities of all joints are correlated, and only one of them has the right magnitude.
+    products, n = velocity_products(trajectory), len(signals.joints)
+    squares, scalar_products = products.diagonal()[:n], products[:n, n + k]
+    nearest = int((squares - 2 * scalar_products).argmin())
+    is_right = abs(scalar_products[nearest] - squares[nearest]) <= tolerance * squares[nearest]
+    if nearest != k and is_right and signals.correlations[nearest] >= SIGNALS.agreement:
+        columns = {"qd": mapping.column("qd", signals.joints[nearest])}
+        return Advice(f"{message}; that of joint {signals.joints[nearest]!r} is", {"columns": columns})
     exchanged = velocity_products(replace(trajectory, q=trajectory.qd, qd=trajectory.q))
     factors, correlations = velocity_agreement(exchanged)
     if correlations[k, k] > SIGNALS.agreement and abs(factors[k] - 1) < 0.5:

@@ -40,7 +40,7 @@ def parameter_tables(
     return tables
 
 
-def base_table(arm: Arm, identified: Content, posterior: Posterior | None = None) -> Listing:
+def base_table(arm: Arm, identified: Content, posterior: Posterior | None) -> Listing:
     """Return the table of base parameters: values of the URDF, of the model and of linear least squares.
 
     The values of the model and of least squares have 95 % intervals.

@@ -94,10 +94,10 @@ def energies(
         number: conversion of the exact constants of the arm to the number type of `positions` and `inertias`.
     """
     transforms = _joint_transforms(arm, positions, number)
-    poses = [
-        _Pose(tuple(_vector(row, number) for row in body.rotation), _vector(body.translation, number))
-        for body in arm.bodies
-    ]
+    poses = []
+    for body in arm.bodies:
+        rotation = tuple(_vector(row, number) for row in body.rotation)
+        poses.append(_Pose(rotation, _vector(body.translation, number)))
     composites = [_Inertia(ten[0], tuple(ten[1:4]), tuple(ten[4:10])) for ten in inertias]
     total = _Inertia(0, (0, 0, 0), (0,) * 6)
     mass = dict.fromkeys(triangle(len(arm.coordinates)), 0)

@@ -7,7 +7,6 @@ for n coordinates. Block 0 has random positions; the positions of block 1 + k di
 
 from collections.abc import Sequence
 from fractions import Fraction
-from itertools import accumulate
 
 import numpy as np
 
@@ -202,8 +201,7 @@ class Spans:
 
 def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return echelon bases, (dimension, entries) each: element k is a basis of the row space of ``bases[:k]``."""
-
-    def with_next(rows: np.ndarray, basis: np.ndarray) -> np.ndarray:
-        return field.row_basis(np.concatenate([rows, basis]))
-
-    return list(accumulate(bases[:-1], with_next, initial=bases[0][:0]))
+    sums = [bases[0][:0]]
+    for basis in bases[:-1]:
+        sums.append(field.row_basis(np.concatenate([sums[-1], basis])))
+    return sums

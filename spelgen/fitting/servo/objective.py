@@ -11,7 +11,6 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import partial
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -49,7 +48,6 @@ class ServoObjective(Objective):
     iteration. The torque of the rigid bodies and the scale of the position errors are recomputed from these parameters.
     """
 
-    name: ClassVar[str] = "servo"
     input: ClassVar[Literal["torque", "position"]] = "position"
 
     def __init__(self, request: FitRequest) -> None:
@@ -108,7 +106,11 @@ class ServoObjective(Objective):
     def _minimized(self, progress: TrainingProgress) -> ServoParameters:
         """Minimize the cost of the current outer iteration by Levenberg-Marquardt; return the fitted parameters."""
         problem, number = self._problem, len(self._iterates)
-        show = partial(_show_progress, progress, number)
+
+        def show(state: SolverState[ServoParameters]) -> None:
+            rms = float(state.residual.square().mean().sqrt())
+            progress.round(number, OUTER_ITERATIONS, state.steps, rms)
+
         # The damping is smaller in the second and third outer iteration, which start near the minimum.
         damping = DAMPING.initial_damping if number == 1 else TUNING.later_damping
         x = self._iterates[-1]
@@ -172,8 +174,3 @@ class ServoObjective(Objective):
             "rounds": [vars(x) for x in self._iterates],
             "steps": self._first_steps,
         }
-
-
-def _show_progress(progress: TrainingProgress, number: int, state: SolverState[ServoParameters]) -> None:
-    rms = float(state.residual.square().mean().sqrt())
-    progress.round(number, OUTER_ITERATIONS, state.steps, rms)

@@ -252,7 +252,7 @@ def _unfitted(
     """
     problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
     state, free = initial_state(problem, problem.prior.mean), problem.free
-    covariance = problem.of_all_parameters(torch.linalg.inv(problem.prior.precision[free][:, free]))
+    covariance = problem.covariance(problem.prior.precision[free][:, free])
     residual = problem.jacobian.residual_samples(state.x).torque_residual
     sizes = [block.count for block in blocks]
     squares = torch.stack([block.square().sum(dim=0) for block in residual.split(sizes)])

@@ -117,13 +117,12 @@ def concatenate_blocks(rows: Iterable[JointRows], joints: int) -> list[JointRows
     blocks: list[list[JointRows]] = [[] for _ in range(joints)]
     for block in rows:
         blocks[block.joint].append(block)
-    return [
-        of_joint[0]._replace(
-            jacobian=torch.cat([block.jacobian for block in of_joint]),
-            residual=torch.cat([block.residual for block in of_joint]),
-        )
-        for of_joint in blocks
-    ]
+    result = []
+    for of_joint in blocks:
+        jacobian = torch.cat([block.jacobian for block in of_joint])
+        residual = torch.cat([block.residual for block in of_joint])
+        result.append(of_joint[0]._replace(jacobian=jacobian, residual=residual))
+    return result
 
 
 def normal_equations(

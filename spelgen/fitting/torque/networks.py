@@ -11,12 +11,7 @@ from spelgen.fitting.optimizers import minimise
 from spelgen.fitting.torque.jacobian import ResidualSamples
 from spelgen.fitting.torque.joint_functions import ALL, rms_per_joint
 from spelgen.fitting.torque.samples import TorqueSamples
-from spelgen.fitting.torque.selection import (
-    SelectedTerm,
-    block_squares,
-    significant_reduction,
-    split_halves,
-)
+from spelgen.fitting.torque.selection import SelectedTerm, block_squares, significant_reduction, split_halves
 from spelgen.fitting.torque.tuning import SELECTION
 from spelgen.settings.fits import DEFAULTS, Adaptation
 
@@ -33,7 +28,7 @@ BLOCK = 2**16
 def fit_networks(
     model: ArmModel,
     samples: TorqueSamples,
-    weight_decay: float = DEFAULTS.lbfgs_decay,
+    weight_decay: float,
     penalty: Callable[[], torch.Tensor | float] | None = None,
     evaluations: int = 2000,
 ) -> int:

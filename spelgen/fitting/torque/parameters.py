@@ -308,7 +308,9 @@ def prior_covariance(
     deviations: dict[str, float] = dict(widths)
     for name, x in parameters.items():
         rows = torch.arange(first, first + x.numel())
-        option = width_option(groups[name])
+        option = groups[name]
+        if option in ("effects", "load_dependence"):
+            option = "sizes"
         matrix[rows, rows] = torch.full((len(rows),), deviations[option]).double().square()
         if option in SHARED:
             # The parameters are logarithms, and their prior has a random factor that is common to all joints. The
@@ -379,8 +381,3 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         squares = (centring @ offset[mask]).square().sum()
         updated[group] = float(width(squares, gamma, group, initial[group]))
     return replace(prior, widths=prior.widths.model_copy(update=updated), body_widths=body_widths)
-
-
-def width_option(group: str) -> str:
-    """Return the name of the option of `GaussianPrior` that is the standard deviation of a parameter group."""
-    return "sizes" if group in ("effects", "load_dependence") else group

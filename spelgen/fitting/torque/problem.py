@@ -239,12 +239,12 @@ class TorqueProblem:
             self, state, max_steps=max_steps, min_relative_decrease=TUNING.min_relative_decrease
         )
 
-    def covariance(self, curvature: torch.Tensor) -> torch.Tensor:
-        """Return the posterior covariance (K, K) of all K parameters, which is zero for fixed parameters.
+    def covariance(self, precision: torch.Tensor) -> torch.Tensor:
+        """Return the covariance (K, K) of all K parameters, which is zero for fixed parameters.
 
-        curvature: Gauss-Newton Hessian with respect to the k free parameters, (k, k).
+        precision: inverse covariance of the k free parameters, (k, k), for example the Gauss-Newton Hessian.
         """
-        return self.of_all_parameters(torch.linalg.inv(curvature))
+        return self.of_all_parameters(torch.linalg.inv(precision))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
         """Return the covariance (K, K) of all parameters, which is zero for fixed parameters.

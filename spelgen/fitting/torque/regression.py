@@ -1,6 +1,7 @@
 """Ridge regression of the torque on the regressors of bodies and friction, a simple method compared with the fit."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -122,9 +123,7 @@ def start_at(model: ArmModel, samples: TorqueSamples, regression: Regression) ->
         model.bodies.raw.copy_(log_cholesky_parameters(upper_cholesky((relative + relative.mT) / 2)))
         inputs = torch.linalg.pinv(model.input_matrix(samples.columns.q[:1])[0])
     torque = torch.from_numpy(regression.torque(samples.columns)) @ inputs.mT
-    predicted = TorqueSamples(
-        samples.columns._replace(tau=torque), samples.original_count, samples.interval, samples.recordings
-    )
+    predicted = replace(samples, columns=samples.columns._replace(tau=torque))
     prior = GaussianPrior(bodies=TUNING.max_width)
     estimate = initial_fit(TorqueProblem.of(TorqueJacobian(model, predicted), prior))
     rigid = estimate.problem.jacobian.rigid

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from itertools import compress
 
 import numpy as np
-import torch
 from scipy.special import gammaincinv
 
 from spelgen.dynamics.parameters import idle_residuals
@@ -54,9 +53,11 @@ def torque_notes(model: ArmModel, samples: TorqueSamples, solution: TorqueSoluti
         yield friction_compensated(f"{joints} Nm s/rad (N s/m) are added")
     if residual_terms(model) is not None:
         yield Diagnostic("info", "residuals", "model", None, _selected_terms(samples, solution, names))
-    # A few positions suffice for the mean inertia.
+    # A few positions suffice for the mean inertia, the mean diagonal of M, (n,) [kg m^2, kg].
     subset = samples.subsampled(50).columns
-    inertia, std = posterior.uncertain(lambda other: _mean_inertia(other, subset.q))
+    inertia, std = posterior.uncertain(
+        lambda fitted: fitted.mass_matrix(subset.q).diagonal(dim1=-2, dim2=-1).mean(dim=0)
+    )
     undetermined = std > TUNING.undetermined * inertia
     if undetermined.any():
         joints = ", ".join(names[undetermined])
@@ -208,9 +209,3 @@ def terms_in_use(model: ArmModel) -> list[str]:
         if term not in terms:
             terms.append(term)
     return terms
-
-
-def _mean_inertia(model: ArmModel, q: torch.Tensor) -> torch.Tensor:
-    """Return the diagonal of M, (n,) [kg m^2, kg], averaged over positions q (T, n)."""
-    mass: torch.Tensor = model.mass_matrix(q)
-    return mass.diagonal(dim1=-2, dim2=-1).mean(dim=0)

@@ -32,8 +32,8 @@ class SampleBlock(NamedTuple):
     z: torch.Tensor | None = None
     direction: torch.Tensor | None = None
 
-    def select(self, rows: slice) -> SampleBlock:
-        """Return the samples of a slice of rows."""
+    def select(self, rows: slice | torch.Tensor) -> SampleBlock:
+        """Return the samples of rows, a slice or indices."""
         return SampleBlock._make(None if column is None else column[rows].contiguous() for column in self)
 
 
@@ -87,8 +87,7 @@ class TorqueSamples:
         # A segment may span two recordings. Such segments are rare, and negligible for means over segments.
         starts = torch.linspace(0, self.count - size, number).long()
         rows = (starts.unsqueeze(-1) + torch.arange(size)).flatten()
-        columns = SampleBlock._make(None if column is None else column[rows] for column in self.columns)
-        return replace(self, columns=columns, recordings=self.recordings[rows])
+        return self.select(rows)
 
     def subsampled(self, max_count: int) -> TorqueSamples:
         """Return at most `max_count` evenly spaced samples; this object itself if it has no more samples."""
@@ -98,8 +97,8 @@ class TorqueSamples:
             return self
         return replace(self.select(slice(None, None, step)), interval=step * self.interval)
 
-    def select(self, rows: slice) -> TorqueSamples:
-        """Return the samples of a slice of rows."""
+    def select(self, rows: slice | torch.Tensor) -> TorqueSamples:
+        """Return the samples of rows, a slice or indices."""
         return replace(self, columns=self.columns.select(rows), recordings=self.recordings[rows])
 
     def blocks(self, size: int) -> Iterator[SampleBlock]:

@@ -10,13 +10,7 @@ from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.joint_functions import TermKey, refit_terms
 from spelgen.fitting.torque.networks import select_networks
 from spelgen.fitting.torque.parameters import NEGLIGIBLE
-from spelgen.fitting.torque.problem import (
-    State,
-    TorqueEstimate,
-    TorqueProblem,
-    alternate,
-    refine,
-)
+from spelgen.fitting.torque.problem import State, TorqueEstimate, TorqueProblem, alternate, refine
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import (
     SelectedTerm,

@@ -1,0 +1,35 @@
+"""Logs that agree with the URDF and the settings get no advice, although the URDF's inertials are 30 % wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.truth import Case, Truth, record_log, wrong_urdf
+from spelgen.arm.configured_arm import load_arm
+from spelgen.log_checks.check_logs import check_logs
+
+# Findings about the amount of motion, and about links of the URDF, whose inertials are wrong in these logs.
+TRUE = {"one-way", "joint-at-rest", "beyond-effort-limit", "beyond-velocity-limit", "urdf-inertials"}
+
+
+def recorded(robot: Path, seed: int, folder: Path, **properties):
+    """Return an arm with wrong inertials, and logs of the true arm in pick-and-place motions of 10 s in all."""
+    rng = np.random.default_rng([7, seed])
+    (folder / "arm.urdf").write_bytes(wrong_urdf(robot, 0.3, rng))
+    known = {"friction": "coulomb", "armature": True, "sample_rate": 200.0, "noise": 0.01}
+    case = Case(
+        number=seed, arm=robot.stem, urdf_error=0.3, offsets=False, springs=False, motion="pick-and-place",
+        seconds=10.0, delay=0.0, **(known | properties),
+    )  # fmt: skip
+    truth = Truth(case, robot, rng)
+    return load_arm(folder / "arm.urdf"), record_log(truth, case, rng)
+
+
+@pytest.mark.parametrize(("robot", "seed"), [("ur10e", 0), ("panda", 2), ("ur10e", 5)])
+def test_synchronous_joints_with_dry_friction_get_no_advice(robots, tmp_path, robot, seed):
+    """Friction after reversals is no coupling of motors, and friction of a joint that moves one way is no stop."""
+    arm, logs = recorded(robots / f"{robot}.urdf", seed, tmp_path)
+    report = check_logs(logs, arm)
+    assert not report.errors
+    assert {x.code for x in report.findings} <= TRUE
