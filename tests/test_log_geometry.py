@@ -507,6 +507,20 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
     assert "delay" not in error
 
 
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize(("seed", "angle"), [(0, -0.72), (5, -1.15), (8, 1.29)])
+def test_presliding_hysteresis_does_not_change_a_zero_offset(arm, seed, angle):
+    """The zero of a joint is named to 0.1 rad although its friction has a hysteresis of 0.05 rad.
+
+    Without hysteresis in the model, the offset of lowest cost compensates friction: it was 0.4 rad wrong, or none.
+    """
+    log = recorded(arm, seed, pick_and_place, noise=0.01)
+    log = replace(log, tau=log.tau + 0.4 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
+    assert check_logs([log], arm).errors == ()
+    error = told(arm, replace(log, q=log.q - angle * np.eye(4)[2]))
+    assert float(re.search(r"'joints: {joint3: {offset: (.*?)}}'", error)[1]) == pytest.approx(angle, abs=0.1)
+
+
 def lifted(arm):
     """Return a log of the lift, whose friction has a hysteresis of 0.05 m and 0.05 rad."""
     log = recorded(arm, 0, lifting)

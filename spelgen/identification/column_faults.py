@@ -220,6 +220,7 @@ class TorqueUnit(WrongScale):
 
     code = "torque-unit"
     rarity = 2
+    is_optimised = True
     needed = 0.0
     evidence = "by the URDF's gravity"
 

@@ -22,6 +22,7 @@ class ZeroOffset(Fault):
 
     code = "joint-zero"
     rarity = 2
+    is_optimised = True
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each joint, the least-squares fit of the log's torques with the best zero offset of its position.
@@ -105,6 +106,7 @@ class Compensation(Fault):
 
     code = "gravity-compensated"
     rarity = 3
+    is_optimised = True
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the least-squares fit of torques that contain only a fraction of the gravity torque, or none of it.

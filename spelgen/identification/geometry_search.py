@@ -36,9 +36,7 @@ def kinds_of_faults(
     torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
     logged positions to SI units; None: the unit of positions is right.
     """
-    n, units = len(arm.coordinates), list[np.ndarray]()
-    if position_scale is not None:
-        units = position_factors(arm, position_scale)
+    n, units = len(arm.coordinates), [] if position_scale is None else position_factors(arm, position_scale)
     return (
         WrongOrder("joint-order", "the columns of other joints", (0, 1)),
         WrongOrder("torque-order", "the torques of other joints", (1,)),
@@ -75,6 +73,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
+    stateful = coarse.with_hysteresis()
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
     # At most three corrections are combined, where any permutation of the columns is one correction: more corrections
@@ -86,7 +85,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         is_partial = base.errors.max() > GEOMETRY.explained and base is not unchanged
         tried: list[HypothesisFit] = []
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
-            tried += _weighed(coarse, [fit for fault in faults for fit in fault.fits(coarse, start)], start)
+            tried += _weighed(coarse, stateful, _corrected(coarse, stateful, faults, start), start)
         better = min(tried, key=RANK)
         # To save time, permutations of all joints and long drifts of delays are searched only if no single correction
         # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
@@ -97,7 +96,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         is_open = better.errors.max() > GEOMETRY.explained or better.hypothesis.drift.any()
         if base is unchanged and is_wrong and is_open:
             orders = [fit for fault in faults for fit in fault.thorough_fits(coarse, base)]
-            tried += _weighed(coarse, orders, base)
+            tried += _weighed(coarse, stateful, orders, base)
         if min(tried, key=RANK).cost > base.cost - GEOMETRY.needed:
             break
         fits = [*tried, unchanged]
@@ -105,13 +104,14 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     if not likely:
         # If no cost decrease is significant, faults with other evidence than the cost are considered, e.g. another
         # torque unit.
-        known = [fit for fault in faults if not fault.needed for fit in fault.fits(coarse, unchanged)]
+        known = _corrected(coarse, stateful, [fault for fault in faults if not fault.needed], unchanged)
         best = min(known, key=RANK, default=unchanged)
         return (unchanged, best) if best.cost < unchanged.cost else (unchanged,)
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
     # only three hypotheses are confirmed, since a message lists at most three
-    confirmed = _weighed(finer, [finer.fit(fit.hypothesis) for fit in likely[:3]], unchanged)
+    fits = [finer.fit(fit.hypothesis) for fit in likely[:3]]
+    confirmed = _weighed(finer, finer.with_hysteresis(), fits, unchanged)
     return unchanged, *_likely(unchanged, confirmed)
 
 
@@ -149,8 +149,25 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     return deviating
 
 
+def _corrected(
+    problem: GeometryProblem, stateful: GeometryProblem, faults: Sequence[Fault], base: HypothesisFit
+) -> list[HypothesisFit]:
+    """Return fits of `problem` under the hypotheses with one more corrected fault than the hypothesis of `base`.
+
+    stateful: `problem` with a friction model with hysteresis. Continuous quantities of a hypothesis, such as a zero
+    offset, are optimised in `stateful`: without hysteresis the optimum compensates errors of the friction model.
+    """
+    fits, start = list[HypothesisFit](), stateful.fit(base.hypothesis)
+    for fault in faults:
+        if fault.is_optimised:
+            fits += [problem.fit(fit.hypothesis) for fit in fault.fits(stateful, start)]
+        else:
+            fits += fault.fits(problem, base)
+    return fits
+
+
 def _weighed(
-    problem: GeometryProblem, fits: Sequence[HypothesisFit], base: HypothesisFit
+    problem: GeometryProblem, stateful: GeometryProblem, fits: Sequence[HypothesisFit], base: HypothesisFit
 ) -> list[HypothesisFit]:
     """Return the fits with costs that take a friction model with hysteresis into account.
 
@@ -159,17 +176,19 @@ def _weighed(
 
     Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
     and b the decrease in fits with hysteresis. For right hypotheses b shows the whole decrease, but for wrong ones it
-    is larger, too: on recorded arms they have b up to 32 and a up to 17. Therefore half of b counts, and the new cost
-    is the cost of `base` minus max(a, b / 2). For a hypothesis with another delay than `base`, it is the cost of `base`
-    minus min(a, b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
+    is larger, too: on recorded arms they have b up to 32 and a up to 17. A wrong hypothesis may also have a large a and
+    a small b, since it explains the friction that the model without hysteresis lacks. The decrease is therefore a,
+    limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a, b):
+    hysteresis resembles a delay, so such a hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.
+        stateful: the same problem with hysteresis.
         fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
             with hysteresis.
         base: fit of `problem` with which the costs are compared.
     """
-    stateful, best = problem.with_hysteresis(), sorted(fits, key=RANK)
+    best = sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)
     plain, least = problem.fit(present).cost, stateful.fit(present).cost
     for k, fit in enumerate(best):
@@ -177,7 +196,7 @@ def _weighed(
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:
             other = stateful.fit(hypothesis).cost - least
             is_late = (np.append(hypothesis.delay, hypothesis.drift) != times).any()
-            change = max(change, other) if is_late else min(change, other / 2)
+            change = max(other, change if is_late else min(change, other / 2))
         best[k] = replace(fit, cost=base.cost + change)
     return best
 

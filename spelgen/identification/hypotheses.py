@@ -198,6 +198,8 @@ class Fault(ABC):
         needed: smallest decrease of the cost with which a hypothesis is accepted.
         evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
         advice: remedy of a fault that no setting corrects.
+        is_optimised: True if quantities of the hypotheses, such as a zero offset, are optimised with a friction model
+            with hysteresis.
 
     Methods with an argument `correction` return texts or settings for the hypothesis `correction.hypothesis`, which has
     a fault of this kind.
@@ -209,6 +211,7 @@ class Fault(ABC):
     needed = GEOMETRY.needed
     evidence = ""
     advice = ""
+    is_optimised = False
 
     @abstractmethod
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:

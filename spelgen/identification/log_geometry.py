@@ -59,8 +59,7 @@ class GeometryProblem:
         self.prior_mean = np.append(mean, np.zeros(drives))
         self._precision = block_diag(precision, np.zeros((drives, drives)))
         self._counted: np.ndarray | None = None
-        self._has_free_gains = False
-        self._has_hysteresis = False
+        self._has_free_gains = self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
         self._chains: dict[Vector3, BodyChain] = {}  # {vector of gravity: the arm's chain of bodies}, a cache
 

@@ -63,9 +63,8 @@ def check_logs(
     if not measured:
         raise LogError("no trajectory", expected="at least one")
     summary = log_checks.findings()
-    reports = []
-    for index, coordinate in enumerate(arm.chain.coordinates):
-        reports.append(joint_report(index, coordinate, measured, log_checks.products))
+    coordinates = enumerate(arm.chain.coordinates)
+    reports = [joint_report(k, coordinate, measured, log_checks.products) for k, coordinate in coordinates]
     completed, tables = checked.check(reports, summary)
     return LogReport(
         robot=arm.chain.name,
@@ -82,16 +81,12 @@ def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
     """Return the notes on logs; notes with the same text about several joints become one note that names the joints."""
     groups = dict[tuple[Severity, str, str, str], list[str]]()
     for note in notes:
-        prefix, joint, name = note.where.partition("joint '")
-        groups.setdefault(
-            (note.severity, note.code, prefix if joint else note.where, note.message), []
-        ).append(joint + name)
+        place, joint, name = note.where.partition("joint '")
+        groups.setdefault((note.severity, note.code, place + joint, note.message), []).append(name)
     joined = []
-    for (severity, code, prefix, message), names in groups.items():
-        listed = ", ".join(x.removeprefix("joint ") for x in names)
-        joined.append(
-            Diagnostic(severity, code, f"{prefix}joint {listed}" if names[0] else prefix, None, message)
-        )
+    for (severity, code, place, message), names in groups.items():
+        where = place + ", '".join(name for name in names if name)
+        joined.append(Diagnostic(severity, code, where, None, message))
     return tuple(joined)
 
 

@@ -125,12 +125,13 @@ class TorqueLogs:
                 self._check_drives(moving, summary)
         # Torques beyond the limits of the drives are not reported if the log has an error, since they are a consequence
         # of it, and if the torques agree with the gravity of the URDF: the limits are then placeholders.
-        faults, accepted_limits = dict[Check[JointEvidence], dict[str, str]](), set[str]()
+        faults = dict[Check[JointEvidence], dict[str, str]]()
         if summary.errors or any(joint.shows_unit for joint in evidence):
-            accepted_limits.add("torque-beyond-drive")
+            accepted.add("torque-beyond-drive")
         for joint in evidence:
-            passed = accepted | accepted_limits
-            passed |= {code for code in UNIT_CODES if self._is_declared(joint.coordinate.name)}
+            # the units of a joint are not tested if the mapping states the unit of its torque
+            is_stated = self._mapping.unit("tau", joint.coordinate.name) is not None
+            passed = accepted.union(UNIT_CODES) if is_stated else accepted
             for check, found in run_checks(CHECKS, joint, passed):
                 if check.severity == "error":
                     faults.setdefault(check, {})[joint.coordinate.name] = found.message
@@ -206,10 +207,6 @@ class TorqueLogs:
             "'gain: trained' under 'joints'; until then, senses, order and zeros of the joints are not tested"
         )
         return [Diagnostic("warning", CURRENT, f"joint {', '.join(map(repr, names))}", None, message)]
-
-    def _is_declared(self, joint: str) -> bool:
-        """Return True if the mapping states the unit of a joint's torque."""
-        return self._mapping.unit("tau", joint) is not None
 
     def _problem(self, samples: MotionSamples, share: float = 1.0) -> GeometryProblem | None:
         """Return the least-squares problem of the samples, for the comparison of hypotheses about the log.
@@ -346,10 +343,9 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
     for k, body in enumerate(problem.arm.bodies):
-        first = 10 * k
         quantities = {
-            "first moment (mass times centre of mass)": slice(first + 1, first + 4),
-            "mass": slice(first, first + 1),
+            "first moment (mass times centre of mass)": slice(10 * k + 1, 10 * k + 4),
+            "mass": slice(10 * k, 10 * k + 1),
         }
         for name, block in quantities.items():
             stated, found = problem.prior_mean[block], fit.parameters[block]
