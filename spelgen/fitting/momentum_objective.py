@@ -36,6 +36,7 @@ class MomentumObjective(Objective):
         epoch_steps: number of optimizer steps per epoch.
     """
 
+    name: ClassVar[str] = "momentum"
     # options of the fit; `prepare` sets the defaults that depend on the number of windows
     config: WindowConfig
     saved_attributes: ClassVar[tuple[str, ...]] = (

@@ -27,6 +27,7 @@ class Objective(ABC):
     to config.json.
     """
 
+    name: ClassVar[str]
     input: ClassVar[Literal["torque", "position"]] = "torque"
     """Input quantity of the models that the objective can fit; the logs must contain this quantity."""
 

@@ -33,6 +33,7 @@ class RolloutObjective(MomentumObjective):
     gives the same numbers as an uninterrupted run.
     """
 
+    name: ClassVar[str] = "rollout"
     config: Rollout
     saved_attributes: ClassVar[tuple[str, ...]] = (
         *MomentumObjective.saved_attributes, "rollbacks", "learning_rate_factor", "fixed", "stage_from", "stage_epoch",

@@ -350,16 +350,6 @@ class PositionUnit(WrongScale):
     code = "joint-unit"
     rarity = 2
 
-    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the fits with positions in other units, for units whose joints the fit `base` does not all explain.
-
-        With a wrong unit, the residual of gravity and inertia is large. Where only friction acts, the unit changes
-        nothing but the velocity below which dry friction is smooth, and is not determined.
-        """
-        unexplained = base.errors > GEOMETRY.explained
-        factors = [factor for factor in self.factors if unexplained[factor[0] != 1].any()]
-        return self._scaled_by(factors, problem, base)
-
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
 

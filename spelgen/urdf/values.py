@@ -129,10 +129,11 @@ class Element:
         elif tag in _LEAVES:
             if (self.xml.text or "").strip() or next(self.xml.iterchildren(etree.Element), None) is not None:
                 self.error("text or elements inside it", "only attributes", "write its values as attributes")
-            for absent in set(_LEAVES[tag]) - set(self.xml.attrib):
-                for key in self.xml.attrib:
-                    if key not in _LEAVES[tag] and _is_spelling(key, absent):
-                        self.error(f"the attribute {key!r}", repr(absent), "correct or remove it")
+            absent = [name for name in _LEAVES[tag] if name not in self.xml.attrib]
+            for key in self.xml.attrib:
+                name = next((name for name in absent if _is_spelling(key, name)), None)
+                if key not in _LEAVES[tag] and name is not None:
+                    self.error(f"the attribute {key!r}", repr(name), "correct or remove it")
 
     def text(self, key: str) -> str | None:
         """Return the text of an attribute; None if the attribute or the element is absent."""
@@ -232,5 +233,5 @@ class Element:
 
 
 def _is_spelling(text: str, name: str) -> bool:
-    """Whether ``text`` is probably a misspelling of ``name``; upper and lower case count as equal."""
+    """Return True if ``text`` is probably a misspelling of ``name``; upper and lower case count as equal."""
     return SequenceMatcher(None, text.lower(), name).ratio() >= _SIMILARITY

@@ -48,6 +48,7 @@ class ServoObjective(Objective):
     iteration. The torque of the rigid bodies and the scale of the position errors are recomputed from these parameters.
     """
 
+    name: ClassVar[str] = "servo"
     input: ClassVar[Literal["torque", "position"]] = "position"
 
     def __init__(self, request: FitRequest) -> None:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
@@ -50,6 +50,7 @@ class TorqueObjective(Objective):
     `begin` runs the whole fit. A fit takes seconds to minutes, so no checkpoints are written during the fit.
     """
 
+    name: ClassVar[str] = "torque"
     config: TorqueFit
 
     def prepare(self) -> PreparedLogs:
