@@ -75,6 +75,19 @@ def drive_rows(
     return np.concatenate([bodies, FRICTION.columns(qd, qdd, None, speeds)], axis=2)
 
 
+def bristle_columns(bent: np.ndarray, speeds: np.ndarray) -> np.ndarray:
+    """Return the regressor of the deflections of bristles, (S, n, n K), for dry friction with hysteresis.
+
+    By virtual power, the friction of drive j acts on joint i with the factor C_ji.
+
+    Args:
+        bent: deflections of K bristles per drive, divided by the break-away displacements, (S, n, K).
+        speeds: matrix C (n, n) from joint speeds to motor speeds.
+    """
+    columns: np.ndarray = bent[:, None] * speeds.T[:, :, None]
+    return columns.reshape(*bent.shape[:2], -1)
+
+
 def drive_problem(chain: BodyChain, drives: Drives, samples: MotionSamples) -> DriveProblem:
     """Return the least-squares problem of the joint torques of `samples`, at their logged times.
 
@@ -135,10 +148,8 @@ class DriveProblem:
         Its dry friction depends on the past motion. The columns are after the columns of the bodies.
         """
         drives = len(FRICTION.effects) * len(self.size) + 1
-        # C_ji is the factor from the torque of drive j to the torque of joint i.
-        bristles = self.samples.bent[:, None] * self.speeds.T[:, :, None]  # (S, n, n, bristles)
-        flat = bristles.reshape(*self.rows.shape[:2], -1)
-        rows = np.concatenate([self.rows[..., :-drives], flat, self.rows[..., -drives:]], axis=2)
+        bristles = bristle_columns(self.samples.bent, self.speeds)
+        rows = np.concatenate([self.rows[..., :-drives], bristles, self.rows[..., -drives:]], axis=2)
         return replace(self, rows=rows, products=block_products(rows, self.products.shape[1]))
 
     @cached_property

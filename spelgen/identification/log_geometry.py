@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Chain
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.identification.drive_hints import FRICTION, drive_rows
+from spelgen.identification.drive_hints import FRICTION, bristle_columns, drive_rows
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.motion_samples import MotionSamples
@@ -160,13 +160,10 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # `bent`: deflections of the bristles under the hypothesis. The samples contain deflections for the
-                # current mapping, so the joints are permuted and the signs reversed like the motion. C = `speeds` maps
-                # joint speeds to motor speeds; by virtual power, friction of drive j, bristles included, acts on joint
-                # i with the factor C_ji.
+                # The samples contain deflections for the current mapping, so the joints are permuted and the signs
+                # reversed like the motion.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
-                bristles = bent[:, None] * self.speeds.T[:, :, None]
-                rows = np.concatenate([rows, bristles.reshape(*q.shape, -1)], axis=2)
+                rows = np.concatenate([rows, bristle_columns(bent, self.speeds)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
             if len(self._equations) >= 30:  # bounds the memory of the cache: an entry has about 1 MB
                 self._equations.pop(next(iter(self._equations)))

@@ -73,7 +73,8 @@ def _find_packages_above(functions: dict[str, Callable[[str], str]], path: Path)
 
     def find(package: str) -> str:
         for folder in path.parents:
-            for candidate in (folder, folder / package, *(x / package for x in folder.glob("*/"))):
+            repositories = sorted(folder.glob("*/"))
+            for candidate in (folder, folder / package, *(x / package for x in repositories)):
                 manifest = candidate / "package.xml"
                 if manifest.is_file():
                     name = re.search(r"<name>\s*(.*?)\s*</name>", manifest.read_text(errors="replace"))
