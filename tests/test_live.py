@@ -21,6 +21,7 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
+from spelgen.live import levels as live_levels
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.levels import block_noise, held_out_tail
@@ -515,6 +516,30 @@ def test_thresholds_hold_in_a_log_that_differs(levels):
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3
+
+
+def test_noise_levels_are_found_with_one_thread(arm, run, monkeypatch):
+    """The fits of the noise levels use one thread of torch, like the fit of the run.
+
+    With torch 2.13 and two threads, `train` of a 6-joint arm did not end: the number of threads had been raised from
+    one, after which the factorisation of a batch of matrices of order 150 does not end.
+    """
+    threads = []
+
+    def fitted_to(fit, logs):
+        threads.append(torch.get_num_threads())
+        raise LogError("too little motion")
+
+    monkeypatch.setattr(live_levels, "fitted_to", fitted_to)
+    previous = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with pytest.raises(LogError):
+            live_levels.cross_validated_levels(dataclasses.replace(load_run(run), logs=[arm[1]]))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(previous)
+    assert threads == [1]
 
 
 def test_models_that_it_cannot_use_are_refused(arm, levels, tmp_path):

@@ -18,6 +18,7 @@ from spelgen.emission.assemble import assemble, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import Fit, required_spec
+from spelgen.fitting.process import threads_of_torch
 from spelgen.fitting.torque.fit import fit_torque
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.tuning import TUNING as TORQUE
@@ -53,6 +54,9 @@ def noise_levels(fit: Fit) -> NoiseLevels:
     return levels
 
 
+# These fits use one thread, like the fit of the run. With torch 2.13, the factorisation of a batch of large matrices
+# does not end if the number of threads was raised before, as it is after a fit.
+@threads_of_torch(1)
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation on its logs.
 
