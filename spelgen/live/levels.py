@@ -55,7 +55,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 # These fits use one thread, like the fit of the run. With torch 2.13, the factorisation of a batch of large matrices
-# does not end if the number of threads was raised before, as it is after a fit.
+# does not end if the number of threads was raised before, and the end of a fit raises it.
 @threads_of_torch(1)
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation on its logs.
