@@ -11,8 +11,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
-from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import UsageError
+from spelgen.cli.options import UsageError, argument, flag, option, output_option
 from spelgen.evaluation.tables import LIMITS, limit_figures, summary
 from spelgen.files import write_json
 from spelgen.listing import WIDTH

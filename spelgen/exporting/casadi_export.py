@@ -92,7 +92,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return {name of a residual term, see `residual_expressions`: its value as an expression in q and qd}.
+    """Return {name of a residual term, see `model_expressions`: its value as an expression in q and qd}.
 
     q, qd: symbols, (n, 1) each; qd: None if no term that depends on velocity is needed.
     """
