@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.predictor import of_dynamics
+from spelgen.baselines.predictor import Solver
 from spelgen.baselines.registry import EvaluatedArm, command_followers, torque_predictors
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import RigidDynamics
@@ -161,8 +161,8 @@ def _evaluate_torques(
     # The number of integrator steps is chosen per predictor, because stiff friction needs more steps than smooth
     # dynamics. Integration errors are then negligible in the error of each predictor.
     arm = EvaluatedArm(tested.joints, tested.urdf, tested.baselines, tested.fitted_arm, probe, notes)
-    predictors = [of_dynamics(MODEL, model, probe), *torque_predictors(arm)]
-    predictors += [of_dynamics(name, dynamics, probe) for name, dynamics in baselines.items()]
+    predictors = {MODEL: Solver(model, probe)} | torque_predictors(arm)
+    predictors |= {name: Solver(dynamics, probe) for name, dynamics in baselines.items()}
     tip = _tip(tested, notes) if lengths else None
     horizons: list[Horizon] = []
     longest = None
@@ -174,7 +174,7 @@ def _evaluate_torques(
         # Curves are kept for the longest horizon only, since they contain all shorter horizons.
         if k == max(lengths.values()):
             longest = predictions
-    all_dynamics = {x.name: x.dynamics for x in predictors if x.dynamics is not None}
+    all_dynamics = {name: x.dynamics for name, x in predictors.items() if isinstance(x, Solver)}
     torque = {}
     if samples:
         torque = {name: torque_errors(dynamics, samples) for name, dynamics in all_dynamics.items()}
