@@ -13,8 +13,9 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.c_source import CFunction, c_function
-from spelgen.exporting.description import TORQUE, TrainedModel, entry_point
+from spelgen.exporting.describe import TrainedModel
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function, residual_symbols
+from spelgen.exporting.parity import TORQUE, entry_point
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.tuning import TUNING

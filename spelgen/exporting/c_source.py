@@ -15,13 +15,14 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline, PPoly
 
-from spelgen.exporting.description import EntryPoint, TrainedModel, spline_energy
+from spelgen.exporting.describe import TrainedModel, spline_energy
 from spelgen.exporting.model_expressions import (
     RESIDUAL,
     expression_functions,
     residual_symbols,
     residuals_needed,
 )
+from spelgen.exporting.parity import EntryPoint
 from spelgen.templates import render
 
 _WIDTH = 118  # maximum number of characters in a line of a C function

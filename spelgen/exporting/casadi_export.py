@@ -8,11 +8,10 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import EntryPoint, Residuals, SigmoidNetwork, TrainedModel, spline_energy
+from spelgen.exporting.describe import Residuals, SigmoidNetwork, Trained, TrainedModel, spline_energy
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
-from spelgen.exporting.parity import Called, Values, check_parity
+from spelgen.exporting.parity import Called, EntryPoint, Values, check_parity
 from spelgen.exporting.rigid_expressions import constant
 from spelgen.exporting.tuning import TUNING
 

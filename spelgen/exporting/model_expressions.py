@@ -16,7 +16,8 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import EntryPoint, Servos, TrainedModel
+from spelgen.exporting.describe import Servos, TrainedModel
+from spelgen.exporting.parity import EntryPoint
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics, mass_and_potential
 
 Symbols = dict[str, ca.SX]
