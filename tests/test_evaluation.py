@@ -23,9 +23,8 @@ from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
-from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.evaluate import evaluate, read_test_logs
 from spelgen.evaluation.rollout import rollout
-from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.fitted import load_run

@@ -44,9 +44,8 @@ def evaluate(
     # Options --limit are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
-    from spelgen.evaluation.evaluate import SECONDS, STEPS
+    from spelgen.evaluation.evaluate import SECONDS, STEPS, read_test_logs
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
-    from spelgen.evaluation.subject import read_test_logs
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
