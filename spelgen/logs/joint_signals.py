@@ -214,8 +214,8 @@ class WordReading(NamedTuple):
     Attributes:
         key: setting of the mapping that decodes the signal, "period" or "sign_bit".
         size: value of this setting, in the unit of the log.
-        in_degrees: True if the angle is probably in degrees: the mapping states no unit, and `size` is 360 times a power
-            of two.
+        in_degrees: True if the angle is probably in degrees: the mapping states no unit, and `size` is 360 times a
+            power of two.
     """
 
     key: Decoding
