@@ -334,11 +334,11 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose least-squares mass or first moment is beyond 0.4 to 2.5 times the URDF's.
+    """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference from the URDF must also change the torque of a joint by more than half of this torque's standard
-    deviation, since parameters with a small effect on the torques are uncertain.
+    difference from the URDF must also exceed four standard deviations of the fitted value, and change the torque of a
+    joint by more than half of this torque's standard deviation.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)

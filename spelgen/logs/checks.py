@@ -104,7 +104,8 @@ class Findings:
 
         where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
         `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
-        the log without the correction. is_partial: True if the settings may be wrong for other recordings.
+        the log without the correction. is_partial: True if other recordings lack the fault, so that `keys` may be wrong
+        for them; the advice then includes this condition.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
