@@ -51,13 +51,12 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     residuals, still = residual_symbols(model), ca.SX(n, 1)
     arm = RigidBodies(model.arm, q, model.inertias)
     # The payload is represented by a second set of bodies, in which only the last body has inertial parameters. The
-    # energy and the torque of this set are linear in these ten parameters.
+    # momentum and the torque of this set are linear in these ten parameters.
     payload = RigidBodies(model.arm, q, [ca.SX(10, 1)] * (len(bodies) - 1) + [load])
-    energy, load_energy = arm.kinetic_energy(qd), payload.kinetic_energy(qd)
-    momentum = ca.gradient(energy, qd) + joint_mass(model, residuals) @ qd
+    momentum, kinetic_gradient = arm.momentum(qd)
+    momentum += joint_mass(model, residuals) @ qd
     gravity = arm.torque(still, still)
-    added = residuals["kinetic"] - residuals["gravity"] - residuals["torque"]
-    gradient = ca.gradient(energy, q) + added - gravity
+    gradient = kinetic_gradient + residuals["kinetic"] - gravity - residuals["gravity"] - residuals["torque"]
     applied = constant(model.inputs) @ (tau - model.torque_offset)
     torque = applied + constant(model.friction_compensation) * qd + gradient
     # The estimator only knows an interval [low, high] of the friction state z. The estimated friction is the mean of
@@ -66,8 +65,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     # Pose and Jacobian of the last body's frame relative to the root frame. The Jacobian has three rows of linear
     # velocity, then three rows of angular velocity.
     pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
-    load_momentum = ca.gradient(load_energy, qd)
-    load_gradient = ca.gradient(load_energy, q) - payload.torque(still, still)
+    load_momentum, load_gradient = payload.momentum(qd)
+    load_gradient -= payload.torque(still, still)
     at_point = jacobian[:3, :] - ca.skew(pose[:3, :3] @ levels.point) @ jacobian[3:, :]
     outputs = {
         "momentum_balance": (

@@ -19,6 +19,8 @@ _Z = ca.sparsify(ca.DM([0, 0, 1]))
 
 Frame = tuple[ca.SX, ca.SX]
 """Rotation (3, 3) and position (3, 1) of a body's frame in the frame of its parent."""
+Wrench = tuple[ca.SX, ca.SX]
+"""Force and torque, or linear and angular momentum, (3, 1) each, about the origin of a body's frame."""
 
 
 def constant(values: object) -> ca.DM:
@@ -42,14 +44,14 @@ def body_frames(bodies: Sequence[Body], q: ca.SX) -> list[Frame]:
 
 
 class RigidBodies:
-    """The rigid bodies of an arm at a position q, (n, 1): functions that return expressions of torque and energy.
+    """The rigid bodies of an arm at a position q, (n, 1): functions that return expressions of torque and momentum.
 
     inertias: inertial parameters, (bodies, 10), or one CasADi vector (10, 1) per body; structural zeros cause no
     operations.
     """
 
     def __init__(self, arm: Chain, q: ca.SX, inertias: Sequence[ca.SX] | np.ndarray) -> None:
-        # `torque` and `kinetic_energy` use the same frames, so that sines and cosines are computed once.
+        # `torque` and `momentum` use the same frames, so that sines and cosines are computed once.
         self.arm, self.bodies, self.frames = arm, arm.bodies, body_frames(arm.bodies, q)
         parameters = []
         for ten in map(ca.sparsify, map(ca.SX, inertias)):
@@ -92,38 +94,60 @@ class RigidBodies:
             force = mass * acceleration + spin @ moment
             torque = ca.cross(moment, acceleration) + inertia @ rate
             wrenches.append((force, torque + ca.cross(w, inertia @ w)))
-        # From the tip to the root, the wrenches of all bodies that a body carries are added to its own wrench.
+        self._accumulate(wrenches)
         torques = ca.SX(len(self.arm.coordinates), 1)
-        for index, body in reversed(list(enumerate(self.bodies))):
-            force, torque = wrenches[index]
+        for body, wrench in reversed(list(zip(self.bodies, wrenches, strict=True))):
             # A mimic joint has the coordinate of its leader, so its torque is added there, times its multiplier.
-            along_axis = torque[2] if body.joint_type == "revolute" else force[2]
-            torques[body.coordinate] += float(body.multiplier) * along_axis
-            if body.parent >= 0:
-                rotation, position = self.frames[index]
-                parent_force, parent_torque = wrenches[body.parent]
-                added = rotation @ force
-                turned = rotation @ torque + ca.cross(position, added)
-                wrenches[body.parent] = parent_force + added, parent_torque + turned
+            torques[body.coordinate] += float(body.multiplier) * _axis_component(body, wrench)
         return torques
 
-    def kinetic_energy(self, qd: ca.SX) -> ca.SX:
-        """Return the kinetic energy, (1, 1) [J], without armature.
+    def momentum(self, qd: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return the momentum M qd, (n, 1), and d/dq of the kinetic energy, (n, 1), both without armature.
 
-        Its derivative with respect to qd is the momentum M qd, its derivative with respect to q a part of the torque.
+        Let h be the spatial momentum of all bodies that a joint carries, S the unit twist of the joint, and v the twist
+        (spatial velocity) of its child body. The entry of M qd is S . h. The entry of the gradient is (dS/dt) . h, with
+        dS/dt = v x S.
         """
-        # `twists` has the twist of the base, then of each body, in its own frame: angular velocity w, and velocity v of
-        # the origin. A body has the energy 1/2 m v.v + v.(w x h) + 1/2 w.(I w).
+        # `twists` has the twist of the base, then of each body, in its own frame: angular velocity, and velocity of the
+        # origin.
         twists = [(ca.SX(3, 1), ca.SX(3, 1))]
-        energy = ca.SX(1, 1)
+        momenta = []
         for body, (mass, moment, inertia), (rotation, position) in self._rows:
             w, v = twists[body.parent + 1]
             w, v = rotation.T @ w, rotation.T @ (v + ca.cross(w, position))
             speed = _Z * (float(body.multiplier) * qd[body.coordinate])
             w, v = (w + speed, v) if body.joint_type == "revolute" else (w, v + speed)
             twists.append((w, v))
-            energy += ca.dot(v, mass * v / 2 + ca.cross(w, moment)) + ca.dot(w, inertia @ w) / 2
-        return energy
+            momenta.append((mass * v + ca.cross(w, moment), inertia @ w + ca.cross(moment, v)))
+        self._accumulate(momenta)
+        momentum, gradient = ca.SX(qd.shape[0], 1), ca.SX(qd.shape[0], 1)
+        for body, (w, v), (linear, angular) in zip(self.bodies, twists[1:], momenta, strict=True):
+            turned = ca.dot(ca.cross(w, _Z), linear)
+            if body.joint_type == "revolute":
+                turned = ca.dot(ca.cross(w, _Z), angular) + ca.dot(ca.cross(v, _Z), linear)
+            ratio = float(body.multiplier)
+            momentum[body.coordinate] += ratio * _axis_component(body, (linear, angular))
+            gradient[body.coordinate] += ratio * turned
+        return momentum, gradient
+
+    def _accumulate(self, wrenches: list[Wrench]) -> None:
+        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
+
+        wrenches: one per body, in the frame of the body, parents first.
+        """
+        for index in reversed(range(len(wrenches))):
+            parent = self.bodies[index].parent
+            if parent >= 0:
+                rotation, position = self.frames[index]
+                force, torque = wrenches[parent]
+                added = rotation @ wrenches[index][0]
+                turned = rotation @ wrenches[index][1] + ca.cross(position, added)
+                wrenches[parent] = force + added, torque + turned
+
+
+def _axis_component(body: Body, wrench: Wrench) -> ca.SX:
+    """Return the force along a prismatic joint's axis, or the torque about a revolute joint's axis, (1, 1)."""
+    return wrench[1][2] if body.joint_type == "revolute" else wrench[0][2]
 
 
 def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
