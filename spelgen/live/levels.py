@@ -172,8 +172,7 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
         pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
-    return _with_observer(levels, tested)
+    return _with_observer(levels.model_copy(update={"load_variance": factor, "load_freedom": freedom}), tested)
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
