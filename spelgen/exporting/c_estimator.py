@@ -92,11 +92,12 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
         "breakaway": model.breakaway.ravel() if model.memory else [0.0],
         "rest_speed": levels.rest_speed,
+        "saturation": levels.effort * levels.saturation,
     }
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay"):
+        elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay", "saturation"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,
