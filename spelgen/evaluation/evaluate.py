@@ -28,6 +28,7 @@ from spelgen.fitting.fitted import Fit
 from spelgen.labels import MODEL
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
+from spelgen.logs.fingerprints import fingerprint_of
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, joined_column, recordings, require_commands, require_torques
 
@@ -77,11 +78,11 @@ def evaluate(
     tested = Subject(model, arm)
     logs = recordings(logs, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
-    seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
-    # Test logs that were also training logs are detected by their names, because a run does not store the logs.
+    # Test logs that were also training logs are detected by fingerprints, because a run does not store the logs.
+    seen = [x.name for x in logs if tested.trained_on.original(fingerprint_of(x))]
     if seen:
         message = (
-            f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
+            f"samples also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", SEEN, "logs", None, message))
     # Logs of position servos have no torques, so they are evaluated by replaying their commands.

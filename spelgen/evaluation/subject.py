@@ -18,6 +18,7 @@ from spelgen.evaluation.verdict import Limits, verdict
 from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.logs.arm_mapping import GivenMapping
+from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
@@ -35,7 +36,7 @@ class Subject:
         reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
         urdf: URDF of the robot; None if unknown.
         preprocessing: Filter and delay that the fit used.
-        trained_on: Names of the training and validation logs.
+        trained_on: Fingerprints of the training and validation logs.
         baselines: Content of least_squares.json: baselines that were fitted to the training logs.
         fitted_urdf: URDF of the fit, whose kinematics the baselines use.
         linear_servos: Parameters of the linear servos that were fitted to the training logs.
@@ -60,13 +61,14 @@ class Subject:
         self.urdf = urdf_path(arm)
         self.fitted_urdf: Path | None = None
         self.preprocessing: Preprocessing | None = None
-        self.trained_on: set[str] = set()
+        self.trained_on = Fingerprints()
         self.baselines: FittedBaselines = {}
         self.linear_servos: LinearServoRecord | None = None
         if isinstance(fit, Fit):
             self.urdf, self.fitted_urdf = self.urdf or fit.urdf, fit.urdf
             self.preprocessing, self.baselines = fit.preprocessing, fit.baselines
-            self.trained_on = {*fit.record.training, *fit.record.validation}
+            for name, fingerprint in fit.record.fingerprints.items():
+                self.trained_on.add(name, fingerprint)
             self.linear_servos = fit.record.servo and fit.record.servo["linear"]
 
     @property
