@@ -65,11 +65,6 @@ def test_different_recordings_share_no_samples():
     assert not repeated(*resting)
 
 
-def test_an_accepted_copy_is_not_reported():
-    copy = replace(recording(0), name="copy", accepted=("repeated-samples",))
-    assert not repeated(recording(0), copy)
-
-
 @pytest.mark.parametrize("samples", [1, 2, 3, 5])
 def test_short_recordings_have_fingerprints(samples):
     known = Fingerprints()

@@ -65,9 +65,17 @@ class GeometryProblem:
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
-        fewer = copy(self)
-        fewer.samples, fewer._equations = self.samples.thinned(count), {}
-        return fewer
+        return self._on(self.samples.thinned(count))
+
+    def part(self, rows: np.ndarray) -> GeometryProblem:
+        """Return the same least-squares problem on the samples that a mask (S,) selects."""
+        return self._on(self.samples.part(rows))
+
+    def _on(self, samples: MotionSamples) -> GeometryProblem:
+        """Return the same least-squares problem on other samples."""
+        other = copy(self)
+        other.samples, other._equations = samples, {}
+        return other
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem in which only some of the torques are fitted.
@@ -211,7 +219,7 @@ class GeometryProblem:
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
-            misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+            misfit = self.misfit(errors)
             cost = misfit + freedom * float(np.log1p(distance / freedom))
             if iteration == 0 or cost < lowest or not self._has_free_gains:
                 lowest, best = cost, (x, errors, misfit, matrix)
@@ -220,12 +228,25 @@ class GeometryProblem:
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
+    def misfit(self, errors: np.ndarray) -> float:
+        """Return the negative log likelihood for relative squared residuals `errors` (n,) of the joints."""
+        return 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
 
         The parameters of `fit` are estimated together with the quantities. columns: (S, n, D) derivative of the torque
         residual with respect to the quantities.
         """
+        return solution(*self._linearized(fit, columns))[len(fit.parameters) :]
+
+    def estimate(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Gauss-Newton step (K + D,) of K parameters and D quantities (see `step`), and its covariance."""
+        matrix, vector = self._linearized(fit, columns)
+        return solution(matrix, vector), inverse(matrix)
+
+    def _linearized(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`."""
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
@@ -235,7 +256,7 @@ class GeometryProblem:
         matrix[:count, :count] += self._precision
         vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
         vector[:count] += self._precision @ (self.prior_mean - fit.parameters)
-        return solution(matrix, vector)[count:]
+        return matrix, vector
 
     def descend(
         self,

@@ -272,7 +272,7 @@ class LogChecks:
         fingerprint = fingerprint_of(trajectory)
         original = self._fingerprints.original(fingerprint)
         self._fingerprints.add(trajectory.name, fingerprint)
-        if original and REPEATED.code not in trajectory.accepted:
+        if original:
             message = f"a quarter or more of its samples are also in trajectory {original}: omit one of both"
             findings.append((REPEATED, Advice(message)))
         for check, advice in findings:
