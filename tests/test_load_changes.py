@@ -53,7 +53,10 @@ def test_recordings_with_another_load_are_named_with_its_mass(arm, mass):  # noq
         if len(others) == 1:
             assert found.keys() == {f"part {k}" for k in others}
         # of two equal groups, either may be the reference
-        assert found.keys() in ({f"part {k}" for k in others}, {f"part {k}" for k in {0, 1, 2, 3} - {*others}})
+        assert found.keys() in (
+            {f"part {k}" for k in others},
+            {f"part {k}" for k in {0, 1, 2, 3} - {*others}},
+        )
         for value, width in found.values():
             assert abs(abs(value) - mass) < max(2 * width, 0.1 * mass)
 
@@ -74,6 +77,12 @@ def test_recordings_with_one_load_are_not_doubted(arm, seed):  # noqa: F811
         assert warnings(arm, logs) == []
 
 
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_a_tool_that_the_urdf_lacks_is_no_other_zero(arm):  # noqa: F811
+    """All recordings have a tool of 3 kg: it is no reason to doubt zeros, senses, order, units or gravity."""
+    assert warnings(arm, [loaded(arm, x, 3.0) for x in parts(recorded(arm, 3))]) == []
+
+
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_training_is_told_of_different_loads(arm):  # noqa: F811
     first, second, *_ = parts(recorded(arm, 5))
@@ -89,5 +98,7 @@ def test_recordings_of_a_ur10e_with_loads_are_found(shared):
     logs = read_logs([folder / f"{name}.parquet" for name in names], arm)
     assert warnings(arm, logs[:3]) == []
     (text,) = warnings(arm, logs)
-    ((mass, width),) = [(float(a), float(b)) for a, b in re.findall(r"load_2600 \((\S+) \+- (\S+) kg\)", text)]
+    ((mass, width),) = [
+        (float(a), float(b)) for a, b in re.findall(r"load_2600 \((\S+) \+- (\S+) kg\)", text)
+    ]
     assert abs(mass - 2.6) < 2 * width < 0.6

@@ -55,15 +55,15 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
 
 def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadChange]:
     """Return the changes of the load in some recordings (see `load_changes`)."""
-    part = problem.part(np.isin(problem.samples.recording, recordings)).thinned(SAMPLES)
-    fit = part.fit(part.unchanged)
-    rows, _ = part.equations(part.unchanged)
+    subset = problem.selected(np.isin(problem.samples.recording, recordings)).thinned(SAMPLES)
+    fit = subset.fit(subset.unchanged)
+    rows, _ = subset.equations(subset.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
     offsets = np.broadcast_to(np.eye(n), (len(rows), n, n))
     # The first effects of `FRICTION` are the armature, viscous and Coulomb friction.
     friction = rows[..., last + 10 + n : last + 10 + 3 * n]
     common, offset, other_friction, load = (
-        _Refit(part, fit, columns, recordings)
+        _refit(subset, fit, columns, recordings)
         for columns in (rows[..., :0], offsets, friction, rows[..., last : last + 4])
     )
     if load.misfit > min(offset.misfit, other_friction.misfit, common.misfit - GEOMETRY.needed):
@@ -73,66 +73,58 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     reference = order[(len(order) - 1) // 2]
     changes = []
     for k, recording in enumerate(recordings):
-        if load.is_needed(k, reference):
-            change, covariance = load.difference(k, reference)
+        change = load.quantities[k] - load.quantities[reference]
+        blocks = load.covariance[[k, reference]][:, :, [k, reference]]
+        covariance = np.einsum("a,aibj,b->ij", [1, -1], blocks, [1, -1])
+        odds = 0.5 * change @ np.linalg.pinv(covariance, hermitian=True) @ change
+        samples = subset.samples.recording == recording
+        residual = load.residual[samples]
+        unchanged = residual - rows[samples, :, last : last + 4] @ change
+        is_needed = np.square(unchanged).sum(axis=0) > 2 * np.square(residual).sum(axis=0)
+        if odds > GEOMETRY.needed and is_needed.any():
             deviation = float(np.sqrt(covariance[0, 0]))
             changes.append(LoadChange(recording, recordings[reference], float(change[0]), deviation))
     return changes
 
 
-class _Refit:
-    """Fit of torques with additional quantities of each recording: D quantities of each of R recordings.
+class _Refit(NamedTuple):
+    """Fit of torques with D additional quantities of each of R recordings.
 
     Attributes:
-        quantities: (R, D) quantities of the recordings minus those of the first one.
         misfit: negative log likelihood.
+        residual: torques of the model minus the logged torques, (S, n) [Nm, N].
+        quantities: (R, D) quantities of the recordings.
+        covariance: (R, D, R, D) covariance of the quantities.
     """
 
-    def __init__(
-        self, problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, recordings: Sequence[int]
-    ) -> None:
-        """Fit the torques of `problem`, starting from its fit without additional quantities.
+    misfit: float
+    residual: np.ndarray
+    quantities: np.ndarray
+    covariance: np.ndarray
 
+
+def _refit(
+    problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, recordings: Sequence[int]
+) -> _Refit:
+    """Return the fit of the torques with additional quantities of each recording.
+
+    Args:
+        problem: problem with the samples of the recordings.
+        fit: its fit without additional quantities.
         columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's recording.
         recordings: indices of the R recordings.
-        """
-        self._rows = [problem.samples.recording == number for number in recordings]
-        self._columns = columns
-        others = [columns * rows[:, None, None] for rows in self._rows[1:]]
-        joined, size = np.concatenate(others, axis=2), columns.shape[2]
-        tau = problem.unchanged.signals(problem.samples).tau
-        # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
-        for _ in range(3):
-            change, self._covariance = problem.estimate(fit, joined)
-            common, added = np.split(change, [len(fit.parameters)])
-            residual = problem.residual(problem.unchanged, fit.parameters + common) + joined @ added
-            errors = np.square(residual).mean(axis=0) / np.maximum(tau.var(axis=0), 1e-30)
-            fit = replace(fit, errors=errors, parameters=fit.parameters + common)
-        self._residual, self.misfit = residual, problem.misfit(errors)
-        self.quantities = np.append(np.zeros((1, size)), added.reshape(len(others), size), axis=0)
-
-    def is_needed(self, k: int, reference: int) -> bool:
-        """Return True if the quantities of recording k differ from those of `reference`, and explain its torques.
-
-        The difference must be significant, and the squared residual of one joint in recording k must at least be
-        doubled with the quantities of `reference`.
-        """
-        change, covariance = self.difference(k, reference)
-        rows = self._rows[k]
-        other = self._residual[rows] - self._columns[rows] @ change
-        ratio = np.square(other).mean(axis=0) / np.maximum(
-            np.square(self._residual[rows]).mean(axis=0), 1e-30
-        )
-        odds = 0.5 * float(change @ np.linalg.pinv(covariance, hermitian=True) @ change)
-        return odds > GEOMETRY.needed and bool((ratio > 2).any())
-
-    def difference(self, k: int, reference: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the quantities (D,) of recording k minus those of `reference`, and their covariance (D, D)."""
-        size = self.quantities.shape[1]
-        start = len(self._covariance) - size * len(self._rows)
-        weights = np.zeros((size, len(self._covariance)))
-        for number, sign in ((k, 1.0), (reference, -1.0)):
-            # The quantities of the first recording are zero, and have no rows in the covariance.
-            if number:
-                weights[:, start + size * number :][:, :size] = sign * np.eye(size)
-        return self.quantities[k] - self.quantities[reference], weights @ self._covariance @ weights.T
+    """
+    count, size = len(fit.parameters), columns.shape[2]
+    number = problem.samples.recording[:, None, None]
+    joined = np.concatenate([columns * (number == recording) for recording in recordings], axis=2)
+    variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
+    # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
+    for _ in range(3):
+        change, covariance = problem.estimate(fit, joined)
+        parameters = fit.parameters + change[:count]
+        residual = problem.residual(problem.unchanged, parameters) + joined @ change[count:]
+        errors = np.square(residual).mean(axis=0) / variance
+        fit = replace(fit, errors=errors, parameters=parameters)
+    shape = len(recordings), size
+    added = covariance[count:, count:].reshape(*shape, *shape)
+    return _Refit(problem.misfit(errors), residual, change[count:].reshape(shape), added)

@@ -67,15 +67,15 @@ class GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
         return self._on(self.samples.thinned(count))
 
-    def part(self, rows: np.ndarray) -> GeometryProblem:
+    def selected(self, rows: np.ndarray) -> GeometryProblem:
         """Return the same least-squares problem on the samples that a mask (S,) selects."""
         return self._on(self.samples.part(rows))
 
     def _on(self, samples: MotionSamples) -> GeometryProblem:
         """Return the same least-squares problem on other samples."""
-        other = copy(self)
-        other.samples, other._equations = samples, {}
-        return other
+        fewer = copy(self)
+        fewer.samples, fewer._equations = samples, {}
+        return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem in which only some of the torques are fitted.
@@ -379,7 +379,8 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
     The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
-    prior of a body without <inertial> in the URDF has mean 0 and is wide.
+    prior of a body without <inertial> in the URDF has mean 0 and is wide. The prior of a body that carries no joint
+    includes a tool or load that the URDF does not contain.
     """
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0
@@ -388,7 +389,11 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
         lengths = [np.linalg.norm(np.array(x.translation, dtype=float)) for x in arm.bodies if x.parent == k]
         mean.append(np.array(body.inertia or (0.0,) * 10, dtype=float))
         root = _root(mean[-1], float(max(lengths, default=0.0)), typical)
-        precisions.append(np.linalg.inv(root @ root.T))
+        covariance = root @ root.T
+        if not lengths:
+            deviations = GEOMETRY.load * typical * np.power(GEOMETRY.load_distance, [0, 1, 2])
+            covariance += np.diag(np.square(np.repeat(deviations, (1, 3, 6))))
+        precisions.append(np.linalg.inv(covariance))
     return np.concatenate(mean), block_diag(*precisions)
 
 
