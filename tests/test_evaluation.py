@@ -249,7 +249,7 @@ def test_predicted_windows_start_at_a_time_of_the_log(run):
 def test_parts_of_an_evaluation_that_are_omitted_are_stated(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
-        "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
+        "tested-on-training-data": "samples also used in training: motion_00, motion_01, motion_02, motion_03; "
         "errors on training data are not test errors",
         "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
         "low-rate": "20 Hz: too slow for fits to torques, which need 24 Hz; motion faster than 10 Hz, delays below "

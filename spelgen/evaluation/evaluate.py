@@ -36,6 +36,7 @@ from spelgen.labels import MODEL
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
+from spelgen.logs.fingerprints import Fingerprints, fingerprint_of
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory, joined_column, recordings, require_commands, require_torques
@@ -57,7 +58,7 @@ class Subject:
         reach: Break-away displacements of the K friction bristles of each joint, (n, K) [rad, m].
         urdf: URDF of the robot; None if unknown.
         preprocessing: Filter and delay that the fit used.
-        trained_on: Names of the training and validation logs.
+        trained_on: Fingerprints of the training and validation logs.
         baselines: Content of least_squares.json: baselines that were fitted to the training logs.
         fitted_urdf: URDF of the fit, whose kinematics the baselines use.
         linear_servos: Parameters of the linear servos that were fitted to the training logs.
@@ -82,13 +83,14 @@ class Subject:
         self.urdf = urdf_path(arm)
         self.fitted_urdf: Path | None = None
         self.preprocessing: Preprocessing | None = None
-        self.trained_on: set[str] = set()
+        self.trained_on = Fingerprints()
         self.baselines: FittedBaselines = {}
         self.linear_servos: LinearServoRecord | None = None
         if isinstance(fit, Fit):
             self.urdf, self.fitted_urdf = self.urdf or fit.urdf, fit.urdf
             self.preprocessing, self.baselines = fit.preprocessing, fit.baselines
-            self.trained_on = {*fit.record.training, *fit.record.validation}
+            for name, fingerprint in fit.record.fingerprints.items():
+                self.trained_on.add(name, fingerprint)
             self.linear_servos = fit.record.servo and fit.record.servo["linear"]
 
     @property
@@ -178,11 +180,11 @@ def evaluate(
     tested = Subject(model, arm)
     logs = recordings(logs, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
-    seen = [trajectory.name for trajectory in logs if trajectory.name in tested.trained_on]
-    # Test logs that were also training logs are detected by their names, because a run does not store the logs.
+    # Test logs that were also training logs are detected by fingerprints, because a run does not store the logs.
+    seen = [x.name for x in logs if tested.trained_on.original(fingerprint_of(x))]
     if seen:
         message = (
-            f"names also used in training: {', '.join(seen)}; errors on training data are not test errors"
+            f"samples also used in training: {', '.join(seen)}; errors on training data are not test errors"
         )
         notes.append(Diagnostic("warning", SEEN, "logs", None, message))
     # Logs of position servos have no torques, so they are evaluated by replaying their commands.
