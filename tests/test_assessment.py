@@ -73,6 +73,15 @@ def test_if_only_motion_fails_its_joint_is_named(nmse, worst):
     assert f"; worst at {worst}." in verdict(judged).sentence
 
 
+def test_the_motion_error_of_the_worst_joint_is_at_least_the_mean():
+    judged = evaluation(0.4, 0.0001)
+    of_model = judged.horizons[-1].errors["model"]
+    differing = {"q_relative_rms": (0.19, 0.21), "qd_relative_rms": (0.83, 0.25), "mean_relative_rms": 0.37}
+    judged.horizons[-1].errors["model"] = replace(of_model, **differing)
+    told = verdict(judged)
+    assert "; worst at a" in told.sentence and "At a the error after 1 s is 51 % of the motion." in told.because
+
+
 def test_a_terminal_shows_the_assessment_first():
     judged = verdict(evaluation(0.7))
     results = replace(evaluation(0.7), assessment=judged)

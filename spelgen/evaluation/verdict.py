@@ -210,13 +210,15 @@ def _worst_joint(results: Results) -> tuple[str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest relative position error at the longest horizon, and this error.
+    """Return the joint of the largest relative error at the longest horizon, and this error, averaged over q and qd.
 
     The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
+        # q and qd are averaged as in the error of all joints, so that the worst joint is not better than their mean.
         # An unknown error (None) becomes NaN.
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)
+        of_model = last.errors[MODEL]
+        errors = np.mean(np.array([of_model.q_relative_rms, of_model.qd_relative_rms], dtype=float), axis=0)
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
