@@ -82,6 +82,17 @@ def test_the_motion_error_of_the_worst_joint_is_at_least_the_mean():
     assert "; worst at a" in told.sentence and "At a the error after 1 s is 51 % of the motion." in told.because
 
 
+def test_a_prediction_that_diverges_is_stated_and_its_dash_explained():
+    judged = evaluation(0.1)
+    judged.horizons[-1].errors["model"] = replace(
+        judged.horizons[-1].errors["model"],
+        q=(None, None), qd=(None, None), q_relative_rms=(None, None), mean_relative_rms=None,
+    )  # fmt: skip
+    assert "is off by 5 % of the motion after 1 step (diverged after 1 s)" in verdict(judged).because
+    assert "-: not finite, since a prediction diverged" in judged.text()
+    assert "diverged" not in evaluation(0.1).text()
+
+
 def test_a_terminal_shows_the_assessment_first():
     judged = verdict(evaluation(0.7))
     results = replace(evaluation(0.7), assessment=judged)

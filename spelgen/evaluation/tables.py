@@ -93,7 +93,7 @@ def _horizon_tables(results: Results) -> list[Listing]:
     """Return tables of the prediction errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
-    relative, tips, note = {}, {}, ""
+    relative, tips, note, diverged = {}, {}, "", ""
     for horizon in results.horizons:
         head = horizon.name
         if not head.endswith(" s"):
@@ -103,10 +103,12 @@ def _horizon_tables(results: Results) -> list[Listing]:
         # The note explains the observer, if there are predictions with an observer: there are none on short logs.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
+        if any(error is None for error in relative[head].values()):
+            diverged = "-: not finite, since a prediction diverged"
     q = {name: errors.q for name, errors in horizon.errors.items()}
     qd = {name: errors.qd for name, errors in horizon.errors.items()}
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-    tables = [_predictor_table(title, relative, note)]
+    tables = [_predictor_table(title, relative, "; ".join(filter(None, [note, diverged])))]
     # Without a URDF the tip is unknown, and the table of tip errors is omitted.
     if any(value is not None for row in tips.values() for value in row.values()):
         tables.append(_predictor_table("Error of the tip's position [mm]", tips))

@@ -143,6 +143,8 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
         tip = last.errors[MODEL].tip_mm
         if tip is not None:
             proof += f", {number(tip)} mm at the tip"
+        if last is not results.horizons[-1]:
+            proof += f" (diverged after {results.horizons[-1].name})"
         uses.proofs.append(proof)
 
 

@@ -45,11 +45,11 @@ class Excitation:
         """Return a text of at most 80 columns about the quality of the motion and its use of the limits."""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
-            f"condition number of the {self.parameters} base parameters' regressor: "
-            f"{self.condition:.3g}\n  of the first motion at random: {self.first:.3g}"
+            f"condition number {self.condition:.3g}; of the first motion at random: {self.first:.3g}"
         )
         if self.first_overruns:
             head += ", beyond effort limits"
+        head += f"\n  of the regressor of {self.parameters} parameters: base parameters, friction and armature"
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
