@@ -57,6 +57,7 @@ def verdict(
     # decide this.
     uses = _Uses()
     _assess_torques(results, uses)
+    good_torques = bool(uses.good)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
     # If neither torques nor motion were evaluated, there is nothing to assess. This happens with --quick on logs
@@ -85,7 +86,7 @@ def verdict(
             sentence += f"; {detail}"
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
-    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results)]
+    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results, good_torques)]
     because += recommendations.values()
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
@@ -170,8 +171,11 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _better_baselines(results: Results) -> list[str]:
-    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque."""
+def _better_baselines(results: Results, good_torques: bool) -> list[str]:
+    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
+
+    good_torques: whether the torques of the model are accurate enough for a use, which is then recommended.
+    """
     times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -191,7 +195,7 @@ def _better_baselines(results: Results) -> list[str]:
     statements = []
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
-        statements.append(f"{ahead}: there, use the model for torques only.")
+        statements.append(f"{ahead}: there, use the model for torques only." if good_torques else f"{ahead}.")
     reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
