@@ -231,7 +231,9 @@ class TestCoordinates:
 
     def test_reversed_limits_are_the_same_range(self, robot):
         reversed_limits = joint("a", "0", "1").replace('lower="-1" upper="2"', 'lower="2" upper="-1"')
-        assert make_arm(robot(reversed_limits)).coordinates == make_arm(robot(joint("a", "0", "1"))).coordinates
+        assert (
+            make_arm(robot(reversed_limits)).coordinates == make_arm(robot(joint("a", "0", "1"))).coordinates
+        )
 
 
 class TestMimic:

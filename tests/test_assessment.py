@@ -79,7 +79,9 @@ def test_the_motion_error_of_the_worst_joint_is_at_least_the_mean():
     differing = {"q_relative_rms": (0.19, 0.21), "qd_relative_rms": (0.83, 0.25), "mean_relative_rms": 0.37}
     judged.horizons[-1].errors["model"] = replace(of_model, **differing)
     told = verdict(judged)
-    assert "; worst at a" in told.sentence and "At a the error after 1 s is 51 % of the motion." in told.because
+    assert (
+        "; worst at a" in told.sentence and "At a the error after 1 s is 51 % of the motion." in told.because
+    )
 
 
 def test_a_prediction_that_diverges_is_stated_and_its_dash_explained():

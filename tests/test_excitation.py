@@ -218,7 +218,7 @@ def test_the_command(robots, tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert "of the first motion at random" in shown.stdout
-    # `inspect` states 6 base inertial parameters of this arm: the sum with those of friction and drives is named as such.
+    # `inspect` states 6 base inertial parameters of this arm: the sum with friction and drives is named as such.
     assert "of the regressor of 13 parameters: base parameters, friction and armature" in shown.stdout
     with open("x.csv", newline="") as file:
         head, *rows = csv.reader(file)

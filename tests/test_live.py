@@ -83,6 +83,7 @@ def loaded(model, log, qdd, theta):
 
 def estimates(run, levels, log, tau):
     estimator = Estimator(load_run(run), levels=levels)
+    assert repr(estimator).endswith("joints, 1 false alarms of contact per minute>")
     return estimator, estimator.replay(dataclasses.replace(log, tau=tau))
 
 

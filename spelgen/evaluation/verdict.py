@@ -117,12 +117,10 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
-    pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
-    worst = ("", -math.inf)
-    for joint, error in pairs:
-        if error is not None and error > worst[1] and joint not in results.torque_steps:
-            worst = joint, error
-    return worst
+    errors = {} if torque is None else dict(zip(results.joints, torque.joint_nmse, strict=False))
+    nmse = {x: error for x, error in errors.items() if error is not None and x not in results.torque_steps}
+    joint = max(nmse, key=nmse.__getitem__, default="")
+    return joint, nmse.get(joint, -math.inf)
 
 
 def _assess_motion(results: Results, uses: _Uses) -> None:
@@ -231,10 +229,7 @@ def _worst_motion(results: Results) -> tuple[str, float]:
 
 
 def _recommendations(
-    results: Results,
-    identified: FittedBaselines,
-    limits: Limits,
-    independent: Collection[str],
+    results: Results, identified: FittedBaselines, limits: Limits, independent: Collection[str]
 ) -> dict[str, str]:
     """Return {motion to record: reason}, the most useful motion first.
 
@@ -261,12 +256,11 @@ def _recommendations(
             # A motion of one revolution covers all positions of a revolute joint, so a wider range counts as one
             # revolution.
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
-    if fractions:
-        joint = min(fractions, key=fractions.__getitem__)
-        # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
-        if fractions[joint] < TUNING.narrow_range:
-            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
-            recommendations[f"wider motion of {joint}"] = reason
+    # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
+    joint = min(fractions, key=fractions.__getitem__, default="")
+    if joint and fractions[joint] < TUNING.narrow_range:
+        reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
+        recommendations[f"wider motion of {joint}"] = reason
     return recommendations
 
 
