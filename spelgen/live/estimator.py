@@ -86,7 +86,7 @@ class Estimator:
         self.reset()
 
     def __repr__(self) -> str:
-        return f"<Estimator of {self.model.n} joints, {self.alarms_per_minute:g} false alarms of contact per minute>"
+        return f"<Estimator of {self.model.n} joints, alarms_per_minute={self.alarms_per_minute:g}>"
 
     def reset(self) -> None:
         """Reset all estimates: payload, friction drift and friction state are unknown afterwards."""
