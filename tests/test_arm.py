@@ -229,6 +229,12 @@ class TestCoordinates:
         assert (first.damping, first.friction, first.passive) == (0.5, 0.25, False)
         assert (second.continuous, second.lower, second.upper, second.velocity) == (False, -1.0, 2.0, 4.0)
 
+    def test_reversed_limits_are_the_same_range(self, robot):
+        reversed_limits = joint("a", "0", "1").replace('lower="-1" upper="2"', 'lower="2" upper="-1"')
+        assert (
+            make_arm(robot(reversed_limits)).coordinates == make_arm(robot(joint("a", "0", "1"))).coordinates
+        )
+
 
 class TestMimic:
     def test_a_mimic_chain_moves_with_its_first_leader(self, robot):

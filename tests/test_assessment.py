@@ -73,6 +73,28 @@ def test_if_only_motion_fails_its_joint_is_named(nmse, worst):
     assert f"; worst at {worst}." in verdict(judged).sentence
 
 
+def test_the_motion_error_of_the_worst_joint_is_at_least_the_mean():
+    judged = evaluation(0.4, 0.0001)
+    of_model = judged.horizons[-1].errors["model"]
+    differing = {"q_relative_rms": (0.19, 0.21), "qd_relative_rms": (0.83, 0.25), "mean_relative_rms": 0.37}
+    judged.horizons[-1].errors["model"] = replace(of_model, **differing)
+    told = verdict(judged)
+    assert (
+        "; worst at a" in told.sentence and "At a the error after 1 s is 51 % of the motion." in told.because
+    )
+
+
+def test_a_prediction_that_diverges_is_stated_and_its_dash_explained():
+    judged = evaluation(0.1)
+    judged.horizons[-1].errors["model"] = replace(
+        judged.horizons[-1].errors["model"],
+        q=(None, None), qd=(None, None), q_relative_rms=(None, None), mean_relative_rms=None,
+    )  # fmt: skip
+    assert "is off by 5 % of the motion after 1 step (diverged after 1 s)" in verdict(judged).because
+    assert "-: not finite, since a prediction diverged" in judged.text()
+    assert "diverged" not in evaluation(0.1).text()
+
+
 def test_a_terminal_shows_the_assessment_first():
     judged = verdict(evaluation(0.7))
     results = replace(evaluation(0.7), assessment=judged)
@@ -146,6 +168,8 @@ def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     still = "velocity stays constant"
     better = "A constant velocity predicts better 1 s ahead: there, use the model for torques only."
     assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
+    # Torques of which 60 % are explained have no use that could be recommended.
+    assert "better 1 s ahead. " in f"{verdict(evaluation(0.9, 0.4, **{still: 0.6})).because} "
     held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
     assert "A constant velocity" not in verdict(held).because
     assert "prediction 1 s ahead with a momentum observer" in verdict(held).sentence

@@ -23,6 +23,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from spelgen.cli.main import app
+from spelgen.fitting.run_folder import RunFolder
 from spelgen.settings.log_mapping import Accepted
 
 ROOT = Path(__file__).parents[1]
@@ -207,6 +208,13 @@ def test_every_code_is_explained_once():
     rows = re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
     explained = Counter(code for row in rows for code in re.findall(r"`([a-z-]+)`", row))
     assert explained == Counter(dict.fromkeys(codes_of_messages(), 1))
+
+
+def test_every_file_of_a_run_folder_is_explained():
+    """Each file of a run folder has a row in docs/cli_runs.md."""
+    page = (ROOT / "docs" / "cli_runs.md").read_text(encoding="utf-8")
+    files = [path.name for path in vars(RunFolder("run")).values() if path.name != "run"]
+    assert [name for name in files if not re.search(rf"^\\|.*`{re.escape(name)}`.*\\|", page, re.M)] == []
 
 
 def test_every_option_is_explained():

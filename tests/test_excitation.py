@@ -218,6 +218,8 @@ def test_the_command(robots, tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert "of the first motion at random" in shown.stdout
+    # `inspect` states 6 base inertial parameters of this arm: the sum with friction and drives is named as such.
+    assert "of the regressor of 13 parameters: base parameters, friction and armature" in shown.stdout
     with open("x.csv", newline="") as file:
         head, *rows = csv.reader(file)
     assert head == ["t", "q_joint1", "q_joint2", "qd_joint1", "qd_joint2", "qdd_joint1", "qdd_joint2"]

@@ -201,6 +201,8 @@ def test_shapes_and_effort_limits_go_along(tmp_path):
     model, q = build(arm, "closed-form").requires_grad_(False), np.array([0.3, -0.9])
     found = export(model, "mjcf", arm=arm)
     assert "shapes omitted, since they cannot be read or are flat: tool" in found.summary
+    # The model has rounded angles, the MJCF file the unrounded ones: the comparison names its reference.
+    assert "from the model's rigid bodies with the URDF's unrounded angles" in found.summary[-1]
     simulated = mujoco.MjModel.from_xml_string(found.files[".xml"].decode())
     data = mujoco.MjData(simulated)
     data.qpos[:], data.ctrl[:] = q, [1e3, -1e3]

@@ -85,6 +85,7 @@ def loaded(model, log, qdd, theta):
 
 def estimates(run, levels, log, tau):
     estimator = Estimator(load_run(run), levels=levels)
+    assert repr(estimator) == f"<Estimator of {estimator.model.n} joints, alarms_per_minute=1>"
     return estimator, estimator.replay(dataclasses.replace(log, tau=tau))
 
 

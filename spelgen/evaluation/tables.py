@@ -61,12 +61,9 @@ def result_tables(results: Results) -> list[Listing]:
 def _predictor_table(title: str, rows: Mapping[str, Numbers], note: str = "") -> Listing:
     """Return a table of the model and the baselines, without the baselines that have no number in any row."""
     # The column of the model is kept even without numbers: it shows that the model has no result.
-    columns, shown = {MODEL}, {}
-    for row in rows.values():
-        columns |= {name for name, value in row.items() if value is not None}
-    for label, row in rows.items():
-        shown[label] = {name: value for name, value in row.items() if name in columns}
-    return table(title, shown, note)
+    columns = {MODEL}.union(*({name for name in row if row[name] is not None} for row in rows.values()))
+    numbers = {label: {name: row[name] for name in row if name in columns} for label, row in rows.items()}
+    return table(title, numbers, note)
 
 
 def summary(results: Results) -> Listing | None:
@@ -93,7 +90,7 @@ def _horizon_tables(results: Results) -> list[Listing]:
     """Return tables of the prediction errors per horizon, and of the errors per joint at the last horizon."""
     if not results.horizons:
         return []
-    relative, tips, note = {}, {}, ""
+    relative, tips, note, diverged = {}, {}, "", ""
     for horizon in results.horizons:
         head = horizon.name
         if not head.endswith(" s"):
@@ -103,10 +100,12 @@ def _horizon_tables(results: Results) -> list[Listing]:
         # The note explains the observer, if there are predictions with an observer: there are none on short logs.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
+        if any(error is None for error in relative[head].values()):
+            diverged = "-: not finite, since a prediction diverged"
     q = {name: errors.q for name, errors in horizon.errors.items()}
     qd = {name: errors.qd for name, errors in horizon.errors.items()}
     title = "Error relative to the motion (0: none, 1: as if the arm had stood still)"
-    tables = [_predictor_table(title, relative, note)]
+    tables = [_predictor_table(title, relative, "; ".join(filter(None, [note, diverged])))]
     # Without a URDF the tip is unknown, and the table of tip errors is omitted.
     if any(value is not None for row in tips.values() for value in row.values()):
         tables.append(_predictor_table("Error of the tip's position [mm]", tips))
@@ -124,9 +123,8 @@ def _torque_tables(results: Results) -> list[Listing]:
         "worst joint": {name: errors.worst_nmse for name, errors in results.torque.items()},
     }
     rmse = {name: errors.rmse for name, errors in results.torque.items()}
-    note = ""
-    if results.torque_steps:
-        note = f"logged in steps of their own size: {', '.join(results.torque_steps)}"
+    steps = ", ".join(results.torque_steps)
+    note = f"logged in steps of their own size: {steps}" if steps else ""
     title = "Torque error of the inverse dynamics, nMSE over all test samples"
     by_joint = _by_joint(results, "Torque error by joint, RMSE{}", "torque", rmse, note)
     return [_predictor_table(title, rows), by_joint]
@@ -150,11 +148,7 @@ def _replay_tables(results: Results) -> list[Listing]:
 
 
 def _by_joint(
-    results: Results,
-    title: str,
-    quantity: str,
-    errors: Mapping[str, Sequence[float | None]],
-    note: str = "",
+    results: Results, title: str, quantity: str, errors: Mapping[str, Sequence[float | None]], note: str = ""
 ) -> Listing:
     """Return a table of the errors of all predictors, with one row per joint.
 

@@ -57,6 +57,7 @@ def verdict(
     # decide this.
     uses = _Uses()
     _assess_torques(results, uses)
+    good_torques = bool(uses.good)
     _assess_motion(results, uses)
     _assess_replays(results, uses)
     # If neither torques nor motion were evaluated, there is nothing to assess. This happens with --quick on logs
@@ -85,7 +86,7 @@ def verdict(
             sentence += f"; {detail}"
         else:
             because.append(f"{detail[0].upper()}{detail[1:]}.")
-    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results)]
+    because += [f"The model {listed(uses.proofs)}.", proof, *_better_baselines(results, good_torques)]
     because += recommendations.values()
     return Verdict(f"{sentence}.", " ".join(filter(None, because)))
 
@@ -116,12 +117,10 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 def _worst_torque(results: Results) -> tuple[str, float]:
     """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
     torque = results.torque.get(MODEL)
-    pairs = [] if torque is None else zip(results.joints, torque.joint_nmse, strict=False)
-    worst = ("", -math.inf)
-    for joint, error in pairs:
-        if error is not None and error > worst[1] and joint not in results.torque_steps:
-            worst = joint, error
-    return worst
+    errors = {} if torque is None else dict(zip(results.joints, torque.joint_nmse, strict=False))
+    nmse = {x: error for x, error in errors.items() if error is not None and x not in results.torque_steps}
+    joint = max(nmse, key=nmse.__getitem__, default="")
+    return joint, nmse.get(joint, -math.inf)
 
 
 def _assess_motion(results: Results, uses: _Uses) -> None:
@@ -143,6 +142,8 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
         tip = last.errors[MODEL].tip_mm
         if tip is not None:
             proof += f", {number(tip)} mm at the tip"
+        if last is not results.horizons[-1]:
+            proof += f" (diverged after {results.horizons[-1].name})"
         uses.proofs.append(proof)
 
 
@@ -168,8 +169,11 @@ def _relative(errors: StateErrors | None) -> float:
     return errors.mean_relative_rms
 
 
-def _better_baselines(results: Results) -> list[str]:
-    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque."""
+def _better_baselines(results: Results, good_torques: bool) -> list[str]:
+    """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
+
+    good_torques: whether the torques of the model are accurate enough for a use, which is then recommended.
+    """
     times = []
     better: dict[str, list[str]] = {}
     for horizon in results.horizons:
@@ -189,7 +193,7 @@ def _better_baselines(results: Results) -> list[str]:
     statements = []
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
-        statements.append(f"{ahead}: there, use the model for torques only.")
+        statements.append(f"{ahead}: there, use the model for torques only." if good_torques else f"{ahead}.")
     reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
@@ -210,23 +214,22 @@ def _worst_joint(results: Results) -> tuple[str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest relative position error at the longest horizon, and this error.
+    """Return the joint of the largest relative error at the longest horizon, and this error, averaged over q and qd.
 
     The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
+        # q and qd are averaged as in the error of all joints, so that the worst joint is not better than their mean.
         # An unknown error (None) becomes NaN.
-        errors = np.array(last.errors[MODEL].q_relative_rms, dtype=float)
+        of_model = last.errors[MODEL]
+        errors = np.mean(np.array([of_model.q_relative_rms, of_model.qd_relative_rms], dtype=float), axis=0)
         if np.isfinite(errors).all():
             return results.joints[errors.argmax()], errors.max()
     return "", math.inf
 
 
 def _recommendations(
-    results: Results,
-    identified: FittedBaselines,
-    limits: Limits,
-    independent: Collection[str],
+    results: Results, identified: FittedBaselines, limits: Limits, independent: Collection[str]
 ) -> dict[str, str]:
     """Return {motion to record: reason}, the most useful motion first.
 
@@ -253,12 +256,11 @@ def _recommendations(
             # A motion of one revolution covers all positions of a revolute joint, so a wider range counts as one
             # revolution.
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
-    if fractions:
-        joint = min(fractions, key=fractions.__getitem__)
-        # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
-        if fractions[joint] < TUNING.narrow_range:
-            reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
-            recommendations[f"wider motion of {joint}"] = reason
+    # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
+    joint = min(fractions, key=fractions.__getitem__, default="")
+    if joint and fractions[joint] < TUNING.narrow_range:
+        reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."
+        recommendations[f"wider motion of {joint}"] = reason
     return recommendations
 
 

@@ -43,13 +43,12 @@ class Excitation:
 
     def text(self) -> str:
         """Return a text of at most 80 columns about the quality of the motion and its use of the limits."""
+        overruns = ", beyond effort limits" if self.first_overruns else ""
         head = (
             f"{self.arm.name}: {self.motion.t[-1]:g} s, {len(self.motion.t)} samples\n"
-            f"condition number of the {self.parameters} base parameters' regressor: "
-            f"{self.condition:.3g}\n  of the first motion at random: {self.first:.3g}"
+            f"condition number {self.condition:.3g}; of the first motion at random: {self.first:.3g}{overruns}\n"
+            f"  of the regressor of {self.parameters} parameters: base parameters, friction and armature"
         )
-        if self.first_overruns:
-            head += ", beyond effort limits"
         paragraphs = [head, self.listing().text()]
         if (self.efforts > 1).any():
             paragraphs.append("warning: effort limits are overrun: no motion was found that keeps them")
@@ -97,9 +96,8 @@ class Excitation:
 
     def csv(self) -> str:
         """Return the motion as CSV with the columns t, q_<joint>, qd_<joint> and qdd_<joint>, with nine decimals."""
-        head = ["t"]
-        for quantity in ("q", "qd", "qdd"):
-            head += [f"{quantity}_{coordinate.name}" for coordinate in self.arm.coordinates]
+        names = self.arm.joint_names
+        head = ["t", *(f"{quantity}_{name}" for quantity in ("q", "qd", "qdd") for name in names)]
         motion, file = self.motion, io.StringIO()
         csv.writer(file, lineterminator="\n").writerow(head)
         rows = np.concatenate([motion.t[:, None], motion.q, motion.qd, motion.qdd], axis=1)
@@ -126,8 +124,7 @@ class Excitation:
         return f'{head}\n"joint_names": {names},\n"points": [\n{rows}\n]}}\n'
 
     def __repr__(self) -> str:
-        summary = f"{self.motion.t[-1]:g} s, condition number {self.condition:.3g}"
-        return f"<Excitation of {self.arm.name!r}: {summary} of {self.parameters} base parameters>"
+        return f"<Excitation of {self.arm.name!r}: {self.motion.t[-1]:g} s, condition number {self.condition:.3g}>"
 
     def _repr_html_(self) -> str:
         return self.listing().html()

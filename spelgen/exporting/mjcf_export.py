@@ -95,7 +95,8 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     expected = {"mass_matrix": mass, "bias": bias, "forward_dynamics": torch.linalg.solve(mass, force)}
     simulated = _simulated(text, arm, random["q"], random["qd"], controls)
     differences = {name: relative(values, expected[name].numpy()) for name, values in simulated.items()}
-    return require_parity(differences, TUNING.mujoco_tolerance, states)
+    reference = "the model's rigid bodies with the URDF's unrounded angles"
+    return require_parity(differences, TUNING.mujoco_tolerance, states, reference)
 
 
 def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls: np.ndarray) -> Values:

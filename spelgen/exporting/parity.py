@@ -137,10 +137,13 @@ class Parity:
     summary: str
 
 
-def require_parity(differences: dict[str, float], tolerance: float, states: int) -> Parity:
+def require_parity(
+    differences: dict[str, float], tolerance: float, states: int, reference: str = "the torch module"
+) -> Parity:
     """Return the differences between export and model as a ``Parity``. Raises RunError if one is above the tolerance.
 
-    differences: {entry point: largest relative difference}. states: number of random states, for the summary.
+    differences: {entry point: largest relative difference}. states, reference: number of random states and name of the
+    compared dynamics, for the summary.
     """
     for name, difference in differences.items():
         if not difference <= tolerance:  # The comparison is negated, so that NaN raises the error, too.
@@ -152,7 +155,7 @@ def require_parity(differences: dict[str, float], tolerance: float, states: int)
             )
     worst = max(differences, key=differences.__getitem__)
     summary = (
-        f"{states} random states: at most {differences[worst]:.1e} ({worst}) from the torch module, "
+        f"{states} random states: at most {differences[worst]:.1e} ({worst}) from {reference}, "
         f"relative to the largest value; {tolerance:.0e} is allowed"
     )
     return Parity(differences, summary)

@@ -85,6 +85,9 @@ class Estimator:
         self.reach = bristle_reach(self.model)
         self.reset()
 
+    def __repr__(self) -> str:
+        return f"<Estimator of {self.model.n} joints, alarms_per_minute={self.alarms_per_minute:g}>"
+
     def reset(self) -> None:
         """Reset all estimates: payload, friction drift and friction state are unknown afterwards."""
         n = self.model.n
