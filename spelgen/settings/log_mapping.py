@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from spelgen.errors import SettingsError
-from spelgen.settings.yaml_document import Group, Number, Positive
+from spelgen.settings.yaml_document import Group, Number, Place, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
@@ -231,7 +231,7 @@ class JointLog(Group):
     counts_per_turn: Positive | None = None
     counts_per_metre: Positive | None = None
     sign: Literal[1, -1] = 1
-    offset: Number = 0.0
+    offset: Place = 0.0
     gain: Number | None = None
     torque_offset: Number = 0.0
     period: JointWords = JointWords()

@@ -179,7 +179,7 @@ def _read_mimic(mimic: Element) -> Mimic | None:
 
 
 def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) -> Transmission:
-    """Return the transmission of a <transmission> element in the form of ROS (<type>, <joint>, <actuator>).
+    """Return the transmission of a <transmission> element (<type>, <joint>, <actuator>) of ROS or ros2_control.
 
     Unknown joints and unusable numbers are added to ``notes`` as warnings. The unusable numbers are also stored in the
     field ``errors`` of the transmission, for callers that need the transmission.
@@ -200,11 +200,16 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
             message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
             notes.warn(joint.line, "unknown-transmission-joint", where, message)
             continue
-        driven.append((joint_name, joint.number_in_text("mechanicalReduction")))
+        driven.append((joint_name, joint.number_in_text(_reduction_tag(element))))
     actuators = []
     for element in xml.findall("actuator"):
-        actuators.append(Element(optional, element, where).number_in_text("mechanicalReduction"))
+        actuators.append(Element(optional, element, where).number_in_text(_reduction_tag(element)))
     notes.add_as_warnings(optional)
     # The type of a transmission is an element in ROS 1, and an attribute in the files of some exporters.
-    kind = (xml.findtext("type") or xml.get("type") or "").strip()
+    kind = (xml.findtext("type") or xml.findtext("plugin") or xml.get("type") or "").strip()
     return Transmission(kind, tuple(driven), tuple(actuators), tuple(optional.errors))
+
+
+def _reduction_tag(element: etree._Element) -> str:
+    """Return the name of the element of the reduction in the dialect of a joint or actuator of a transmission."""
+    return "mechanicalReduction" if element.find("mechanical_reduction") is None else "mechanical_reduction"
