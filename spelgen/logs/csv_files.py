@@ -17,11 +17,10 @@ from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import STATED_KEY, LogTable
 from spelgen.logs.values import is_number, stamps
-from spelgen.settings.log_mapping import PLAIN, UNIT_NAMES, LogMapping, plain_unit
+from spelgen.settings.log_mapping import PLAIN, LogMapping, is_unit, plain_unit
 
 # First columns of a file that `ros2 topic echo --csv` writes: the fields of the message header.
 STAMP = ("sec", "nanosec", "frame_id")
-ALL_UNITS = set().union(*UNIT_NAMES.values())
 # Beginning of a comment line: "#" or "% ". A "%" without a blank is no comment: `rostopic echo -p` names a column
 # "%time".
 COMMENT = re.compile(r"^(#|% )\s*")
@@ -122,7 +121,7 @@ def _beginning(file: Path) -> Beginning:
         names = names + [""] * (width - len(names))
         units = [plain_unit(x) for x in cells[start - 1]]
         # Names, and the header itself, may contain words such as `deg`.
-        units = units if sum(x in ALL_UNITS for x in units) > len(units) / 2 else []
+        units = units if sum(map(is_unit, units)) > sum(map(bool, units)) / 2 else []
     return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
 
 

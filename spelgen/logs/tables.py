@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
-from spelgen.settings.log_mapping import UNIT_NAMES, LogMapping
+from spelgen.settings.log_mapping import LogMapping, mapped_unit
 
 UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
@@ -286,8 +286,8 @@ def _require_units(
     stated = stated_units(schema)
     units: dict[str, str] = {}
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
-        unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(stated.get(name, ""), "")
-        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.units.t != "s"
+        unit = mapped_unit(quantity, stated.get(name, "")) or ""
+        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.time_scale != 1.0
         is_mapped |= bool(
             mapping.sample_rate if quantity == "t" else quantity == "tau" and mapping.joint(joint).gain
         )

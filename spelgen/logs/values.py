@@ -131,7 +131,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
         if nanoseconds is not None:
             return nanoseconds, TIMES["ns"]
     if not pa.types.is_temporal(times.type):
-        return times, TIMES[layout.mapping.units.t]
+        return times, layout.mapping.time_scale
     counted: pa.DataType = pa.timestamp("ns")
     if pa.types.is_duration(times.type):
         counted = pa.duration("ns")

@@ -30,17 +30,20 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping.
+# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping,
+# which may have a factor.
 UNIT_NAMES = {
-    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
+    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns", "min": "60 s"},
     "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
-          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "turn": "turns",
-          "rev": "turns", "revs": "turns", "revolutions": "turns", "mm": "mm",
-          "m": "m"},
+          "mrad": "mrad", **dict.fromkeys(("counts", "ticks", "pulse", "pulses", "cnt", "inc"), "counts"),
+          "mdeg": "0.001 deg", "cdeg": "0.01 deg", "arcmin": "0.01666666667 deg", "cm": "10 mm", "m": "m", "mm": "mm",
+          **dict.fromkeys(("turns", "turn", "rev", "revs", "revolutions"), "turns")},
     "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
            "rev/s": "turns/s", "revs/s": "turns/s", "turns/s": "turns/s", "turn/s": "turns/s", "rps": "turns/s",
-           "counts/s": "counts/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
+           **dict.fromkeys(("counts/s", "ticks/s", "pulse/s", "pulses/s", "cnt/s", "inc/s"), "counts/s"),
+           "mdeg/s": "0.001 deg/s", "cdeg/s": "0.01 deg/s", "deg/min": "0.01666666667 deg/s", "cm/s": "10 mm/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
     "tau": {"nm": "Nm", "mnm": "mNm", "ncm": "Ncm", "kgfcm": "kgf.cm", "kgcm": "kgf.cm", "n": "N",
+            "knm": "1000 Nm", "kn": "1000 N", "lbfft": "1.355817948 Nm", "lbfin": "0.112984829 Nm", "ozfin": "0.0070615518 Nm",
             "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
             "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
 }  # fmt: skip
@@ -73,10 +76,37 @@ Decoding = Literal["period", "sign_bit"]
 def plain_unit(text: str) -> str:
     """Return a unit as written in a log, in lower case, without brackets and signs of products.
 
-    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s.
+    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm", and so is "N·m x1000".
     """
-    unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", text.strip(" []()").lower())
-    return re.sub(r"[\s.·⋅*-]", "", unit)
+    unit = text.strip(" []()").lower()
+    number = r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
+    match = re.fullmatch(rf"(?P<x>[x×]?) ?{number}(?![\d/]) ?[*x×]?(?P<unit>.+)|(.+?) ?[*x×] ?{number}", unit)
+    factor = ""
+    if match:
+        unit = match["unit"] or match[4]
+        # Values "x1000" are a thousand times as large, and values in "0.01 deg" are counts of hundredths of a degree.
+        size = float(match[2] or match[5])
+        factor = f"{1 / size if size > 1 and (match['x'] or match[5]) else size:.9g} "
+    unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", unit)
+    return factor + re.sub(r"[\s.·⋅*-]", "", unit)
+
+
+def mapped_unit(quantity: str, unit: str) -> str | None:
+    """Return the unit of a mapping, such as "0.01 deg", of a unit in the form of `plain_unit`; None if it is unknown.
+
+    quantity: "t", "q", "qd", "tau" or "u".
+    """
+    factor, _, name = unit.rpartition(" ")
+    known = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
+    if known is None or not factor:
+        return known
+    own, _, name = known.rpartition(" ")
+    return f"{float(factor) * float(own or 1):.9g} {name}"
+
+
+def is_unit(unit: str) -> bool:
+    """Return True if a text in the form of `plain_unit` is a unit of any quantity."""
+    return any(mapped_unit(quantity, unit) for quantity in UNIT_NAMES)
 
 
 class LogColumns(Group):
@@ -122,17 +152,33 @@ class JointColumns(Group):
 class JointUnits(Group):
     """Units of the columns of one joint, in place of the `units` of all joints.
 
+    A unit may have a factor: "0.01 deg" for values in hundredths of a degree.
+
     Attributes:
         q: Position.
         qd: Velocity.
         tau: Torque, force or motor current.
         u: Commanded position; default: the unit of q.
+        factors: Factors of the units by quantity, in place of factors in the units.
     """
 
     q: Position | None = None
     qd: Velocity | None = None
     tau: Effort | None = None
     u: Position | None = None
+    factors: dict[Literal["t", "q", "qd", "tau", "u"], Positive] = Field(default={})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_factors(cls, content: object) -> object:
+        # A factor in the text of a unit becomes an entry of `factors`.
+        texts = content.items() if isinstance(content, dict) else ()
+        matches = {x: re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?) ?([^\d\s.].*)", y) for x, y in texts if isinstance(y, str)}
+        found = {x: match for x, match in matches.items() if match}
+        if not found or not isinstance(content, dict):
+            return content
+        factors = {x: match[1] for x, match in found.items()} | content.get("factors", {})
+        return content | {x: match[2] for x, match in found.items()} | {"factors": factors}
 
 
 class LogUnits(JointUnits):
@@ -399,9 +445,18 @@ class LogMapping(Group):
             return self.unit("q", joint)
         return unit
 
+    @property
+    def time_scale(self) -> float:
+        """Factor that converts logged times to seconds."""
+        return TIMES[self.units.t] * self.units.factors.get("t", 1.0)
+
     def scale(self, quantity: str, joint: str) -> float:
         """Return the factor, with sign, that converts logged values of a quantity of a joint to SI units."""
         logged, unit = self.joint(joint), self.unit(quantity, joint)
+        if quantity == "u" and not (logged.units.u or self.units.u):
+            return self.scale("q", joint)
+        units = logged.units if getattr(logged.units, quantity) else self.units
+        multiple = units.factors.get(quantity, 1.0)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
@@ -415,7 +470,7 @@ class LogMapping(Group):
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
-        return logged.sign * factor
+        return logged.sign * factor * multiple
 
     def offset(self, quantity: str, joint: str) -> float:
         """Return the offset of a quantity of a joint in SI units, which is added after multiplication by `scale`."""
