@@ -5,7 +5,7 @@ import csv
 import json
 import re
 from collections.abc import Sequence
-from itertools import takewhile, zip_longest
+from itertools import pairwise, takewhile, zip_longest
 from pathlib import Path
 from statistics import mode
 from typing import NamedTuple
@@ -52,19 +52,40 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
+    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark.
+
+    If the header is repeated between the rows, a new recording begins where the clock goes back.
+    """
     table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    return [LogTable.of(table, mapping, remarks=remarks, header=header)]
+    first = table[0].to_pylist() if table.num_columns and pa.types.is_string(table.schema.types[0]) else []
+    if table.column_names[0] not in first or mapping.columns.trajectory in table.column_names:
+        return [LogTable.of(table, mapping, remarks=remarks, header=header)]
+    tables: list[tuple[pa.Table, int]] = []
+    text = _beginning(file)
+    lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
+    starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
+    for start, stop in pairwise([*starts, len(lines) + 1]):
+        part, _, _ = csv_table(file, text, "\n".join(lines[start : stop - 1]))
+        t = mapping.columns.t if mapping.columns.t in part.column_names else part.column_names[0]
+        if tables and part.schema == tables[-1][0].schema and part[t][0].as_py() > tables[-1][0][t][-1].as_py():
+            start, part = tables[-1][1], pa.concat_tables([tables.pop()[0], part])
+        tables.append((part, start))
+    return [
+        LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
+        for k, (x, start) in enumerate(tables, start=1)
+    ]
 
 
-def csv_table(file: Path) -> tuple[pa.Table, int, str]:
+def csv_table(file: Path, text: Beginning | None = None, rows: str | None = None) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
+
+    text: beginning of the file, if it is known. rows: some of its lines of values; None: all.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
     may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
-    text = _beginning(file)
+    text = text or _beginning(file)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
@@ -84,10 +105,12 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
         source, encoding = pa.BufferReader(plain.encode()), "utf-8"
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
-    rows = {"skip_rows": text.lines, "column_names": names or text.names}
+    if rows is not None:
+        source, encoding = pa.BufferReader(rows.encode()), "utf-8"
+    before = text.lines if rows is None else 0
     table = pa.csv.read_csv(
         source,
-        pa.csv.ReadOptions(use_threads=False, encoding=encoding, **rows),
+        pa.csv.ReadOptions(use_threads=False, encoding=encoding, skip_rows=before, column_names=names or text.names),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
@@ -95,7 +118,7 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
     # error.
     for row in wrong:
-        if not len(table) or row.number <= text.lines + len(table):
+        if not len(table) or row.number <= before + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
             raise LogError(
                 got, file=file, line=row.number, expected=f"{row.expected_columns}, as in the header"

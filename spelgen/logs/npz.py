@@ -10,7 +10,7 @@ from zipfile import ZipFile
 import numpy as np
 import pyarrow as pa
 
-from spelgen.errors import LogError
+from spelgen.errors import LogError, collect
 from spelgen.logs.tables import JOINTS_KEY, LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
@@ -51,6 +51,10 @@ class NpzArrays:
                     raise self.error(name, "Python objects", "numbers", do) from error
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
+            fields = self._arrays[name].dtype.names
+            if fields:
+                do = f"store its fields: a = numpy.load(FILE)[{name!r}]; numpy.savez(OTHER, **{{x: a[x] for x in a.dtype.names}})"
+                raise self.error(name, f"a structured array ({', '.join(fields)})", "an array of numbers", do)
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
@@ -141,11 +145,25 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
     A matrix becomes a column of lists.
     """
-    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
+    names, faults = [], []
+    for name in arrays.names:
+        try:
+            names += [name] if arrays[name].ndim in (1, 2) else []
+        # Other arrays, such as a dict with the settings of the recorder, are not needed.
+        except LogError as fault:
+            faults.append(fault)
     vectors = set(filter(arrays.is_vector, names))
     rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
     samples = max(rows.values(), default=0)
+    collect(faults if samples == 0 else ())
+    for name in arrays.names if not faults else ():
+        # An array (recordings, rows, joints); images have larger third dimensions.
+        if arrays[name].ndim == 3 and len(arrays[name]) < arrays[name].shape[1] >= samples and arrays[name].shape[1] > 3 * arrays[name].shape[2]:
+            _order(name, arrays, [])
     for name in names:
+        if rows[name] == samples - 1 > 1:
+            expected, do = f"{samples} rows", "leave out the last row of the longer arrays, a state without torques"
+            raise arrays.error(name, f"{rows[name]} rows", expected, do)
         if rows[name] != samples and arrays[name].shape[-1] == samples:
             raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")
     table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)

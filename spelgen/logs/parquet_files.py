@@ -1,6 +1,7 @@
-"""Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
+"""Reader of Parquet logs, of JSON and JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from spelgen.errors import LogError, collect, shortened
 from spelgen.files import read_json, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.bags import names_line
-from spelgen.logs.tables import LogTable, reading
+from spelgen.logs.npz import JOINT_NAMES
+from spelgen.logs.tables import JOINTS_KEY, LogTable, reading
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
@@ -57,11 +59,69 @@ def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> l
     return [LogTable.of(_flat(table), mapping, remarks=remarks, header=0)]
 
 
+def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
+    """Return a list with one table, the content of a JSON file: a list of objects, one per row, or lists of values.
+
+    The rows are the items of the longest list, or of all lists of its length. Names of nested values are joined by
+    points, such as `joints.elbow.position`; an object of a list is named by its `name`, else by its index.
+    """
+    try:
+        document = json.loads(file.read_bytes())
+    except json.JSONDecodeError as error:
+        if error.msg == "Extra data":
+            return read_json_lines(file, joints, mapping)
+        raise
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    found = dict(_lists(document, ""))
+    rows = max(map(len, found.values()), default=0)
+    columns = {name: pa.array(values) for name, values in found.items() if len(values) == rows}
+    table = pa.table(columns)
+    if len(columns) == 1 and pa.types.is_struct(table.schema.types[0]):
+        table = pa.Table.from_struct_array(table[0].combine_chunks())
+    names = (x for name, x in found.items() if JOINT_NAMES.fullmatch(name.rpartition(".")[2]) and len(x) < rows)
+    table = table.replace_schema_metadata({JOINTS_KEY: json.dumps(next(names, []))})
+    return [LogTable.of(_flat(table), mapping, header=0)]
+
+
+def _lists(value: object, name: str) -> Iterator[tuple[str, list[Any]]]:
+    """Yield (name, items) of the lists in a JSON value, except for lists within items of a list of samples."""
+    items = value.items() if isinstance(value, dict) else ()
+    if isinstance(value, list):
+        objects = [x for x in value if isinstance(x, dict)]
+        # Objects of joints contain lists of samples; samples contain numbers, or a list with a value per joint.
+        if any(isinstance(x, list) and len(x) > len(value) for item in objects for x in item.values()):
+            items = [(str(x.get("name", k)), x) for k, x in enumerate(objects)]
+        else:
+            yield name, value
+    for key, item in items:
+        yield from _lists(item, f"{name}.{key}" if name else key)
+
+
 def _flat(table: pa.Table) -> pa.Table:
-    """Return a table in which columns of structs are replaced by a column per field, such as `position.elbow`."""
-    while any(map(pa.types.is_struct, table.schema.types)):
-        table = table.flatten()
+    """Return a table in which columns of structs are replaced by a column per field, such as `position.elbow`.
+
+    Columns of lists of structs, such as the states of all motors, become a column of lists per field.
+    """
+    index = next((k for k, x in enumerate(table.schema.types) if _has_structs(x)), None)
+    while index is not None:
+        if any(map(pa.types.is_struct, table.schema.types)):
+            table = table.flatten()
+        else:
+            name, lists = table.schema.names[index], table[index].cast(pa.list_(table.schema.types[index].value_type))
+            lists = lists.combine_chunks()
+            table = table.remove_column(index)
+            for field, values in zip(lists.type.value_type, lists.values.flatten(), strict=True):
+                column = pa.ListArray.from_arrays(lists.offsets, values, mask=lists.is_null())
+                table = table.append_column(f"{name}.{field.name}", column)
+        index = next((k for k, x in enumerate(table.schema.types) if _has_structs(x)), None)
     return table
+
+
+def _has_structs(kind: pa.DataType) -> bool:
+    """Return True for the type of structs, and of lists of structs."""
+    lists = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    return pa.types.is_struct(kind.value_type if lists else kind)
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

@@ -167,6 +167,11 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
         _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
+    repeated = [x for x, count in Counter(table.column_names).items() if count > 1]
+    if repeated and not by_joint["q"]:
+        numbers = f"{repeated[0]}1, {repeated[0]}2, ..."
+        got = f"the same name for several columns: {shortened(repeated, TUNING.listed)}"
+        raise LogError(got, file=file, expected="a name for each column", do=f"number them: {numbers}")
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
