@@ -68,7 +68,11 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     for start, stop in pairwise([*starts, len(lines) + 1]):
         part, _, _ = csv_table(file, text, "\n".join(lines[start : stop - 1]))
         t = mapping.columns.t if mapping.columns.t in part.column_names else part.column_names[0]
-        if tables and part.schema == tables[-1][0].schema and part[t][0].as_py() > tables[-1][0][t][-1].as_py():
+        if (
+            tables
+            and part.schema == tables[-1][0].schema
+            and part[t][0].as_py() > tables[-1][0][t][-1].as_py()
+        ):
             start, part = tables[-1][1], pa.concat_tables([tables.pop()[0], part])
         tables.append((part, start))
     return [
@@ -77,7 +81,9 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     ]
 
 
-def csv_table(file: Path, text: Beginning | None = None, rows: str | None = None) -> tuple[pa.Table, int, str]:
+def csv_table(
+    file: Path, text: Beginning | None = None, rows: str | None = None
+) -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
     text: beginning of the file, if it is known. rows: some of its lines of values; None: all.
@@ -110,7 +116,9 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str | None = None
     before = text.lines if rows is None else 0
     table = pa.csv.read_csv(
         source,
-        pa.csv.ReadOptions(use_threads=False, encoding=encoding, skip_rows=before, column_names=names or text.names),
+        pa.csv.ReadOptions(
+            use_threads=False, encoding=encoding, skip_rows=before, column_names=names or text.names
+        ),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),

@@ -109,8 +109,9 @@ def _conversion(path: Path) -> str | None:
     """Return the advice, for an error message, to convert a file by a command in CONVERT; None for other files."""
     suffix = path.suffix.lower()
     # The documents of `ros2 topic echo` are YAML in a file of any name.
-    if suffix in (".txt", ".log") and path.read_bytes()[: 2**16].startswith(b"header:"):
-        suffix = ".yaml"
+    if suffix in (".txt", ".log") and path.is_file():
+        with path.open("rb") as source:
+            suffix = ".yaml" if source.read(7) == b"header:" else suffix
     command = CONVERT.get(suffix)
     # FILE replaces a path with spaces or quotation marks, which a shell would split into arguments or execute as code.
     plain = path if re.fullmatch(r"[\w./@+-]+", str(path)) else Path("FILE").with_suffix(path.suffix)
@@ -133,7 +134,7 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
     if not logs:
         packed = next(filter(None, map(_conversion, sorted(path.iterdir()))), None)
         if any(format_of(x) for x in path.glob("*/*")):
-            packed = f"name the folders with logs: {path}/*"
+            packed = "name the folders in it, which have logs"
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
     # All logs of a folder are used if no file of the folder is named train.* or test.*.
     selected = [log for log in logs if log.stem == role]

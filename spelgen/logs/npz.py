@@ -158,11 +158,18 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     collect(faults if samples == 0 else ())
     for name in arrays.names if not faults else ():
         # An array (recordings, rows, joints); images have larger third dimensions.
-        if arrays[name].ndim == 3 and len(arrays[name]) < arrays[name].shape[1] >= samples and arrays[name].shape[1] > 3 * arrays[name].shape[2]:
+        if (
+            arrays[name].ndim == 3
+            and len(arrays[name]) < arrays[name].shape[1] >= samples
+            and arrays[name].shape[1] > 3 * arrays[name].shape[2]
+        ):
             _order(name, arrays, [])
     for name in names:
         if rows[name] == samples - 1 > 1:
-            expected, do = f"{samples} rows", "leave out the last row of the longer arrays, a state without torques"
+            expected, do = (
+                f"{samples} rows",
+                "leave out the last row of the longer arrays, a state without torques",
+            )
             raise arrays.error(name, f"{rows[name]} rows", expected, do)
         if rows[name] != samples and arrays[name].shape[-1] == samples:
             raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")

@@ -79,7 +79,9 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
     table = pa.table(columns)
     if len(columns) == 1 and pa.types.is_struct(table.schema.types[0]):
         table = pa.Table.from_struct_array(table[0].combine_chunks())
-    names = (x for name, x in found.items() if JOINT_NAMES.fullmatch(name.rpartition(".")[2]) and len(x) < rows)
+    names = (
+        x for name, x in found.items() if JOINT_NAMES.fullmatch(name.rpartition(".")[2]) and len(x) < rows
+    )
     table = table.replace_schema_metadata({JOINTS_KEY: json.dumps(next(names, []))})
     return [LogTable.of(_flat(table), mapping, header=0)]
 
@@ -108,7 +110,10 @@ def _flat(table: pa.Table) -> pa.Table:
         if any(map(pa.types.is_struct, table.schema.types)):
             table = table.flatten()
         else:
-            name, lists = table.schema.names[index], table[index].cast(pa.list_(table.schema.types[index].value_type))
+            name, lists = (
+                table.schema.names[index],
+                table[index].cast(pa.list_(table.schema.types[index].value_type)),
+            )
             lists = lists.combine_chunks()
             table = table.remove_column(index)
             for field, values in zip(lists.type.value_type, lists.values.flatten(), strict=True):

@@ -141,7 +141,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     labels = joint_patterns(joints, names)
     columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
     if not commands:
-        columns = [_by_values(x, columns, table) for x in columns]
+        columns = _with_letters(columns, table)
     columns_of = _by_quantity(columns, commands, len(joints))
     # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
@@ -212,24 +212,35 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     return _suggestion(lines, missing, "column")
 
 
-def _by_values(column: ColumnName, columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
-    """Return a column such as `u0` or `t0` with its quantity, which the letter does not determine.
+def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
+    """Return the columns with quantities of names such as `t0`, `v0` and `u0`, which letters do not determine.
 
-    `t0` is a torque if there is a column of the same number of positions. `u0` is a velocity if its values are those of
-    the derivative of the position, a commanded position if they are close to the position, otherwise a torque.
+    Numbered columns `t` are torques. `v` and `u` are velocities if their values are those of the derivative of the
+    positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
     """
-    of_number = [x for x in columns if x.quantity == "q" and x.number == column.number >= 0 and not x.words & COMMANDED]
-    if not column.words <= {"t", "u"} or not column.words or not of_number:
-        return column
-    q, values = _numbers(table, of_number[0].name), _numbers(table, column.name)
-    if column.words == {"t"}:
-        return column._replace(quantity="tau")
-    if len(q) != len(values) or len(q) < 3 or not np.ptp(q) * np.ptp(values) > 0:
-        return column
-    if abs(np.corrcoef(np.gradient(q), values)[0, 1]) > 0.9:
-        return column._replace(quantity="qd", words={"qd"})
-    is_command = np.std(values - q) < 0.3 * np.std(q)
-    return column if is_command else column._replace(quantity="tau", words={"tau"})
+    result = list(columns)
+    for letter in "tvu":
+        pairs = []
+        named = [k for k, x in enumerate(result) if x.words == {letter} and x.number >= 0]
+        for x in map(result.__getitem__, named):
+            q = [
+                y.name
+                for y in result
+                if (y.quantity, y.number) == ("q", x.number) and not y.words & COMMANDED
+            ]
+            pair = [_numbers(table, name) for name in (*q[:1], x.name)]
+            if q and len(pair[0]) == len(pair[1]) > 2 and min(map(np.ptp, pair)) > 0:
+                pairs.append(pair)
+        if not pairs:
+            continue
+        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in pairs])
+        distance = np.median([np.std(x - q) / np.std(q) for q, x in pairs])
+        quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
+        if letter != "t" and slope > 0.9 and all(x.quantity != "qd" for x in result):
+            quantity = "qd"
+        for k in named if quantity else ():
+            result[k] = result[k]._replace(quantity=quantity, words={str(quantity)})
+    return result
 
 
 def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
@@ -359,7 +370,13 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
-    if not unit and last and is_unit(plain_unit(last[2])) and last[2].lower() not in BARE and last[2] != name[:1]:
+    if (
+        not unit
+        and last
+        and is_unit(plain_unit(last[2]))
+        and last[2].lower() not in BARE
+        and last[2] != name[:1]
+    ):
         bare, unit = last[1], plain_unit(last[2])
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
     separated = GLUED.sub(r" \g<0> ", unicodedata.normalize("NFKC", separated))

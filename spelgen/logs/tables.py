@@ -287,7 +287,9 @@ def _require_units(
     units: dict[str, str] = {}
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
         unit = mapped_unit(quantity, stated.get(name, "")) or ""
-        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.time_scale != 1.0
+        is_mapped = (
+            mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.time_scale != 1.0
+        )
         is_mapped |= bool(
             mapping.sample_rate if quantity == "t" else quantity == "tau" and mapping.joint(joint).gain
         )

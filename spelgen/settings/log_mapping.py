@@ -173,7 +173,11 @@ class JointUnits(Group):
     def _with_factors(cls, content: object) -> object:
         # A factor in the text of a unit becomes an entry of `factors`.
         texts = content.items() if isinstance(content, dict) else ()
-        matches = {x: re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?) ?([^\d\s.].*)", y) for x, y in texts if isinstance(y, str)}
+        matches = {
+            x: re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?) ?([^\d\s.].*)", y)
+            for x, y in texts
+            if isinstance(y, str)
+        }
         found = {x: match for x, match in matches.items() if match}
         if not found or not isinstance(content, dict):
             return content
