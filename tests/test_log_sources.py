@@ -251,9 +251,12 @@ def test_other_arrays_of_an_archive_are_named_or_not_needed(scara, tmp_path):
     np.savez(tmp_path / "log.npz", info=np.array({"robot": "x"}, dtype=object), **arrays)
     require_same(suggested(tmp_path / "log.npz", scara)[0])
     faults = {
-        "an array per recording": {x: np.stack([y, y]) for x, y in arrays.items()},
-        "leave out the last row of the longer": arrays | {"positions": np.vstack([Q, Q[-1:]])},
-        "store its fields: a = numpy": {"log": np.zeros(9, dtype=[("t", float), ("q", float)])},
+        "an array of shape .2, 200, 4.*split it by recordings": {
+            x: np.stack([y, y]) for x, y in arrays.items()
+        },
+        "an array of shape .200,., expected a row for each of the 201 times": arrays
+        | {"positions": np.vstack([Q, Q[-1:]])},
+        "store its fields: numpy": {"log": np.zeros(9, dtype=[("t", float), ("q", float)])},
     }
     for number, (message, content) in enumerate(faults.items()):
         np.savez(tmp_path / f"{number}.npz", **content)

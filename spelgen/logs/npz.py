@@ -51,10 +51,9 @@ class NpzArrays:
                     raise self.error(name, "Python objects", "numbers", do) from error
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
-            fields = self._arrays[name].dtype.names
-            if fields:
-                do = f"store its fields: a = numpy.load(FILE)[{name!r}]; numpy.savez(OTHER, **{{x: a[x] for x in a.dtype.names}})"
-                raise self.error(name, f"a structured array ({', '.join(fields)})", "an array of numbers", do)
+            if fields := self._arrays[name].dtype.names:
+                do = "store its fields: numpy.savez(OTHER, **{x: array[x] for x in array.dtype.names})"
+                raise self.error(name, f"a structured array ({', '.join(fields)})", "numbers", do)
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
@@ -145,35 +144,30 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
     A matrix becomes a column of lists.
     """
-    names, faults = [], []
+    shapes, faults = {}, []
     for name in arrays.names:
         try:
-            names += [name] if arrays[name].ndim in (1, 2) else []
+            shapes[name] = arrays[name].shape
         # Other arrays, such as a dict with the settings of the recorder, are not needed.
         except LogError as fault:
             faults.append(fault)
-    vectors = set(filter(arrays.is_vector, names))
-    rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
-    samples = max(rows.values(), default=0)
-    collect(faults if samples == 0 else ())
-    for name in arrays.names if not faults else ():
-        # An array (recordings, rows, joints); images have larger third dimensions.
-        if (
-            arrays[name].ndim == 3
-            and len(arrays[name]) < arrays[name].shape[1] >= samples
-            and arrays[name].shape[1] > 3 * arrays[name].shape[2]
-        ):
-            _order(name, arrays, [])
-    for name in names:
-        if rows[name] == samples - 1 > 1:
-            expected, do = (
-                f"{samples} rows",
-                "leave out the last row of the longer arrays, a state without torques",
+    collect([] if shapes else faults)
+    samples = max(map(max, filter(None, shapes.values())), default=0)
+    vectors = set(filter(arrays.is_vector, shapes))
+    columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
+    chosen = [x for x in columns if samples == (arrays[x].size if x in vectors else len(arrays[x]))]
+    for name, shape in sorted(shapes.items(), key=lambda item: -len(item[1])):
+        # An array of images has a row per time, and is not needed. Simulations may have a state more than inputs.
+        if name not in chosen and shape[:1] != (samples,) and any(abs(x - samples) < 2 for x in shape):
+            do = (
+                "transpose it: rows are times"
+                if shape[-1] == samples
+                else "resample it, or split it by recordings"
             )
-            raise arrays.error(name, f"{rows[name]} rows", expected, do)
-        if rows[name] != samples and arrays[name].shape[-1] == samples:
-            raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")
-    table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
+            raise arrays.error(
+                name, f"an array of shape {shape}", f"a row for each of the {samples} times", do
+            )
+    table = _equally_long(arrays, chosen, vectors)
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
 

@@ -79,11 +79,9 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
     table = pa.table(columns)
     if len(columns) == 1 and pa.types.is_struct(table.schema.types[0]):
         table = pa.Table.from_struct_array(table[0].combine_chunks())
-    names = (
-        x for name, x in found.items() if JOINT_NAMES.fullmatch(name.rpartition(".")[2]) and len(x) < rows
-    )
-    table = table.replace_schema_metadata({JOINTS_KEY: json.dumps(next(names, []))})
-    return [LogTable.of(_flat(table), mapping, header=0)]
+    names = [x for name, x in found.items() if JOINT_NAMES.fullmatch(name.split(".")[-1]) and len(x) < rows]
+    table = table.replace_schema_metadata({JOINTS_KEY: json.dumps([*names, []][0])})
+    return [LogTable.of(_flat(table), mapping)]
 
 
 def _lists(value: object, name: str) -> Iterator[tuple[str, list[Any]]]:
@@ -105,28 +103,24 @@ def _flat(table: pa.Table) -> pa.Table:
 
     Columns of lists of structs, such as the states of all motors, become a column of lists per field.
     """
-    index = next((k for k, x in enumerate(table.schema.types) if _has_structs(x)), None)
-    while index is not None:
-        if any(map(pa.types.is_struct, table.schema.types)):
+    while True:
+        while any(map(pa.types.is_struct, table.schema.types)):
             table = table.flatten()
-        else:
-            name, lists = (
-                table.schema.names[index],
-                table[index].cast(pa.list_(table.schema.types[index].value_type)),
-            )
-            lists = lists.combine_chunks()
-            table = table.remove_column(index)
-            for field, values in zip(lists.type.value_type, lists.values.flatten(), strict=True):
-                column = pa.ListArray.from_arrays(lists.offsets, values, mask=lists.is_null())
-                table = table.append_column(f"{name}.{field.name}", column)
-        index = next((k for k, x in enumerate(table.schema.types) if _has_structs(x)), None)
-    return table
+        name = next((x.name for x in table.schema if _has_structs(x.type)), None)
+        if name is None:
+            return table
+        column = table[name].combine_chunks()
+        lists = column.cast(pa.list_(column.type.value_type))
+        table = table.drop_columns([name])
+        for field, values in zip(lists.type.value_type, lists.values.flatten(), strict=True):
+            column = pa.ListArray.from_arrays(lists.offsets, values, mask=lists.is_null())
+            table = table.append_column(f"{name}.{field.name}", column)
 
 
 def _has_structs(kind: pa.DataType) -> bool:
-    """Return True for the type of structs, and of lists of structs."""
-    lists = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
-    return pa.types.is_struct(kind.value_type if lists else kind)
+    """Return True for the type of lists of structs."""
+    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    return bool(is_list and pa.types.is_struct(kind.value_type))
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:

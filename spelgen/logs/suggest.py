@@ -167,11 +167,10 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
         _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
-    repeated = [x for x, count in Counter(table.column_names).items() if count > 1]
-    if repeated and not by_joint["q"]:
-        numbers = f"{repeated[0]}1, {repeated[0]}2, ..."
-        got = f"the same name for several columns: {shortened(repeated, TUNING.listed)}"
-        raise LogError(got, file=file, expected="a name for each column", do=f"number them: {numbers}")
+        repeated = [x for x, count in Counter(table.column_names).items() if count > 1]
+        if repeated:
+            got = f"the same name for several columns: {shortened(repeated, TUNING.listed)}"
+            raise LogError(got, file=file, expected="a name for each", do=f"number them: {repeated[0]}1, ...")
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
@@ -219,19 +218,15 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
     positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
     """
     result = list(columns)
+    of_number = {x.number: x for x in columns if x.quantity == "q" and not x.words & COMMANDED}
     for letter in "tvu":
-        pairs = []
         named = [k for k, x in enumerate(result) if x.words == {letter} and x.number >= 0]
-        for x in map(result.__getitem__, named):
-            q = [
-                y.name
-                for y in result
-                if (y.quantity, y.number) == ("q", x.number) and not y.words & COMMANDED
-            ]
-            pair = [_numbers(table, name) for name in (*q[:1], x.name)]
-            if q and len(pair[0]) == len(pair[1]) > 2 and min(map(np.ptp, pair)) > 0:
-                pairs.append(pair)
-        if not pairs:
+        pairs = [[of_number.get(result[k].number, result[k]), result[k]] for k in named]
+        pairs = [[_numbers(table, x.name) for x in pair] for pair in pairs]
+        pairs = [
+            (q, x) for q, x in pairs if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0 and q is not x
+        ]
+        if not pairs or not of_number:
             continue
         slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in pairs])
         distance = np.median([np.std(x - q) / np.std(q) for q, x in pairs])
@@ -318,8 +313,9 @@ def _joint_lines(
     differing = {x: unit for x, unit in units.items() if x not in common}
     if differing:
         yield f"    units: {json.dumps(differing)}"
-    if (unit := units.get("tau", "")).split()[-1:] and unit.split()[-1] in CURRENTS:
-        yield f"    gain: 1.0 # Nm per {unit.split()[-1]} at the joint, the gear included: write its value"
+    unit = units.get("tau", "").rpartition(" ")[2]
+    if unit in CURRENTS:
+        yield f"    gain: 1.0 # Nm per {unit} at the joint, the gear included: write its value"
     if units.get("q") == "counts":
         yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
 
@@ -370,13 +366,8 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
-    if (
-        not unit
-        and last
-        and is_unit(plain_unit(last[2]))
-        and last[2].lower() not in BARE
-        and last[2] != name[:1]
-    ):
+    is_bare = last and (last[2].lower() in BARE or last[2] == name[:1])
+    if not unit and last and not is_bare and is_unit(plain_unit(last[2])):
         bare, unit = last[1], plain_unit(last[2])
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
     separated = GLUED.sub(r" \g<0> ", unicodedata.normalize("NFKC", separated))

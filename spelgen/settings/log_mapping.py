@@ -8,12 +8,12 @@ Register values of motors, such as signed magnitudes, are first decoded by `sign
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PlainSerializer, WrapValidator, field_validator, model_validator
 
 from spelgen.errors import SettingsError
 from spelgen.settings.yaml_document import Group, Number, Place, Positive
@@ -65,10 +65,23 @@ Accepted = Literal[
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
-Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
-Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
-Effort = Literal["Nm", "mNm", "Ncm", "kgf.cm", "N", "A", "mA", "percent", "permille"]
+
+def _scaled(value: object, validate: Callable[[object], str]) -> str:
+    """Return a validated unit, which may have a factor, such as "0.01 deg"."""
+    match = (
+        re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value) if isinstance(value, str) else None
+    )
+    return f"{match[1]} {validate(match[2])}" if match and float(match[1]) else validate(value)
+
+
+# A unit with a factor is none of the literals, so that it is serialised as a text.
+_SCALED = WrapValidator(_scaled), PlainSerializer(str, when_used="unless-none")
+Time = Annotated[Literal["s", "ms", "us", "ns"], *_SCALED]
+Position = Annotated[Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"], *_SCALED]
+Velocity = Annotated[
+    Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"], *_SCALED
+]
+Effort = Annotated[Literal["Nm", "mNm", "Ncm", "kgf.cm", "N", "A", "mA", "percent", "permille"], *_SCALED]
 Decoding = Literal["period", "sign_bit"]
 """Settings of the raw values of registers and wrapped angles."""
 
@@ -78,9 +91,9 @@ def plain_unit(text: str) -> str:
 
     Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm", and so is "N·m x1000".
     """
-    unit = text.strip(" []()").lower()
+    unit = text.strip(" []()").lower().replace("\u00d7", "x")
     number = r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
-    match = re.fullmatch(rf"(?P<x>[x×]?) ?{number}(?![\d/]) ?[*x×]?(?P<unit>.+)|(.+?) ?[*x×] ?{number}", unit)
+    match = re.fullmatch(rf"(?P<x>x?) ?{number}(?![\d/]) ?[*x]?(?P<unit>.+)|(.+?) ?[*x] ?{number}", unit)
     factor = ""
     if match:
         unit = match["unit"] or match[4]
@@ -159,30 +172,12 @@ class JointUnits(Group):
         qd: Velocity.
         tau: Torque, force or motor current.
         u: Commanded position; default: the unit of q.
-        factors: Factors of the units by quantity, in place of factors in the units.
     """
 
     q: Position | None = None
     qd: Velocity | None = None
     tau: Effort | None = None
     u: Position | None = None
-    factors: dict[Literal["t", "q", "qd", "tau", "u"], Positive] = Field(default={})
-
-    @model_validator(mode="before")
-    @classmethod
-    def _with_factors(cls, content: object) -> object:
-        # A factor in the text of a unit becomes an entry of `factors`.
-        texts = content.items() if isinstance(content, dict) else ()
-        matches = {
-            x: re.fullmatch(r"([\d.]+(?:e[+-]?\d+)?) ?([^\d\s.].*)", y)
-            for x, y in texts
-            if isinstance(y, str)
-        }
-        found = {x: match for x, match in matches.items() if match}
-        if not found or not isinstance(content, dict):
-            return content
-        factors = {x: match[1] for x, match in found.items()} | content.get("factors", {})
-        return content | {x: match[2] for x, match in found.items()} | {"factors": factors}
 
 
 class LogUnits(JointUnits):
@@ -441,26 +436,28 @@ class LogMapping(Group):
         """Return the period in SI units at which logged values of a quantity of a joint wrap; 0 if it is not set."""
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
-    def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of the logged "q", "qd", "tau" or "u" of a joint; None if the settings contain none."""
-        unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+    def _unit(self, quantity: str, joint: str) -> tuple[float, str | None]:
+        """Return the factor and the unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
+        text: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
-        if unit is None and quantity == "u":
-            return self.unit("q", joint)
-        return unit
+        if text is None and quantity == "u":
+            return self._unit("q", joint)
+        factor, _, unit = (text or "").rpartition(" ")
+        return float(factor or 1), unit or None
+
+    def unit(self, quantity: str, joint: str) -> str | None:
+        """Return the unit, without factor, of a logged quantity of a joint; None if the settings contain none."""
+        return self._unit(quantity, joint)[1]
 
     @property
     def time_scale(self) -> float:
         """Factor that converts logged times to seconds."""
-        return TIMES[self.units.t] * self.units.factors.get("t", 1.0)
+        factor, _, unit = self.units.t.rpartition(" ")
+        return float(factor or 1) * TIMES[unit]
 
     def scale(self, quantity: str, joint: str) -> float:
         """Return the factor, with sign, that converts logged values of a quantity of a joint to SI units."""
-        logged, unit = self.joint(joint), self.unit(quantity, joint)
-        if quantity == "u" and not (logged.units.u or self.units.u):
-            return self.scale("q", joint)
-        units = logged.units if getattr(logged.units, quantity) else self.units
-        multiple = units.factors.get(quantity, 1.0)
+        logged, (multiple, unit) = self.joint(joint), self._unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain

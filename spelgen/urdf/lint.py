@@ -15,8 +15,8 @@ _ROUNDING = 1e-6
 _SMALLEST_INERTIA = 1e-15
 
 _LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm
-# [1] Largest plausible distance of a centre of mass from the frame of its link, divided by the sum of the offsets of all
-# joints. Of 1,283 links in 180 URDFs only placeholders exceed 1.4; with centres of mass in cm, all URDFs exceed 2.
+# [1] Largest plausible distance of a centre of mass from the frame of its link, divided by the sum of the offsets of
+# all joints. Of 1,283 links in 180 URDFs only placeholders exceed 1.4; with centres of mass in cm, all URDFs exceed 2.
 _LARGEST_COM = 2.0
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
