@@ -28,7 +28,10 @@ def documents(names):
     stamps = [{"sec": int(t), "nanosec": round(t % 1 * 1e9)} for t in T.tolist()]
     order = [2, 0, 3, 1]
     points = [
-        {"time_from_start": stamp, "positions": q[order].tolist(), "velocities": qd[order].tolist(), "effort": tau[order].tolist()}
+        {
+            "time_from_start": stamp, "positions": q[order].tolist(), "velocities": qd[order].tolist(),
+            "effort": tau[order].tolist(),
+        }
         for stamp, q, qd, tau in zip(stamps, Q, QD, TAU, strict=True)
     ]  # fmt: skip
     joints = [
@@ -207,7 +210,7 @@ def test_equal_names_are_one_error(scara, tmp_path):
     head = ["time", *["pos"] * 4, *["vel"] * 4, *["effort"] * 4]
     path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU]))
     with pytest.raises(
-        LogError, match="the same name for several columns: pos, vel, effort.*number them: pos1"
+        LogError, match=r"the same name for several columns: pos, vel, effort.*number them: pos1"
     ):
         suggest_mapping(path, scara.chain.joint_names)
 
@@ -254,8 +257,7 @@ def test_other_arrays_of_an_archive_are_named_or_not_needed(scara, tmp_path):
         "an array of shape .2, 200, 4.*split it by recordings": {
             x: np.stack([y, y]) for x, y in arrays.items()
         },
-        "an array of shape .200,., expected a row for each of the 201 times": arrays
-        | {"positions": np.vstack([Q, Q[-1:]])},
+        "expected a row for each of the 201 times": arrays | {"positions": np.vstack([Q, Q[-1:]])},
         "store its fields: numpy": {"log": np.zeros(9, dtype=[("t", float), ("q", float)])},
     }
     for number, (message, content) in enumerate(faults.items()):

@@ -58,35 +58,37 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     """
     table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    first = table[0].to_pylist() if table.num_columns and pa.types.is_string(table.schema.types[0]) else []
-    if table.column_names[0] not in first or mapping.columns.trajectory in table.column_names:
+    is_text = table.num_columns and pa.types.is_string(table.schema.types[0])
+    is_repeated = is_text and pa.compute.index(table[0], table.column_names[0]).as_py() >= 0
+    if not is_repeated or mapping.columns.trajectory in table.column_names:
         return [LogTable.of(table, mapping, remarks=remarks, header=header)]
     tables: list[tuple[pa.Table, int]] = []
     text = _beginning(file)
     lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
     starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
     for start, stop in pairwise([*starts, len(lines) + 1]):
-        part, _, _ = csv_table(file, text, "\n".join(lines[start : stop - 1]))
+        # Without lines between two headers, `csv_table` would read the whole file.
+        part, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
         t = mapping.columns.t if mapping.columns.t in part.column_names else part.column_names[0]
+        times = part[t].drop_null().to_pylist()
         if (
             tables
+            and times
             and part.schema == tables[-1][0].schema
-            and part[t][0].as_py() > tables[-1][0][t][-1].as_py()
+            and times[0] > tables[-1][0][t][-1].as_py()
         ):
             start, part = tables[-1][1], pa.concat_tables([tables.pop()[0], part])
-        tables.append((part, start))
+        tables += [(part.filter(part[t].is_valid()), start)] if times else []
     return [
         LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
         for k, (x, start) in enumerate(tables, start=1)
     ]
 
 
-def csv_table(
-    file: Path, text: Beginning | None = None, rows: str | None = None
-) -> tuple[pa.Table, int, str]:
+def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    text: beginning of the file, if it is known. rows: some of its lines of values; None: all.
+    text: beginning of the file, if it is known. rows: some of its lines of values; "": all.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
     may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
@@ -102,20 +104,18 @@ def csv_table(
             wrong.append(row)
         return "skip" if len(wrong) < 2 else "error"
 
-    source, encoding = file, text.encoding
     # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
     exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
     spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
+    before = 0 if rows else text.lines
     if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
-        plain = re.sub(spaces, "", re.sub(exponent, "E", file.read_text(encoding)), flags=re.MULTILINE)
-        source, encoding = pa.BufferReader(plain.encode()), "utf-8"
+        rows = re.sub(exponent, "E", rows or file.read_text(text.encoding))
+        rows = re.sub(spaces, "", rows, flags=re.MULTILINE)
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
-    if rows is not None:
-        source, encoding = pa.BufferReader(rows.encode()), "utf-8"
-    before = text.lines if rows is None else 0
+    encoding = "utf-8" if rows else text.encoding
     table = pa.csv.read_csv(
-        source,
+        pa.BufferReader(rows.encode()) if rows else file,
         pa.csv.ReadOptions(
             use_threads=False, encoding=encoding, skip_rows=before, column_names=names or text.names
         ),
@@ -128,9 +128,8 @@ def csv_table(
     for row in wrong:
         if not len(table) or row.number <= before + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
-            raise LogError(
-                got, file=file, line=row.number, expected=f"{row.expected_columns}, as in the header"
-            )
+            expected = f"{row.expected_columns}, as in the header"
+            raise LogError(got, file=file, line=row.number, expected=expected)
     if names is not None:
         table = table.append_column(PLAIN["t"], stamps(table[STAMP[0]], table[STAMP[1]]))
     if text.units:

@@ -28,15 +28,15 @@ from spelgen.settings.log_mapping import CURRENTS, UNIT_NAMES, LogMapping, is_un
 WORDS = {
     quantity: frozenset(words.split())
     for quantity, words in (
-        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit zeitstempel uhrzeit temps "
-              "tiempo tempo tijd czas время 时间 時間 時刻 시간"),
+        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit zeitstempel uhrzeit "
+              "temps tiempo tempo tijd czas время 时间 時間 時刻 시간"),
         ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición posizione posição positie "
               "hoek положение позиция угол 位置 角度 위치 각도"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit geschw vitesse velocidad "
                "velocidade velocità snelheid prędkość скорость spd 速度 속도"),
         ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
-                "curr cur iq iqf drehmoment strom couple par coppia corrente corriente koppel момент ток 力矩 扭矩 电流 "
-                "トルク 電流 토크 전류"),
+                "curr cur iq iqf drehmoment strom couple par coppia corrente corriente koppel момент ток 力矩 扭矩 "
+                "电流 トルク 電流 토크 전류"),
     )
 }  # fmt: skip
 # Words in names of columns that mark commanded values, measured values, signals other than those of joints, and values
@@ -46,8 +46,8 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
         "ipo set soll u leader consigne заданное заданный 目标 指令 设定 目標 목표",
-        "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 현재 "
-        "실제",
+        "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
+        "현재 실제",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
         "dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
         "computed model predicted pred sim simulated g c f",
@@ -104,6 +104,9 @@ class ColumnName(NamedTuple):
     number: int = -1
 
 
+ByJoint = Mapping[str, Mapping[str, ColumnName]]
+
+
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
@@ -152,7 +155,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     _require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
-    # Of more numbered columns than joints, the moving ones belong to the arm: others are a base, rail or gripper at rest.
+    # Of more numbered columns than joints, the moving ones belong to the arm: others are of a base or gripper at rest.
     moved = {x.number for x in _of_one_signal(moving, len(joints))}
     if len(moved) == len(joints):
         for quantity, named in columns_of.items():
@@ -161,9 +164,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
     # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {
-        x: _by_joint(_of_one_signal(named, len(joints)), joints, order) for x, named in columns_of.items()
-    }
+    signals = {x: _of_one_signal(named, len(joints)) for x, named in columns_of.items()}
+    by_joint = {x: _by_joint(named, joints, order) for x, named in signals.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
         _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
@@ -174,9 +176,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
-        raise LogError(
-            f"no {listed(absent)} in addition to its other columns", file=file, expected=expected, do=JOINING
-        )
+        got = f"no {listed(absent)} in addition to its other columns"
+        raise LogError(got, file=file, expected=expected, do=JOINING)
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
@@ -197,9 +198,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     used |= set(clock.name.split(" + "))
     columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
     unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in columns_of.items()}
-    lines += [
-        f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
-    ]
+    lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
     unknown = {
         (quantity, column.unit)
         for quantity, named in [*by_joint.items(), ("t", {"": clock})]
@@ -208,7 +207,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     }
     lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in sorted(unknown)]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
-    return _suggestion(lines, missing, "column")
+    lines += [f"# no column was found for {name}" for name in missing]
+    return Suggestion("\n".join([*lines, ""]), tuple(missing))
 
 
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
@@ -218,18 +218,18 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
     positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
     """
     result = list(columns)
-    of_number = {x.number: x for x in columns if x.quantity == "q" and not x.words & COMMANDED}
+    of_number = {
+        x.number: x for x in columns if x.quantity == "q" and x.number >= 0 and not x.words & COMMANDED
+    }
     for letter in "tvu":
-        named = [k for k, x in enumerate(result) if x.words == {letter} and x.number >= 0]
-        pairs = [[of_number.get(result[k].number, result[k]), result[k]] for k in named]
-        pairs = [[_numbers(table, x.name) for x in pair] for pair in pairs]
-        pairs = [
-            (q, x) for q, x in pairs if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0 and q is not x
-        ]
-        if not pairs or not of_number:
+        named = [k for k, x in enumerate(result) if x.words == {letter} and x.number in of_number]
+        pairs = [(of_number[result[k].number], result[k]) for k in named]
+        values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
+        moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
+        if not moving:
             continue
-        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in pairs])
-        distance = np.median([np.std(x - q) / np.std(q) for q, x in pairs])
+        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving])
+        distance = np.median([np.std(x - q) / np.std(q) for q, x in moving])
         quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
         if letter != "t" and slope > 0.9 and all(x.quantity != "qd" for x in result):
             quantity = "qd"
@@ -249,9 +249,8 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
                 f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
                 "wide.columns = [f'{x}_{y}' for x, y in wide.columns]"
             )
-            raise LogError(
-                f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do
-            )
+            got = f"joints in the column {name!r}"
+            raise LogError(got, file=file, expected="all joints in each row", do=do)
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
@@ -266,9 +265,8 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
         seconds = [x for x in columns if not (x.quantity or x.joint) and _is_rising(_numbers(table, x.name))]
-    clock = min(
-        seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
-    )
+    absent = ColumnName("", set(), "s")
+    clock = min(seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=absent)
     times = _numbers(table, clock.name)
     # Seconds of a stamp are whole numbers that repeat.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
@@ -299,10 +297,7 @@ def _numbers(table: pa.Table, name: str) -> np.ndarray:
 
 
 def _joint_lines(
-    joint: str,
-    by_joint: Mapping[str, Mapping[str, ColumnName]],
-    units: Mapping[str, str],
-    common: Mapping[str, str],
+    joint: str, by_joint: ByJoint, units: Mapping[str, str], common: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
 
@@ -326,11 +321,6 @@ def _ranges(names: Sequence[str]) -> list[str]:
     return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
 
 
-def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Suggestion:
-    notes = [f"# no {kind} was found for {column}" for column in missing]
-    return Suggestion("\n".join([*lines, *notes, ""]), tuple(missing))
-
-
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
@@ -342,7 +332,9 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
         "joints:",
         *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in motor_of.items() if name),
     ]
-    return _suggestion(lines, [f"q of {joint}" for joint, name in motor_of.items() if not name], "motor")
+    missing = [f"q of {joint}" for joint, name in motor_of.items() if not name]
+    lines += [f"# no motor was found for {name}" for name in missing]
+    return Suggestion("\n".join([*lines, ""]), tuple(missing))
 
 
 def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
@@ -414,9 +406,7 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
     return by_quantity
 
 
-def _units(
-    by_joint: Mapping[str, Mapping[str, ColumnName]], joints: Sequence[str]
-) -> dict[str, dict[str, str]]:
+def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
     units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():

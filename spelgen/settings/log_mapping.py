@@ -32,21 +32,20 @@ COUNTS = ("counts", "counts/s")
 NORMALISED = "normalised"
 # For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping,
 # which may have a factor.
-UNIT_NAMES = {
-    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns", "min": "60 s"},
-    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
-          "mrad": "mrad", **dict.fromkeys(("counts", "ticks", "pulse", "pulses", "cnt", "inc"), "counts"),
-          "mdeg": "0.001 deg", "cdeg": "0.01 deg", "arcmin": "0.01666666667 deg", "cm": "10 mm", "m": "m", "mm": "mm",
-          **dict.fromkeys(("turns", "turn", "rev", "revs", "revolutions"), "turns")},
-    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
-           "rev/s": "turns/s", "revs/s": "turns/s", "turns/s": "turns/s", "turn/s": "turns/s", "rps": "turns/s",
-           **dict.fromkeys(("counts/s", "ticks/s", "pulse/s", "pulses/s", "cnt/s", "inc/s"), "counts/s"),
-           "mdeg/s": "0.001 deg/s", "cdeg/s": "0.01 deg/s", "deg/min": "0.01666666667 deg/s", "cm/s": "10 mm/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "ncm": "Ncm", "kgfcm": "kgf.cm", "kgcm": "kgf.cm", "n": "N",
-            "knm": "1000 Nm", "kn": "1000 N", "lbfft": "1.355817948 Nm", "lbfin": "0.112984829 Nm", "ozfin": "0.0070615518 Nm",
-            "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
-            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
+UNIT_NAMES: dict[str, dict[str, str]] = {
+    quantity: {name: unit for unit, names in units for name in names.split()}
+    for quantity, units in {
+        "t": [("s", "s sec"), ("ms", "ms millis"), ("us", "us µs"), ("ns", "ns"), ("60 s", "min")],
+        "q": [("deg", "deg degs degree degrees grad °"), ("rad", "rad"), ("mrad", "mrad"), ("0.001 deg", "mdeg"),
+              ("0.01 deg", "cdeg"), ("counts", "counts ticks pulse pulses cnt inc"), ("0.016666666667 deg", "arcmin"),
+              ("turns", "turns turn rev revs revolutions"), ("m", "m"), ("10 mm", "cm"), ("mm", "mm")],
+        "qd": [("deg/s", "degps dps"), ("rpm", "rpm 1/min r/min"), ("turns/s", "rps")],
+        "tau": [("Nm", "nm"), ("mNm", "mnm"), ("Ncm", "ncm"), ("kgf.cm", "kgfcm kgcm"), ("N", "n"), ("1000 N", "kn"),
+                ("A", "a amps ampere"), ("mA", "ma"), ("percent", "% percent"), ("permille", "‰ permille"),
+                ("1000 Nm", "knm"), ("1.355817948 Nm", "lbfft"), ("0.112984829 Nm", "lbfin")],
+    }.items()
 }  # fmt: skip
+UNIT_NAMES["qd"] |= {f"{name}/s": f"{unit}/s" for name, unit in UNIT_NAMES["q"].items()}
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
@@ -68,9 +67,7 @@ Accepted = Literal[
 
 def _scaled(value: object, validate: Callable[[object], str]) -> str:
     """Return a validated unit, which may have a factor, such as "0.01 deg"."""
-    match = (
-        re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value) if isinstance(value, str) else None
-    )
+    match = isinstance(value, str) and re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value)
     return f"{match[1]} {validate(match[2])}" if match and float(match[1]) else validate(value)
 
 
@@ -332,9 +329,8 @@ class LogMapping(Group):
     @classmethod
     def _is_by_motor(cls, content: object) -> object:
         # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
-        if isinstance(content, dict) and not all(
-            isinstance(x, dict | MotorCalibration) for x in content.values()
-        ):
+        motors = content.values() if isinstance(content, dict) else ()
+        if not all(isinstance(x, dict | MotorCalibration) for x in motors):
             raise ValueError(
                 "range_min and range_max of each motor; data of an older LeRobot is in degrees, 'units: {q: deg}'"
             )
@@ -437,7 +433,7 @@ class LogMapping(Group):
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def _unit(self, quantity: str, joint: str) -> tuple[float, str | None]:
-        """Return the factor and the unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
+        """Return factor and unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
         text: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if text is None and quantity == "u":

@@ -270,9 +270,7 @@ def _require_joints(
 
     found: (location, name) of each joint in the file.
     """
-    collect(
-        [unknown_name(place, "joint", name, names, document) for place, name in found if name not in names]
-    )
+    collect([unknown_name(place, "joint", x, names, document) for place, x in found if x not in names])
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:
