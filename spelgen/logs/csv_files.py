@@ -63,7 +63,7 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     if not is_repeated or mapping.columns.trajectory in table.column_names:
         return [LogTable.of(table, mapping, remarks=remarks, header=header)]
     tables: list[tuple[pa.Table, int]] = []
-    text = _beginning(file)
+    text, last = _beginning(file), None
     lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
     starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
     for start, stop in pairwise([*starts, len(lines) + 1]):
@@ -71,14 +71,12 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         part, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
         t = mapping.columns.t if mapping.columns.t in part.column_names else part.column_names[0]
         times = part[t].drop_null().to_pylist()
-        if (
-            tables
-            and times
-            and part.schema == tables[-1][0].schema
-            and times[0] > tables[-1][0][t][-1].as_py()
-        ):
+        if not times:
+            continue
+        if tables and part.schema == tables[-1][0].schema and times[0] > last:
             start, part = tables[-1][1], pa.concat_tables([tables.pop()[0], part])
-        tables += [(part.filter(part[t].is_valid()), start)] if times else []
+        tables.append((part, start))
+        last = times[-1]
     return [
         LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
         for k, (x, start) in enumerate(tables, start=1)
