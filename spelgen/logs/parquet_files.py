@@ -1,7 +1,7 @@
 """Reader of Parquet logs, of JSON and JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
 
 def _lists(value: object, name: str) -> Iterator[tuple[str, list[Any]]]:
     """Yield (name, items) of the lists in a JSON value, except for lists within items of a list of samples."""
-    items = value.items() if isinstance(value, dict) else ()
+    items: Iterable[tuple[str, object]] = value.items() if isinstance(value, dict) else ()
     if isinstance(value, list):
         objects = [x for x in value if isinstance(x, dict)]
         # Objects of joints contain lists of samples; samples contain numbers, or a list with a value per joint.
@@ -189,10 +189,8 @@ def _missing_episodes(files: Sequence[Path], info: Mapping[str, object]) -> tupl
         return ()
     numbers = set(chain(*(column.unique().to_pylist() for column in columns)))
     missing = [str(number) for number in range(total) if number not in numbers]
-    text = (
-        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}"
-    )
-    return (text,) if missing else ()
+    text = f"{counted(len(missing), 'episode')} of {total} without a file"
+    return (f"{text}: {shortened(missing, TUNING.listed)}",) if missing else ()
 
 
 def _require_times(file: Path, fps: float) -> None:

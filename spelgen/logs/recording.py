@@ -136,9 +136,8 @@ def _unwrap(rows: Rows) -> None:
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
-            rows.remarks.append(
-                f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed"
-            )
+            text = f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed"
+            rows.remarks.append(text)
         column[:] = result
 
 
@@ -285,7 +284,7 @@ def _order_in_time(rows: Rows) -> None:
             steps[steps < 0] = np.median(steps)
             rows.t[1:] = rows.t[0] + np.cumsum(steps)
             message = (
-                f"the clock went back {counted(late, 'time')} while the motion continued: times were joined"
+                f"the clock went back {counted(late, 'time')} in a motion that continued: times were joined"
             )
         else:
             rows.keep(order)

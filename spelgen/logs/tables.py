@@ -286,9 +286,10 @@ def _require_units(
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
         unit = mapped_unit(quantity, stated.get(name, "")) or ""
         if quantity == "t":
-            is_mapped = mapping.time_scale != 1.0 or mapping.sample_rate
+            is_mapped = mapping.time_scale != 1.0 or bool(mapping.sample_rate)
         else:
-            is_mapped = mapping.unit(quantity, joint) or (quantity == "tau" and mapping.joint(joint).gain)
+            has_gain = quantity == "tau" and mapping.joint(joint).gain
+            is_mapped = bool(mapping.unit(quantity, joint) or has_gain)
         if unit not in ("", "s", "rad", "m", "rad/s", "m/s", "Nm", "N") and not is_mapped:
             units[quantity] = unit
     if units:
