@@ -129,7 +129,7 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
         raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_conversion(path))
     # hidden files are no logs: macOS writes "._log.csv" in addition to log.csv on foreign file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
-    # JSON files beside logs are metadata.
+    # JSON files in a folder with other logs are metadata.
     logs = [x for x in logs if format_of(x) is not JSON] or logs
     if not logs:
         packed = next(filter(None, map(_conversion, sorted(path.iterdir()))), None)

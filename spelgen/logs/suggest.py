@@ -214,7 +214,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
     """Return the columns with quantities of names such as `t0`, `v0` and `u0`, which letters do not determine.
 
-    Numbered columns `t` are torques. `v` and `u` are velocities if their values are those of the derivative of the
+    Numbered columns `t` are torques. `v` and `u` are velocities if they are correlated with the derivatives of the
     positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
     """
     result = list(columns)
@@ -400,7 +400,7 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
             by_quantity[quantity].append(column)
     if len(by_quantity["q"]) < joints:
         by_quantity["q"] += unstated
-    # The commanded torques are those of the drives if no others were logged.
+    # If no other torques were logged, the commanded torques are used.
     if not commands and not by_quantity["tau"]:
         by_quantity["tau"] = commanded
     return by_quantity
