@@ -198,6 +198,24 @@ def test_inputs_that_are_close_to_the_positions_are_commands(scara, tmp_path):
         suggest_mapping(path, scara.chain.joint_names)
 
 
+@pytest.mark.parametrize("letter", "tu")
+def test_letters_are_no_torques_if_the_log_has_torques(scara, tmp_path, letter):
+    """Columns `t` are then temperatures, for example."""
+    head = ["time", *(f"{x}{k}" for x in ("q", "qd", "tau", letter) for k in range(4))]
+    rows = np.column_stack([T, Q, QD, TAU, 30 + TAU])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_commanded_currents_are_no_torques(scara, tmp_path):
+    head = [
+        "time",
+        *(f"{x}_{k}" for x in ("present_position", "goal_position", "goal_current") for k in range(4)),
+    ]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, Q, TAU]))
+    with pytest.raises(LogError, match="got commanded positions and no torques"):
+        suggest_mapping(path, scara.chain.joint_names)
+
+
 def test_numbers_of_pandas_for_equal_names_begin_with_the_second(scara, tmp_path):
     head = [
         "time",

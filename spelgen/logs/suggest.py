@@ -193,6 +193,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     ]
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
+    if any(x.words & COMMANDED for x in by_joint.get("tau", {}).values()):
+        lines.append("# tau: commanded torques, since no others were logged")
     lines += ["joints:", *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints)]
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
@@ -231,9 +233,11 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
         slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving])
         distance = np.median([np.std(x - q) / np.std(q) for q, x in moving])
         quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
-        if letter != "t" and slope > 0.9 and all(x.quantity != "qd" for x in result):
+        if letter != "t" and slope > 0.9:
             quantity = "qd"
-        for k in named if quantity else ():
+        # Temperatures `t0`, for example, are no torques if the log has torques.
+        present = {x.quantity for x in result if not x.words & (COMMANDED | OTHERS)}
+        for k in named if quantity and quantity not in present else ():
             result[k] = result[k]._replace(quantity=quantity, words={str(quantity)})
     return result
 
@@ -391,7 +395,7 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
         if commands and column.words & COMMANDED and quantity in ("q", None):
             quantity = "u"
         elif column.words & (COMMANDED | OTHERS):
-            if column.quantity == "tau" and not commands and not column.words & OTHERS:
+            if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
                 commanded.append(column)
             continue
         if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
