@@ -68,14 +68,14 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
     for start, stop in pairwise([*starts, len(lines) + 1]):
         # Without lines between two headers, `csv_table` would read the whole file.
-        part, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
-        t = mapping.columns.t if mapping.columns.t in part.column_names else part.column_names[0]
-        times = part[t].drop_null().to_pylist()
+        segment, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
+        t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
+        times = segment[t].drop_null().to_pylist()
         if not times:
             continue
-        if tables and part.schema == tables[-1][0].schema and times[0] > last:
-            start, part = tables[-1][1], pa.concat_tables([tables.pop()[0], part])
-        tables.append((part, start))
+        if tables and segment.schema == tables[-1][0].schema and times[0] > last:
+            start, segment = tables[-1][1], pa.concat_tables([tables.pop()[0], segment])
+        tables.append((segment, start))
         last = times[-1]
     return [
         LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
@@ -105,7 +105,7 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
     # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
     exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
     spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
-    before = 0 if rows else text.lines
+    skipped_lines = 0 if rows else text.lines
     if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
         rows = re.sub(exponent, "E", rows or file.read_text(text.encoding))
         rows = re.sub(spaces, "", rows, flags=re.MULTILINE)
@@ -115,7 +115,7 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
     table = pa.csv.read_csv(
         pa.BufferReader(rows.encode()) if rows else file,
         pa.csv.ReadOptions(
-            use_threads=False, encoding=encoding, skip_rows=before, column_names=names or text.names
+            use_threads=False, encoding=encoding, skip_rows=skipped_lines, column_names=names or text.names
         ),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
@@ -124,7 +124,7 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
     # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
     # error.
     for row in wrong:
-        if not len(table) or row.number <= before + len(table):
+        if not len(table) or row.number <= skipped_lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
             expected = f"{row.expected_columns}, as in the header"
             raise LogError(got, file=file, line=row.number, expected=expected)

@@ -73,27 +73,27 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
         raise
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    found = dict(_lists(document, ""))
-    rows = max(map(len, found.values()), default=0)
-    columns = {name: pa.array(values) for name, values in found.items() if len(values) == rows}
+    lists = dict(_lists(document, ""))
+    rows = max(map(len, lists.values()), default=0)
+    columns = {name: pa.array(values) for name, values in lists.items() if len(values) == rows}
     table = pa.table(columns)
     if len(columns) == 1 and pa.types.is_struct(table.schema.types[0]):
         table = pa.Table.from_struct_array(table[0].combine_chunks())
-    names = [x for name, x in found.items() if JOINT_NAMES.fullmatch(name.split(".")[-1]) and len(x) < rows]
+    names = [x for name, x in lists.items() if JOINT_NAMES.fullmatch(name.split(".")[-1]) and len(x) < rows]
     table = table.replace_schema_metadata({JOINTS_KEY: json.dumps([*names, []][0])})
     return [LogTable.of(_flat(table), mapping)]
 
 
-def _lists(value: object, name: str) -> Iterator[tuple[str, list[Any]]]:
-    """Yield (name, items) of the lists in a JSON value, except for lists within items of a list of samples."""
-    items: Iterable[tuple[str, object]] = value.items() if isinstance(value, dict) else ()
-    if isinstance(value, list):
-        objects = [x for x in value if isinstance(x, dict)]
+def _lists(document: object, name: str) -> Iterator[tuple[str, list[object]]]:
+    """Yield (name, items) of the lists in a JSON document, except for lists within items of a list of samples."""
+    items: Iterable[tuple[str, object]] = document.items() if isinstance(document, dict) else ()
+    if isinstance(document, list):
+        objects = [x for x in document if isinstance(x, dict)]
         # Objects of joints contain lists of samples; samples contain numbers, or a list with a value per joint.
-        if any(isinstance(x, list) and len(x) > len(value) for item in objects for x in item.values()):
+        if any(isinstance(x, list) and len(x) > len(document) for item in objects for x in item.values()):
             items = [(str(x.get("name", k)), x) for k, x in enumerate(objects)]
         else:
-            yield name, value
+            yield name, document
     for key, item in items:
         yield from _lists(item, f"{name}.{key}" if name else key)
 

@@ -107,11 +107,11 @@ def mapped_unit(quantity: str, unit: str) -> str | None:
     quantity: "t", "q", "qd", "tau" or "u".
     """
     factor, _, name = unit.rpartition(" ")
-    known = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
-    if known is None or not factor:
-        return known
-    own, _, name = known.rpartition(" ")
-    return f"{float(factor) * float(own or 1):.9g} {name}"
+    mapped = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
+    if mapped is None or not factor:
+        return mapped
+    multiple, _, name = mapped.rpartition(" ")
+    return f"{float(factor) * float(multiple or 1):.9g} {name}"
 
 
 def is_unit(unit: str) -> bool:

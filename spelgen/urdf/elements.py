@@ -107,8 +107,8 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     notes.add_as_warnings(optional)
     if kind not in JOINT_TYPES or parent is None or child is None:
         return None
-    place = xyz, rpy, axis
-    return UrdfJoint(name, kind, parent, child, *place, *limits, damping, friction, mimic, joint.line, soft)
+    pose = xyz, rpy, axis
+    return UrdfJoint(name, kind, parent, child, *pose, *limits, damping, friction, mimic, joint.line, soft)
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
