@@ -284,7 +284,7 @@ def _order_in_time(rows: Rows) -> None:
             steps[steps < 0] = np.median(steps)
             rows.t[1:] = rows.t[0] + np.cumsum(steps)
             message = (
-                f"the clock went back {counted(late, 'time')} in a motion that continued: times were joined"
+                f"the clock went back {counted(late, 'time')} while the motion continued: times were joined"
             )
         else:
             rows.keep(order)
