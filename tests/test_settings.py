@@ -126,6 +126,25 @@ def test_settings_do_not_change(urdf):
         ),
         ("joints:\n  2: {}", "arm.yaml:2: joints.2: got 2, expected a name; write it in quotes"),
         (
+            "joints: {a: {gear: 1,5}}",
+            "arm.yaml:1: joints.a.5: got 5, expected a name as key; in braces, write numbers with a decimal point, 1.5",
+        ),
+        (
+            "gravity: [0, 0, -9810]",
+            "arm.yaml:1: gravity: got [0, 0, -9810], expected m/s^2, such as [0, 0, -9.81], and not mm/s^2",
+        ),
+        *(
+            (
+                f"{group}: {{{text}}}",
+                f"arm.yaml:1: {group}.{place}: got {size}, expected rad or m, and not degrees or mm",
+            )
+            for group, text, place, size in (
+                ("simulation", "positions: {a: [-1.5, 90]}", "positions.a.1", 90),
+                ("tracking", "amplitude: 30", "amplitude", 30),
+                ("logs", "joints: {a: {offset: -180}}", "joints.a.offset", -180),
+            )
+        ),
+        (
             "joints: [a]",
             "arm.yaml:1: joints: got ['a'], expected settings by the name of a joint; "
             "`moving_joints` lists the joints that move",

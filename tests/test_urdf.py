@@ -1,6 +1,7 @@
 """A URDF is read with its exact values, each defect is reported with its line, and external files are not opened."""
 
 import hashlib
+import re
 import time
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from time_bounds import in_time
 
 from spelgen.arm.arm import make_arm
+from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import ArmError, SpelgenError
 from spelgen.urdf.read import read_urdf
 from spelgen.urdf.robot import Inertial, Mimic, Transmission, UrdfJoint
@@ -558,3 +560,30 @@ def refusal(path):
     with pytest.raises(SpelgenError) as told:
         read_urdf(path)
     return str(told.value).replace(str(path), "FILE")
+
+
+def test_lengths_friction_and_reductions_that_are_implausible_are_named(robots, tmp_path):
+    """A centre of mass outside the arm, friction above the effort limit, and unused reductions cause messages."""
+    text = (robots / "two_link.urdf").read_text()
+    codes = {x.code for x in load_arm(robots / "two_link.urdf").diagnostics}
+    assert codes.isdisjoint({"millimetres", "friction-above-effort", "reduction"})
+    text = re.sub(r'(<inertial>\s*<origin xyz=")[^"]*', r"\g<1>0 12.5 0", text, count=1)
+    text = re.sub(r'(<limit [^>]*effort=")[^>]*/>', r'\g<0><dynamics friction="900"/>', text)
+    ros = (
+        '<transmission name="a"><type>SimpleTransmission</type><joint name="joint1"/>'
+        '<actuator name="m"><mechanicalReduction>50</mechanicalReduction></actuator></transmission>'
+    )
+    ros2 = (
+        '<ros2_control name="x"><transmission name="b"><plugin>transmission_interface/SimpleTransmission</plugin>'
+        '<joint name="joint2"><mechanical_reduction>-80</mechanical_reduction></joint></transmission></ros2_control>'
+    )
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", ros + ros2 + "</robot>"))
+    arm = load_arm(tmp_path / "arm.urdf")
+    messages = {x.code: x.message for x in arm.diagnostics}
+    assert "a centre of mass at 12.5 m, of an arm with joints within" in messages["millimetres"]
+    assert "a friction of 900 above the effort limit 50" in messages["friction-above-effort"]
+    assert "(joint1 50, joint2 -80): logged torques are taken as joint torques" in messages["reduction"]
+    (tmp_path / "arm.yaml").write_text("torque: motor\n")
+    arm = load_arm(tmp_path / "arm.urdf")
+    assert "reduction" not in {x.code for x in arm.diagnostics}
+    assert arm.actuation.matrix().diagonal().tolist() == [50, -80]

@@ -120,7 +120,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
     """
     # Only driven joints have entries of the input matrix G: the row of a passive joint is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
-    remarks = tuple(_undriven(robot, settings, driven))
+    remarks = (*_undriven(robot, settings, driven), *_reduced(robot, settings, driven))
     couplings = tuple(_couplings(robot, settings, joints))
     if settings.torque == "joint":
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
@@ -152,6 +152,24 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
             yield Diagnostic("info", "no-transmission", f"joint {name!r}", robot.joint[name].line, message)
 
 
+def _reduced(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
+    """Yield a remark if the URDF states reductions of driven joints, and the settings do not state a `torque`."""
+    transmissions = [x for x in robot.transmissions if not x.errors and set(x.joint_names) <= set(driven)]
+    reductions = {
+        name: reduction
+        for transmission in transmissions
+        for name in transmission.joint_names
+        if abs(reduction := _reduction(robot, name) or 1.0) != 1.0
+    }
+    if reductions and "torque" not in settings.model_fields_set:
+        stated = ", ".join(f"{name} {reduction:g}" for name, reduction in reductions.items())
+        message = (
+            f"reductions of transmissions ({stated}): logged torques are taken as joint torques; write "
+            "'torque: motor' into the settings if they are torques of the motors"
+        )
+        yield Diagnostic("info", "reduction", "robot", None, message)
+
+
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
     """Return the entry of the input matrix G of a motor that moves only the joint ``name``, with the index ``index``.
 
@@ -171,7 +189,8 @@ def _reduction(robot: Robot, name: str) -> float | None:
     for transmission in robot.transmissions:
         if _SIMPLE in transmission.type and transmission.joint_names == [name]:
             collect(transmission.errors)
-            reductions = [reduction for reduction in transmission.actuators if reduction]
+            # ROS 1 states the reduction at the actuator, ros2_control at the joint.
+            reductions = [x for x in transmission.actuators if x] or [x for _, x in transmission.joints if x]
             # A joint with two actuators has no known reduction: URDF does not specify how they share the load.
             if len(reductions) == 1:
                 return reductions[0]

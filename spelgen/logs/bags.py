@@ -66,7 +66,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         stamped, times = messages, np.array([message.recorded for message in messages])
     elif len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
-    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, list(names.values()))
+    columns = {"t": (times - times[0]) * 1e-9} | _states(path, stamped, list(names.values()))
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply to bags.
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
@@ -112,9 +112,7 @@ def _of_one_arm(
     return of_arm
 
 
-def _joint_states(
-    path: Path, messages: Sequence[StampedState], names: Sequence[str]
-) -> dict[str, np.ndarray]:
+def _states(path: Path, messages: Sequence[StampedState], names: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the columns `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names` from T messages, each (T,).
 
     Fields that are empty in all messages are omitted; values of joints that a message does not contain are NaN.
@@ -149,10 +147,8 @@ def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}
     if all(len(full_names) == 1 for full_names in matches.values()):
         return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in matches.items()}})
-    return (
-        mapping_line({"joints": {next(iter(names)): {"name": "NAME IN THE LOG"}}})
-        + ", and so for the other joints"
-    )
+    line = mapping_line({"joints": {next(iter(names)): {"name": "NAME IN THE LOG"}}})
+    return f"{line}, and so for the other joints"
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:
@@ -195,9 +191,8 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
                     clock = state.header.stamp
                     yield StampedState(name, clock.sec * 1_000_000_000 + clock.nanosec, recorded, state)
         if topic is not None and topic not in topics:
-            raise LogError(
-                f"no joint states on {topic}", file=path, expected=f"one of {', '.join(sorted(topics))}"
-            )
+            expected = f"one of {', '.join(sorted(topics))}"
+            raise LogError(f"no joint states on {topic}", file=path, expected=expected)
     except (LogError, GeneratorExit):
         raise
     except Exception as error:  # rosbags raises exceptions of many types: all are caught

@@ -5,7 +5,7 @@ import csv
 import json
 import re
 from collections.abc import Sequence
-from itertools import takewhile, zip_longest
+from itertools import pairwise, takewhile, zip_longest
 from pathlib import Path
 from statistics import mode
 from typing import NamedTuple
@@ -17,11 +17,10 @@ from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import STATED_KEY, LogTable
 from spelgen.logs.values import is_number, stamps
-from spelgen.settings.log_mapping import PLAIN, UNIT_NAMES, LogMapping, plain_unit
+from spelgen.settings.log_mapping import PLAIN, LogMapping, is_unit, plain_unit
 
 # First columns of a file that `ros2 topic echo --csv` writes: the fields of the message header.
 STAMP = ("sec", "nanosec", "frame_id")
-ALL_UNITS = set().union(*UNIT_NAMES.values())
 # Beginning of a comment line: "#" or "% ". A "%" without a blank is no comment: `rostopic echo -p` names a column
 # "%time".
 COMMENT = re.compile(r"^(#|% )\s*")
@@ -53,19 +52,46 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark."""
+    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark.
+
+    If the header is repeated between the rows, a new recording begins where the clock goes back.
+    """
     table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    return [LogTable.of(table, mapping, remarks=remarks, header=header)]
+    is_text = table.num_columns and pa.types.is_string(table.schema.types[0])
+    is_repeated = is_text and pa.compute.index(table[0], table.column_names[0]).as_py() >= 0
+    if not is_repeated or mapping.columns.trajectory in table.column_names:
+        return [LogTable.of(table, mapping, remarks=remarks, header=header)]
+    tables: list[tuple[pa.Table, int]] = []
+    text, last = _beginning(file), None
+    lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
+    starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
+    for start, stop in pairwise([*starts, len(lines) + 1]):
+        # Without lines between two headers, `csv_table` would read the whole file.
+        segment, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
+        t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
+        times = segment[t].drop_null().to_pylist()
+        if not times:
+            continue
+        if tables and segment.schema == tables[-1][0].schema and times[0] > last:
+            start, segment = tables[-1][1], pa.concat_tables([tables.pop()[0], segment])
+        tables.append((segment, start))
+        last = times[-1]
+    return [
+        LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
+        for k, (x, start) in enumerate(tables, start=1)
+    ]
 
 
-def csv_table(file: Path) -> tuple[pa.Table, int, str]:
+def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
+
+    text: beginning of the file, if it is known. rows: some of its lines of values; "": all.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
     may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
     """
-    text = _beginning(file)
+    text = text or _beginning(file)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
@@ -76,19 +102,21 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
             wrong.append(row)
         return "skip" if len(wrong) < 2 else "error"
 
-    source, encoding = file, text.encoding
     # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
     exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
     spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
+    skipped_lines = 0 if rows else text.lines
     if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
-        plain = re.sub(spaces, "", re.sub(exponent, "E", file.read_text(encoding)), flags=re.MULTILINE)
-        source, encoding = pa.BufferReader(plain.encode()), "utf-8"
+        rows = re.sub(exponent, "E", rows or file.read_text(text.encoding))
+        rows = re.sub(spaces, "", rows, flags=re.MULTILINE)
     # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
     # costs 0.02 s for 17 MB.
-    rows = {"skip_rows": text.lines, "column_names": names or text.names}
+    encoding = "utf-8" if rows else text.encoding
     table = pa.csv.read_csv(
-        source,
-        pa.csv.ReadOptions(use_threads=False, encoding=encoding, **rows),
+        pa.BufferReader(rows.encode()) if rows else file,
+        pa.csv.ReadOptions(
+            use_threads=False, encoding=encoding, skip_rows=skipped_lines, column_names=names or text.names
+        ),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
@@ -96,11 +124,10 @@ def csv_table(file: Path) -> tuple[pa.Table, int, str]:
     # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
     # error.
     for row in wrong:
-        if not len(table) or row.number <= text.lines + len(table):
+        if not len(table) or row.number <= skipped_lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
-            raise LogError(
-                got, file=file, line=row.number, expected=f"{row.expected_columns}, as in the header"
-            )
+            expected = f"{row.expected_columns}, as in the header"
+            raise LogError(got, file=file, line=row.number, expected=expected)
     if names is not None:
         table = table.append_column(PLAIN["t"], stamps(table[STAMP[0]], table[STAMP[1]]))
     if text.units:
@@ -122,7 +149,7 @@ def _beginning(file: Path) -> Beginning:
         names = names + [""] * (width - len(names))
         units = [plain_unit(x) for x in cells[start - 1]]
         # Names, and the header itself, may contain words such as `deg`.
-        units = units if sum(x in ALL_UNITS for x in units) > len(units) / 2 else []
+        units = units if sum(map(is_unit, units)) > sum(map(bool, units)) / 2 else []
     return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
 
 

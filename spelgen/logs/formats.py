@@ -33,7 +33,10 @@ CONVERT = {
     **dict.fromkeys((".pkl", ".pickle"), _PYTHON.format(
         "pandas; pandas.read_pickle('{0}').reset_index().to_parquet('{1}.parquet')"
     )),
-    ".json": _PYTHON.format("pandas; pandas.read_json('{0}').to_parquet('{1}.parquet')"),
+    **dict.fromkeys((".yaml", ".yml"), _PYTHON.format(
+        "json, yaml; open('{1}.jsonl', 'w').writelines("
+        "json.dumps(x) + chr(10) for x in yaml.load_all(open('{0}'), yaml.CSafeLoader) if x)"
+    )),
     ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
     ".mat": _PYTHON.format("numpy, scipy.io; numpy.savez('{1}.npz', **scipy.io.loadmat('{0}'))"),
     **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(
@@ -55,9 +58,10 @@ PARQUET = LogFormat(_lazy("parquet_files:read_parquet"), (".parquet",))
 CSV = LogFormat(_lazy("csv_files:read_csv"), (".csv", ".tsv"))
 NPZ = LogFormat(_lazy("npz:read_npz"), (".npz",))
 JSON_LINES = LogFormat(_lazy("parquet_files:read_json_lines"), (".jsonl", ".ndjson"))
+JSON = LogFormat(_lazy("parquet_files:read_json_document"), (".json",))
 BAG = LogFormat(_lazy("bags:read_bag"), (".mcap", ".db3", ".bag"), "metadata.yaml", "a ROS 2 bag")
 LEROBOT = LogFormat(_lazy("parquet_files:read_dataset"), marker="meta/info.json", folder="a LeRobot data set")
-FORMATS = [PARQUET, CSV, NPZ, JSON_LINES, BAG, LEROBOT]
+FORMATS = [PARQUET, CSV, NPZ, JSON_LINES, JSON, BAG, LEROBOT]
 
 
 def format_of(path: Path) -> LogFormat | None:
@@ -103,7 +107,12 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
 
 def _conversion(path: Path) -> str | None:
     """Return the advice, for an error message, to convert a file by a command in CONVERT; None for other files."""
-    command = CONVERT.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    # The documents of `ros2 topic echo` are YAML in a file of any name.
+    if suffix in (".txt", ".log") and path.is_file():
+        with path.open("rb") as source:
+            suffix = ".yaml" if source.read(7) == b"header:" else suffix
+    command = CONVERT.get(suffix)
     # FILE replaces a path with spaces or quotation marks, which a shell would split into arguments or execute as code.
     plain = path if re.fullmatch(r"[\w./@+-]+", str(path)) else Path("FILE").with_suffix(path.suffix)
     return command and f"convert it: {command.format(plain, plain.with_suffix(''))}"
@@ -120,8 +129,12 @@ def _logs_at(path: Path, role: str | None) -> list[Path]:
         raise LogError(f"a file of kind {path.suffix!r}", file=path, expected=formats, do=_conversion(path))
     # hidden files are no logs: macOS writes "._log.csv" in addition to log.csv on foreign file systems
     logs = sorted(x for x in path.iterdir() if format_of(x) is not None and not x.name.startswith("."))
+    # JSON files in a folder with other logs are metadata.
+    logs = [x for x in logs if format_of(x) is not JSON] or logs
     if not logs:
         packed = next(filter(None, map(_conversion, sorted(path.iterdir()))), None)
+        if any(format_of(x) for x in path.glob("*/*")):
+            packed = "name the folders in it, which have logs"
         raise LogError("a folder without logs", file=path, expected=formats, do=packed)
     # All logs of a folder are used if no file of the folder is named train.* or test.*.
     selected = [log for log in logs if log.stem == role]

@@ -308,9 +308,7 @@ def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
             continue
         is_possible = np.ptp(raw) < 1.01 * reading.size if reading.key == "period" else raw.min() >= 0
         signal_and_decoded = raw, decoded(raw, reading.key, reading.size)
-        jumps_of_both = [
-            np.count_nonzero(np.abs(np.diff(x)) > 0.4 * reading.size) for x in signal_and_decoded
-        ]
+        jumps_of_both = [np.count_nonzero(abs(np.diff(x)) > 0.4 * reading.size) for x in signal_and_decoded]
         if reading == present or (is_possible and jumps_of_both[1] < 0.5 * jumps_of_both[0]):
             return reading
     return None
@@ -331,9 +329,8 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
         word = read_as_words(signals.raw(name)[is_valid], turn)
         if word is not None:
             # A multiple 2^k of 360 without a stated unit is a number of revolutions in degrees.
-            in_degrees = len(turns) > 1 and bool(
-                np.isclose(np.log2(word.value / 360) % 1, [0, 1], atol=1e-6).any()
-            )
+            is_power = np.isclose(np.log2(word.value / 360) % 1, [0, 1], atol=1e-6).any()
+            in_degrees = len(turns) > 1 and bool(is_power)
             return WordReading(word.key, plain_number(word.value, 12), in_degrees)
     return None
 

@@ -10,7 +10,7 @@ from zipfile import ZipFile
 import numpy as np
 import pyarrow as pa
 
-from spelgen.errors import LogError
+from spelgen.errors import LogError, collect
 from spelgen.logs.tables import JOINTS_KEY, LogTable, missing_columns
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
@@ -51,6 +51,9 @@ class NpzArrays:
                     raise self.error(name, "Python objects", "numbers", do) from error
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
+            if fields := self._arrays[name].dtype.names:
+                do = "store its fields: numpy.savez(OTHER, **{x: array[x] for x in array.dtype.names})"
+                raise self.error(name, f"a structured array ({', '.join(fields)})", "numbers", do)
         return self._arrays[name]
 
     def error(self, name: str, got: str, expected: str, do: str | None = None) -> LogError:
@@ -141,14 +144,30 @@ def _longest(arrays: NpzArrays) -> pa.Table:
 
     A matrix becomes a column of lists.
     """
-    names = [name for name in arrays.names if arrays[name].ndim in (1, 2)]
-    vectors = set(filter(arrays.is_vector, names))
-    rows = {name: arrays[name].size if name in vectors else len(arrays[name]) for name in names}
-    samples = max(rows.values(), default=0)
-    for name in names:
-        if rows[name] != samples and arrays[name].shape[-1] == samples:
-            raise arrays.error(name, f"{samples} columns", "a row per time", "transpose it: rows are times")
-    table = _equally_long(arrays, [name for name in names if rows[name] == samples], vectors)
+    shapes, faults = {}, []
+    for name in arrays.names:
+        try:
+            shapes[name] = arrays[name].shape
+        # Other arrays, such as a dict with the settings of the recorder, are not needed.
+        except LogError as fault:
+            faults.append(fault)
+    collect([] if shapes else faults)
+    samples = max(map(max, filter(None, shapes.values())), default=0)
+    vectors = set(filter(arrays.is_vector, shapes))
+    columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
+    chosen = [x for x in columns if samples == (arrays[x].size if x in vectors else len(arrays[x]))]
+    for name, shape in sorted(shapes.items(), key=lambda item: -len(item[1])):
+        # An array of images has a row per time, and is not needed. Simulations may have a state more than inputs.
+        if name not in chosen and shape[:1] != (samples,) and any(abs(x - samples) < 2 for x in shape):
+            do = (
+                "transpose it: rows are times"
+                if shape[-1] == samples
+                else "resample it, or split it by recordings"
+            )
+            raise arrays.error(
+                name, f"an array of shape {shape}", f"a row for each of the {samples} times", do
+            )
+    table = _equally_long(arrays, chosen, vectors)
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
 

@@ -1,6 +1,7 @@
-"""Reader of Parquet logs, of JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
+"""Reader of Parquet logs, of JSON and JSON lines, and of LeRobot 3 data sets, which consist of Parquet files."""
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from spelgen.errors import LogError, collect, shortened
 from spelgen.files import read_json, require_regular_file
 from spelgen.labels import counted
 from spelgen.logs.bags import names_line
-from spelgen.logs.tables import LogTable, reading
+from spelgen.logs.npz import JOINT_NAMES
+from spelgen.logs.tables import JOINTS_KEY, LogTable, reading
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping, MotorCalibration
 from spelgen.settings.yaml_document import YamlDocument, validated
@@ -57,11 +59,68 @@ def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> l
     return [LogTable.of(_flat(table), mapping, remarks=remarks, header=0)]
 
 
+def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
+    """Return a list with one table, the content of a JSON file: a list of objects, one per row, or lists of values.
+
+    The rows are the items of the longest list, or of all lists of its length. Names of nested values are joined by
+    points, such as `joints.elbow.position`; an object of a list is named by its `name`, else by its index.
+    """
+    try:
+        document = json.loads(file.read_bytes())
+    except json.JSONDecodeError as error:
+        if error.msg == "Extra data":
+            return read_json_lines(file, joints, mapping)
+        raise
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    lists = dict(_lists(document, ""))
+    rows = max(map(len, lists.values()), default=0)
+    columns = {name: pa.array(values) for name, values in lists.items() if len(values) == rows}
+    table = pa.table(columns)
+    if len(columns) == 1 and pa.types.is_struct(table.schema.types[0]):
+        table = pa.Table.from_struct_array(table[0].combine_chunks())
+    names = [x for name, x in lists.items() if JOINT_NAMES.fullmatch(name.split(".")[-1]) and len(x) < rows]
+    table = table.replace_schema_metadata({JOINTS_KEY: json.dumps([*names, []][0])})
+    return [LogTable.of(_flat(table), mapping)]
+
+
+def _lists(document: object, name: str) -> Iterator[tuple[str, list[object]]]:
+    """Yield (name, items) of the lists in a JSON document, except for lists within items of a list of samples."""
+    items: Iterable[tuple[str, object]] = document.items() if isinstance(document, dict) else ()
+    if isinstance(document, list):
+        objects = [x for x in document if isinstance(x, dict)]
+        # Objects of joints contain lists of samples; samples contain numbers, or a list with a value per joint.
+        if any(isinstance(x, list) and len(x) > len(document) for item in objects for x in item.values()):
+            items = [(str(x.get("name", k)), x) for k, x in enumerate(objects)]
+        else:
+            yield name, document
+    for key, item in items:
+        yield from _lists(item, f"{name}.{key}" if name else key)
+
+
 def _flat(table: pa.Table) -> pa.Table:
-    """Return a table in which columns of structs are replaced by a column per field, such as `position.elbow`."""
-    while any(map(pa.types.is_struct, table.schema.types)):
-        table = table.flatten()
-    return table
+    """Return a table in which columns of structs are replaced by a column per field, such as `position.elbow`.
+
+    Columns of lists of structs, such as the states of all motors, become a column of lists per field.
+    """
+    while True:
+        while any(map(pa.types.is_struct, table.schema.types)):
+            table = table.flatten()
+        name = next((x.name for x in table.schema if _has_structs(x.type)), None)
+        if name is None:
+            return table
+        column = table[name].combine_chunks()
+        lists = column.cast(pa.list_(column.type.value_type))
+        table = table.drop_columns([name])
+        for field, values in zip(lists.type.value_type, lists.values.flatten(), strict=True):
+            column = pa.ListArray.from_arrays(lists.offsets, values, mask=lists.is_null())
+            table = table.append_column(f"{name}.{field.name}", column)
+
+
+def _has_structs(kind: pa.DataType) -> bool:
+    """Return True for the type of lists of structs."""
+    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    return bool(is_list and pa.types.is_struct(kind.value_type))
 
 
 def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
@@ -130,10 +189,8 @@ def _missing_episodes(files: Sequence[Path], info: Mapping[str, object]) -> tupl
         return ()
     numbers = set(chain(*(column.unique().to_pylist() for column in columns)))
     missing = [str(number) for number in range(total) if number not in numbers]
-    text = (
-        f"{counted(len(missing), 'episode')} of {total} without a file: {shortened(missing, TUNING.listed)}"
-    )
-    return (text,) if missing else ()
+    text = f"{counted(len(missing), 'episode')} of {total} without a file"
+    return (f"{text}: {shortened(missing, TUNING.listed)}",) if missing else ()
 
 
 def _require_times(file: Path, fps: float) -> None:

@@ -136,9 +136,8 @@ def _unwrap(rows: Rows) -> None:
         elif count or abs(period - 2 * pi) > 1e-6:
             result = centred(result - offset, period) + offset
         if count:
-            rows.remarks.append(
-                f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed"
-            )
+            text = f"{quantity} of {joint!r} wraps at {period:.4g}: {counted(count, 'jump')} removed"
+            rows.remarks.append(text)
         column[:] = result
 
 
@@ -196,9 +195,8 @@ def _remove_delays(rows: Rows) -> None:
         column[:] = earlier(t, column, delay)
     for piece in _pieces(t):
         first, last = t[piece][0] - delays.min(initial=0.0), t[piece][-1] - delays.max(initial=0.0)
-        covered[piece] = (t[piece] >= first - TUNING.shortest_step) & (
-            t[piece] <= last + TUNING.shortest_step
-        )
+        margin = TUNING.shortest_step
+        covered[piece] = (t[piece] >= first - margin) & (t[piece] <= last + margin)
     rows.keep(covered)
 
 

@@ -6,6 +6,7 @@ SI units: the checks of logs then detect degrees, for example, and state the set
 
 import json
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, groupby, pairwise
@@ -22,17 +23,20 @@ from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
-from spelgen.settings.log_mapping import CURRENTS, LogMapping, plain_unit
-from spelgen.settings.log_mapping import UNIT_NAMES as UNITS
+from spelgen.settings.log_mapping import CURRENTS, UNIT_NAMES, LogMapping, is_unit, mapped_unit, plain_unit
 
 WORDS = {
     quantity: frozenset(words.split())
     for quantity, words in (
-        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit temps tiempo 时间"),
-        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición 位置 角度"),
-        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit vitesse velocidad spd 速度"),
+        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit zeitstempel uhrzeit "
+              "temps tiempo tempo tijd czas время 时间 時間 時刻 시간"),
+        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición posizione posição positie "
+              "hoek положение позиция угол 位置 角度 위치 각도"),
+        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit geschw vitesse velocidad "
+               "velocidade velocità snelheid prędkość скорость spd 速度 속도"),
         ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
-                "curr cur drehmoment strom couple par 力矩 扭矩 电流"),
+                "curr cur iq iqf drehmoment strom couple par coppia corrente corriente koppel момент ток 力矩 扭矩 "
+                "电流 トルク 電流 토크 전류"),
     )
 }  # fmt: skip
 # Words in names of columns that mark commanded values, measured values, signals other than those of joints, and values
@@ -41,10 +45,11 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
-        "ipo set soll u leader consigne 目标 指令 设定",
-        "actual act measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈",
+        "ipo set soll u leader consigne заданное заданный 目标 指令 设定 目標 목표",
+        "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
+        "현재 실제",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
-        "dot vol volt voltage temp temperature bias passive constraint residual",
+        "dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
         "computed model predicted pred sim simulated g c f",
     )
 )
@@ -61,8 +66,15 @@ JOINING = (
 # All words that state something about a signal; others may be the name of an arm.
 KNOWN = COMMANDED.union(MEASURED, OTHERS, COMPUTED, *WORDS.values())
 FILTERED = {"filt", "filtered", "smooth", "smoothed"}
-CURRENT = {"current", "currents", "curr", "cur", "strom", "电流", "i"}
-CHINESE = sorted(x for x in COMMANDED.union(MEASURED, *WORDS.values()) if x > "一")
+CURRENT = {"current", "currents", "curr", "cur", "iq", "iqf", "strom", "corrente", "corriente", "ток", "i"}
+CURRENT |= {"电流", "電流", "전류"}
+# Words that are not separated from others by blanks: words of Chinese, Japanese and Korean anywhere, long words at the
+# end of a compound such as `Gelenkwinkel` or `motortorque`, and short words after the J of a joint, as in `JPOS1`.
+GLUED = re.compile(
+    "|".join(x for x in sorted(KNOWN.union(OTHERS), key=len, reverse=True) if x > "⺀")
+    + rf"|(?<=[^\W\d_])(?:{'|'.join(x for x in WORDS['q'].union(WORDS['qd'], WORDS['tau']) if len(x) > 4)})(?![^\W\d_])"
+    + r"|(?<=\bj)(?:pos|vel|trq|tau|cmd|cur)(?![^\W\d_])"
+)
 
 
 class Suggestion(NamedTuple):
@@ -81,6 +93,7 @@ class ColumnName(NamedTuple):
         unit: unit in the name, or in a line of units below the header; "" if there is none.
         joint: joint whose name the column's name contains; "" if there is none.
         quantity: "t", "q", "qd" or "tau"; None if neither words nor unit state it.
+        number: last number in the name without its unit; -1 if there is none.
     """
 
     name: str
@@ -88,6 +101,10 @@ class ColumnName(NamedTuple):
     unit: str = ""
     joint: str = ""
     quantity: str | None = None
+    number: int = -1
+
+
+ByJoint = Mapping[str, Mapping[str, ColumnName]]
 
 
 def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False) -> Suggestion:
@@ -126,6 +143,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
     columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
+    if not commands:
+        columns = _with_letters(columns, table)
     columns_of = _by_quantity(columns, commands, len(joints))
     # A column named "load" is no torque: it is a register of a servo.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
@@ -136,28 +155,36 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     _require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
+    # Of more numbered columns than joints, the moving ones belong to the arm: others are of a base or gripper at rest.
+    moved = {x.number for x in _of_one_signal(moving, len(joints))}
+    if len(moved) == len(joints):
+        for quantity, named in columns_of.items():
+            complete = [x for x in named if x.number in moved]
+            columns_of[quantity] = complete if {x.number for x in complete} == moved else named
     # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
     # from the arm's: ROS often sorts joints by name.
     order = _order_in_cells(table, joints)
-    by_joint = {
-        x: _by_joint(_of_one_signal(named, len(joints)), joints, order) for x, named in columns_of.items()
-    }
+    signals = {x: _of_one_signal(named, len(joints)) for x, named in columns_of.items()}
+    by_joint = {x: _by_joint(named, joints, order) for x, named in signals.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
         _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
+        repeated = [x for x, count in Counter(table.column_names).items() if count > 1]
+        if repeated:
+            got = f"the same name for several columns: {shortened(repeated, TUNING.listed)}"
+            raise LogError(got, file=file, expected="a name for each", do=f"number them: {repeated[0]}1, ...")
     absent = [word for x, word in (("q", "positions"), ("tau", "torques")) if by_joint.get(x) == {}]
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
-        raise LogError(
-            f"no {listed(absent)} in addition to its other columns", file=file, expected=expected, do=JOINING
-        )
+        got = f"no {listed(absent)} in addition to its other columns"
+        raise LogError(got, file=file, expected=expected, do=JOINING)
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
     units = _units(by_joint, joints)
     common = _common(units)
-    common = {"t": UNITS["t"].get(clock.unit) or _unit_of_times(clock.name, table) or "s"} | common
+    common = {"t": mapped_unit("t", clock.unit) or _unit_of_times(clock.name, table) or "s"} | common
     rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     lines = [
         f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
@@ -166,23 +193,53 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     ]
     if not commands and "qd" not in by_joint:
         lines.append("velocity: differentiated")
+    if any(x.words & COMMANDED for x in by_joint.get("tau", {}).values()):
+        lines.append("# tau: commanded torques, since no others were logged")
     lines += ["joints:", *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints)]
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
     columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
     unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in columns_of.items()}
-    lines += [
-        f"# not used for {x}: {shortened(names, TUNING.listed)}" for x, names in unused.items() if names
-    ]
+    lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
     unknown = {
         (quantity, column.unit)
         for quantity, named in [*by_joint.items(), ("t", {"": clock})]
         for column in named.values()
-        if column.unit and column.unit not in UNITS["q" if quantity == "u" else quantity]
+        if column.unit and not mapped_unit(quantity, column.unit)
     }
     lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in sorted(unknown)]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
-    return _suggestion(lines, missing, "column")
+    lines += [f"# no column was found for {name}" for name in missing]
+    return Suggestion("\n".join([*lines, ""]), tuple(missing))
+
+
+def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
+    """Return the columns with quantities of names such as `t0`, `v0` and `u0`, which letters do not determine.
+
+    Numbered columns `t` are torques. `v` and `u` are velocities if they are correlated with the derivatives of the
+    positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
+    """
+    result = list(columns)
+    of_number = {
+        x.number: x for x in columns if x.quantity == "q" and x.number >= 0 and not x.words & COMMANDED
+    }
+    for letter in "tvu":
+        named = [k for k, x in enumerate(result) if x.words == {letter} and x.number in of_number]
+        pairs = [(of_number[result[k].number], result[k]) for k in named]
+        values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
+        moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
+        if not moving:
+            continue
+        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving])
+        distance = np.median([np.std(x - q) / np.std(q) for q, x in moving])
+        quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
+        if letter != "t" and slope > 0.9:
+            quantity = "qd"
+        # Temperatures `t0`, for example, are no torques if the log has torques.
+        present = {x.quantity for x in result if not x.words & (COMMANDED | OTHERS)}
+        for k in named if quantity and quantity not in present else ():
+            result[k] = result[k]._replace(quantity=quantity, words={str(quantity)})
+    return result
 
 
 def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
@@ -196,9 +253,8 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
                 f"in Python: wide = log.pivot(index=TIME, columns={name!r}); "
                 "wide.columns = [f'{x}_{y}' for x, y in wide.columns]"
             )
-            raise LogError(
-                f"joints in the column {name!r}", file=file, expected="all joints in each row", do=do
-            )
+            got = f"joints in the column {name!r}"
+            raise LogError(got, file=file, expected="all joints in each row", do=do)
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
@@ -213,9 +269,8 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
         seconds = [x for x in columns if not (x.quantity or x.joint) and _is_rising(_numbers(table, x.name))]
-    clock = min(
-        seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=ColumnName("", set(), "s")
-    )
+    absent = ColumnName("", set(), "s")
+    clock = min(seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=absent)
     times = _numbers(table, clock.name)
     # Seconds of a stamp are whole numbers that repeat.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
@@ -246,10 +301,7 @@ def _numbers(table: pa.Table, name: str) -> np.ndarray:
 
 
 def _joint_lines(
-    joint: str,
-    by_joint: Mapping[str, Mapping[str, ColumnName]],
-    units: Mapping[str, str],
-    common: Mapping[str, str],
+    joint: str, by_joint: ByJoint, units: Mapping[str, str], common: Mapping[str, str]
 ) -> Iterator[str]:
     """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
 
@@ -260,8 +312,9 @@ def _joint_lines(
     differing = {x: unit for x, unit in units.items() if x not in common}
     if differing:
         yield f"    units: {json.dumps(differing)}"
-    if units.get("tau") in CURRENTS:
-        yield f"    gain: 1.0 # Nm per {units['tau']} at the joint, the gear included: write its value"
+    unit = units.get("tau", "").rpartition(" ")[2]
+    if unit in CURRENTS:
+        yield f"    gain: 1.0 # Nm per {unit} at the joint, the gear included: write its value"
     if units.get("q") == "counts":
         yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
 
@@ -270,11 +323,6 @@ def _ranges(names: Sequence[str]) -> list[str]:
     """Return the names, with runs that differ only in a number, such as x1, x2, x3, abbreviated to `x1 ... x3`."""
     groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
     return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
-
-
-def _suggestion(lines: Sequence[str], missing: Sequence[str], kind: str) -> Suggestion:
-    notes = [f"# no {kind} was found for {column}" for column in missing]
-    return Suggestion("\n".join([*lines, *notes, ""]), tuple(missing))
 
 
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
@@ -288,7 +336,9 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
         "joints:",
         *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in motor_of.items() if name),
     ]
-    return _suggestion(lines, [f"q of {joint}" for joint, name in motor_of.items() if not name], "motor")
+    missing = [f"q of {joint}" for joint, name in motor_of.items() if not name]
+    lines += [f"# no motor was found for {name}" for name in missing]
+    return Suggestion("\n".join([*lines, ""]), tuple(missing))
 
 
 def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
@@ -297,28 +347,26 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     labels: {joint: pattern of its name}. unit: unit in a line of units below the header. words: additional words that
     describe the column, such as "time" for a column of dates.
     """
-    unit_names = set().union(*UNITS.values())
     # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
     # a number or a joint.
     for bracket in re.finditer(r"\s*[\[(]([^\])]+)[\])]", name):
-        is_unit = plain_unit(bracket[1]) in unit_names
-        if is_unit or (
-            bracket.end() == len(name) and not re.search(r"[\d',]", bracket[1]) and bracket[1] not in labels
-        ):
+        is_other = re.search(r"[\d',]", bracket[1]) or bracket[1] in labels
+        if is_unit(plain_unit(bracket[1])) or (bracket.end() == len(name) and not is_other):
             unit, name_without = plain_unit(bracket[1]), name.replace(bracket[0], "", 1)
             return _column_name(name_without, labels, unit, words)._replace(name=name)
     matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
     bare = labels[joint].sub(" ", name) if joint else name
+    numbers = re.findall(r"\d+", bare)
     # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
-    if not unit and last and plain_unit(last[2]) in unit_names - BARE and last[2] != name[:1]:
+    is_bare = last and (last[2].lower() in BARE or last[2] == name[:1])
+    if not unit and last and not is_bare and is_unit(plain_unit(last[2])):
         bare, unit = last[1], plain_unit(last[2])
     separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
-    # Chinese words are not separated by blanks.
-    separated = re.sub("|".join(CHINESE), r" \g<0> ", separated)
+    separated = GLUED.sub(r" \g<0> ", unicodedata.normalize("NFKC", separated))
     texts = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
     words = words | set(texts) | ({"theta"} if "theta" in separated else set())
     quantity = "t" if words & WORDS["t"] else None
@@ -327,10 +375,10 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
         if quantity is None and (quantity := next((x for x, y in WORDS.items() if word in y), None)):
             # The values of `current_torque` and `current_as_torque` are no currents.
             words = words if word in CURRENT else words - CURRENT
-    quantity = quantity or next((x for x, units in UNITS.items() if unit in units), None)
+    quantity = quantity or next((x for x in UNIT_NAMES if mapped_unit(x, unit)), None)
     if quantity is None and words & MEASURED:
         quantity = next((LETTERS[x] for x in texts if x in LETTERS), None)
-    return ColumnName(name, words, unit, joint, quantity)
+    return ColumnName(name, words, unit, joint, quantity, int(numbers[-1]) if numbers else -1)
 
 
 def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> dict[str, list[ColumnName]]:
@@ -341,12 +389,14 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
     positions, columns that only name a joint are positions.
     """
     by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
-    unstated = []
+    unstated, commanded = [], []
     for column in columns:
         quantity = column.quantity
         if commands and column.words & COMMANDED and quantity in ("q", None):
             quantity = "u"
         elif column.words & (COMMANDED | OTHERS):
+            if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
+                commanded.append(column)
             continue
         if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
             unstated.append(column)
@@ -354,17 +404,18 @@ def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> 
             by_quantity[quantity].append(column)
     if len(by_quantity["q"]) < joints:
         by_quantity["q"] += unstated
+    # If no other torques were logged, the commanded torques are used.
+    if not commands and not by_quantity["tau"]:
+        by_quantity["tau"] = commanded
     return by_quantity
 
 
-def _units(
-    by_joint: Mapping[str, Mapping[str, ColumnName]], joints: Sequence[str]
-) -> dict[str, dict[str, str]]:
+def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]]:
     """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
     units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():
         for joint, column in named.items():
-            unit = UNITS["q" if quantity == "u" else quantity].get(column.unit)
+            unit = mapped_unit(quantity, column.unit)
             if unit is None and quantity == "qd" and "q" in units[joint]:
                 unit = f"{units[joint]['q']}/s"
             if unit is None and quantity == "tau" and column.words & CURRENT:
@@ -460,8 +511,8 @@ def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> 
     arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
     of_joint: dict[str, list[str]] = {}
     for column in chain.from_iterable(signals[x] for x in arms):
-        numbers = re.findall(r"\d+", column.name) or [column.name]
-        of_joint.setdefault(column.joint or numbers[-1], []).append(column.name)
+        label = column.joint or (str(column.number) if column.number >= 0 else column.name)
+        of_joint.setdefault(label, []).append(column.name)
     rivals = max(of_joint.values(), key=len, default=[])
     if len(rivals) > 1 and len(of_joint) >= joints:
         raise LogError(
@@ -486,7 +537,10 @@ def _by_joint(
     number}, the result of `_order_in_cells`.
     """
     named = {column.joint: column for column in columns if column.joint}
-    numbered = {int(match[-1]): x for x in columns if (match := re.findall(r"\d+", x.name))}
+    numbered = {x.number: x for x in columns if x.number >= 0}
+    # pandas numbers equal names from the second one: q, q.1, q.2.
+    if len(numbered) == len(joints) - 1:
+        numbered = {x.number: x for x in columns}
     if named or len(numbered) < len(joints):
         return {joint: named[joint] for joint in joints if joint in named}
     if set(order) == set(joints):

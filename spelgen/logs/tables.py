@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.logs.tuning import TUNING
-from spelgen.settings.log_mapping import UNIT_NAMES, LogMapping
+from spelgen.settings.log_mapping import LogMapping, mapped_unit
 
 UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
@@ -158,8 +158,9 @@ def table_layout(log: LogTable, joints: Sequence[str], file: Path) -> Layout:
     accepted: tuple[str, ...] = mapping.accept
     if UNITS_KEY in metadata:
         accepted += UNIT_CODES
+    names = tuple(columns)
     return Layout(
-        file, tuple(columns), labels, tuple(joints), mapping, accepted, log.recording, log.remarks, log.header
+        file, names, labels, tuple(joints), mapping, accepted, log.recording, log.remarks, log.header
     )
 
 
@@ -228,9 +229,8 @@ def missing_columns(
         do = _naming([x for x in columns if x not in used])
     element = f"missing column{'s' * (len(missing) > 1)} {shortened(missing, TUNING.listed)}"
     got = f"only the columns {shortened(list(columns), TUNING.listed)}"
-    return LogError(
-        got, file=file, element=element, expected=", ".join([mapping.columns.t, *patterns]), do=do
-    )
+    expected = ", ".join([mapping.columns.t, *patterns])
+    return LogError(got, file=file, element=element, expected=expected, do=do)
 
 
 def _are_commands(columns: Collection[str], mapping: LogMapping, joints: Sequence[str]) -> bool:
@@ -266,9 +266,7 @@ def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, r
         # Numbers are no names: columns may be numbered in another order, which cells of the log may state.
         if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
             parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}
-            texts = {
-                x: r"[\W_]?".join(re.escape(part.strip("_")) for part in of_x) for x, of_x in parts.items()
-            }
+            texts = {x: r"[\W_]?".join(re.escape(y.strip("_")) for y in of_x) for x, of_x in parts.items()}
             forms.append({x: re.compile(rf"(?<![^\W_]){text}(?![^\W_])", re.I) for x, text in texts.items()})
     return next((x for x in forms if all(any(map(y.search, names)) for y in x.values())), forms[0])
 
@@ -286,11 +284,12 @@ def _require_units(
     stated = stated_units(schema)
     units: dict[str, str] = {}
     for name, (quantity, joint) in zip(columns, [("t", ""), *mapping.signals(joints)], strict=True):
-        unit = UNIT_NAMES["q" if quantity == "u" else quantity].get(stated.get(name, ""), "")
-        is_mapped = mapping.unit(quantity, joint) is not None if quantity != "t" else mapping.units.t != "s"
-        is_mapped |= bool(
-            mapping.sample_rate if quantity == "t" else quantity == "tau" and mapping.joint(joint).gain
-        )
+        unit = mapped_unit(quantity, stated.get(name, "")) or ""
+        if quantity == "t":
+            is_mapped = mapping.time_scale != 1.0 or bool(mapping.sample_rate)
+        else:
+            has_gain = quantity == "tau" and mapping.joint(joint).gain
+            is_mapped = bool(mapping.unit(quantity, joint) or has_gain)
         if unit not in ("", "s", "rad", "m", "rad/s", "m/s", "Nm", "N") and not is_mapped:
             units[quantity] = unit
     if units:

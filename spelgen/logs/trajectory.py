@@ -195,9 +195,8 @@ def recordings(logs: Trajectory | Iterable[Trajectory], joints: Sequence[str]) -
     for trajectory in trajectories:
         if not isinstance(trajectory, Trajectory):
             got = f"{type(logs).__name__} {logs!r:.60}"
-            raise LogError(
-                got, element="logs", expected="trajectories: spelgen.read_logs(PATHS, arm) or Trajectory(...)"
-            )
+            expected = "trajectories: spelgen.read_logs(PATHS, arm) or Trajectory(...)"
+            raise LogError(got, element="logs", expected=expected)
         require_joints(trajectory, joints)
     return trajectories
 

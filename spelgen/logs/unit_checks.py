@@ -220,9 +220,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
             text = _velocity_sum(signals) if correlation < 0.99 else ""
             return f"qd is not dq/dt{text}" if text else None
         order = "later" if lag > 0 else "earlier"
-        return Advice(
-            f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt", keys={"velocity": "differentiated"}
-        )
+        message = f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt"
+        return Advice(message, keys={"velocity": "differentiated"})
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
         # Increments are changes over ten samples. A log of at most ten samples has only one, the change from its first

@@ -16,6 +16,7 @@ from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
 
 NUMBER = r"[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?"
+DECIMAL_COMMA = NUMBER.replace("[.,]", ",")
 
 Rows: TypeAlias = "Sequence[int] | np.ndarray"
 Column: TypeAlias = "pa.ChunkedArray | pa.Array"
@@ -131,7 +132,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
         if nanoseconds is not None:
             return nanoseconds, TIMES["ns"]
     if not pa.types.is_temporal(times.type):
-        return times, TIMES[layout.mapping.units.t]
+        return times, layout.mapping.time_scale
     counted: pa.DataType = pa.timestamp("ns")
     if pa.types.is_duration(times.type):
         counted = pa.duration("ns")
@@ -225,12 +226,15 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
     except (pa.ArrowException, ValueError) as error:
         # The row of the first value that is no number is searched, since Arrow's error does not state it.
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
+        # Numbers with decimal commas are no error; "1,234" may be one thousand, unless other numbers have more digits.
+        with_comma = [text for text in texts if text and "," in text]
+        is_decimal = not all(re.fullmatch(r"-?[1-9]\d{0,2},\d{3}", text) for text in with_comma)
+        if is_decimal and all(re.fullmatch(DECIMAL_COMMA, text) for text in texts if text):
+            return _numbers(values)
         for index, text in enumerate(texts):
-            if text and not is_number(text):
+            if text and not is_number(text) and not (is_decimal and re.fullmatch(DECIMAL_COMMA, text)):
                 do = "remove that row"
-                if text.strip() == name:
-                    do += ", the header of a second file; joined recordings need a column 'trajectory'"
-                elif re.fullmatch(r"-?\d{1,3}([,.' ]\d{3})+([,.]\d*)?", text):
+                if re.fullmatch(r"-?\d{1,3}([,.' ]\d{3})+([,.]\d*)?", text):
                     do = "write numbers without separators of thousands"
                 elif name == layout.columns[0] and re.search(r"\d:\d\d", text):
                     do = "write times as numbers, or like 2025-10-26T11:59:56.123 or 11:59:56.123"

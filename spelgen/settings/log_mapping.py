@@ -8,15 +8,15 @@ Register values of motors, such as signed magnitudes, are first decoded by `sign
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PlainSerializer, WrapValidator, field_validator, model_validator
 
 from spelgen.errors import SettingsError
-from spelgen.settings.yaml_document import Group, Number, Positive
+from spelgen.settings.yaml_document import Group, Number, Place, Positive
 
 _MILLI = 1e-3
 TIMES = {unit: _MILLI**power for power, unit in enumerate(("s", "ms", "us", "ns"))}
@@ -30,20 +30,22 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping.
-UNIT_NAMES = {
-    "t": {"s": "s", "sec": "s", "ms": "ms", "millis": "ms", "us": "us", "µs": "us", "ns": "ns"},
-    "q": {"deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "grad": "deg", "°": "deg", "rad": "rad",
-          "mrad": "mrad", "counts": "counts", "ticks": "counts", "turns": "turns", "turn": "turns",
-          "rev": "turns", "revs": "turns", "revolutions": "turns", "mm": "mm",
-          "m": "m"},
-    "qd": {"deg/s": "deg/s", "degps": "deg/s", "dps": "deg/s", "rad/s": "rad/s", "mrad/s": "mrad/s", "°/s": "deg/s",
-           "rev/s": "turns/s", "revs/s": "turns/s", "turns/s": "turns/s", "turn/s": "turns/s", "rps": "turns/s",
-           "counts/s": "counts/s", "rpm": "rpm", "1/min": "rpm", "r/min": "rpm", "mm/s": "mm/s", "m/s": "m/s"},
-    "tau": {"nm": "Nm", "mnm": "mNm", "ncm": "Ncm", "kgfcm": "kgf.cm", "kgcm": "kgf.cm", "n": "N",
-            "a": "A", "amps": "A", "ampere": "A", "ma": "mA",
-            "%": "percent", "percent": "percent", "‰": "permille", "permille": "permille"},
+# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping,
+# which may have a factor.
+UNIT_NAMES: dict[str, dict[str, str]] = {
+    quantity: {name: unit for unit, names in units for name in names.split()}
+    for quantity, units in {
+        "t": [("s", "s sec"), ("ms", "ms millis"), ("us", "us µs"), ("ns", "ns"), ("60 s", "min")],
+        "q": [("deg", "deg degs degree degrees grad °"), ("rad", "rad"), ("mrad", "mrad"), ("0.001 deg", "mdeg"),
+              ("0.01 deg", "cdeg"), ("counts", "counts ticks pulse pulses cnt inc"), ("0.016666666667 deg", "arcmin"),
+              ("turns", "turns turn rev revs revolutions"), ("m", "m"), ("10 mm", "cm"), ("mm", "mm")],
+        "qd": [("deg/s", "degps dps"), ("rpm", "rpm 1/min r/min"), ("turns/s", "rps")],
+        "tau": [("Nm", "nm"), ("mNm", "mnm"), ("Ncm", "ncm"), ("kgf.cm", "kgfcm kgcm"), ("N", "n"), ("1000 N", "kn"),
+                ("A", "a amps ampere"), ("mA", "ma"), ("percent", "% percent"), ("permille", "‰ permille"),
+                ("1000 Nm", "knm"), ("1.355817948 Nm", "lbfft"), ("0.112984829 Nm", "lbfin")],
+    }.items()
 }  # fmt: skip
+UNIT_NAMES["qd"] |= {f"{name}/s": f"{unit}/s" for name, unit in UNIT_NAMES["q"].items()}
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
@@ -62,10 +64,21 @@ Accepted = Literal[
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
-Time = Literal["s", "ms", "us", "ns"]
-Position = Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"]
-Velocity = Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"]
-Effort = Literal["Nm", "mNm", "Ncm", "kgf.cm", "N", "A", "mA", "percent", "permille"]
+
+def _scaled(value: object, validate: Callable[[object], str]) -> str:
+    """Return a validated unit, which may have a factor, such as "0.01 deg"."""
+    match = isinstance(value, str) and re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value)
+    return f"{match[1]} {validate(match[2])}" if match and float(match[1]) else validate(value)
+
+
+# A unit with a factor is none of the literals, so that it is serialised as a text.
+_SCALED = WrapValidator(_scaled), PlainSerializer(str, when_used="unless-none")
+Time = Annotated[Literal["s", "ms", "us", "ns"], *_SCALED]
+Position = Annotated[Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"], *_SCALED]
+Velocity = Annotated[
+    Literal["rad/s", "deg/s", "turns/s", "mrad/s", "rpm", "counts/s", "m/s", "mm/s"], *_SCALED
+]
+Effort = Annotated[Literal["Nm", "mNm", "Ncm", "kgf.cm", "N", "A", "mA", "percent", "permille"], *_SCALED]
 Decoding = Literal["period", "sign_bit"]
 """Settings of the raw values of registers and wrapped angles."""
 
@@ -73,10 +86,37 @@ Decoding = Literal["period", "sign_bit"]
 def plain_unit(text: str) -> str:
     """Return a unit as written in a log, in lower case, without brackets and signs of products.
 
-    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s.
+    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm", and so is "N·m x1000".
     """
-    unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", text.strip(" []()").lower())
-    return re.sub(r"[\s.·⋅*-]", "", unit)
+    unit = text.strip(" []()").lower().replace("\u00d7", "x")
+    number = r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
+    match = re.fullmatch(rf"(?P<x>x?) ?{number}(?![\d/]) ?[*x]?(?P<unit>.+)|(.+?) ?[*x] ?{number}", unit)
+    factor = ""
+    if match:
+        unit = match["unit"] or match[4]
+        # Values "x1000" are a thousand times as large, and values in "0.01 deg" are counts of hundredths of a degree.
+        size = float(match[2] or match[5])
+        factor = f"{1 / size if size > 1 and (match['x'] or match[5]) else size:.9g} "
+    unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", unit)
+    return factor + re.sub(r"[\s.·⋅*-]", "", unit)
+
+
+def mapped_unit(quantity: str, unit: str) -> str | None:
+    """Return the unit of a mapping, such as "0.01 deg", of a unit in the form of `plain_unit`; None if it is unknown.
+
+    quantity: "t", "q", "qd", "tau" or "u".
+    """
+    factor, _, name = unit.rpartition(" ")
+    mapped = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
+    if mapped is None or not factor:
+        return mapped
+    multiple, _, name = mapped.rpartition(" ")
+    return f"{float(factor) * float(multiple or 1):.9g} {name}"
+
+
+def is_unit(unit: str) -> bool:
+    """Return True if a text in the form of `plain_unit` is a unit of any quantity."""
+    return any(mapped_unit(quantity, unit) for quantity in UNIT_NAMES)
 
 
 class LogColumns(Group):
@@ -121,6 +161,8 @@ class JointColumns(Group):
 
 class JointUnits(Group):
     """Units of the columns of one joint, in place of the `units` of all joints.
+
+    A unit may have a factor: "0.01 deg" for values in hundredths of a degree.
 
     Attributes:
         q: Position.
@@ -231,7 +273,7 @@ class JointLog(Group):
     counts_per_turn: Positive | None = None
     counts_per_metre: Positive | None = None
     sign: Literal[1, -1] = 1
-    offset: Number = 0.0
+    offset: Place = 0.0
     gain: Number | None = None
     torque_offset: Number = 0.0
     period: JointWords = JointWords()
@@ -287,9 +329,8 @@ class LogMapping(Group):
     @classmethod
     def _is_by_motor(cls, content: object) -> object:
         # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
-        if isinstance(content, dict) and not all(
-            isinstance(x, dict | MotorCalibration) for x in content.values()
-        ):
+        motors = content.values() if isinstance(content, dict) else ()
+        if not all(isinstance(x, dict | MotorCalibration) for x in motors):
             raise ValueError(
                 "range_min and range_max of each motor; data of an older LeRobot is in degrees, 'units: {q: deg}'"
             )
@@ -391,17 +432,28 @@ class LogMapping(Group):
         """Return the period in SI units at which logged values of a quantity of a joint wrap; 0 if it is not set."""
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
-    def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit of the logged "q", "qd", "tau" or "u" of a joint; None if the settings contain none."""
-        unit: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
+    def _unit(self, quantity: str, joint: str) -> tuple[float, str | None]:
+        """Return factor and unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
+        text: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
-        if unit is None and quantity == "u":
-            return self.unit("q", joint)
-        return unit
+        if text is None and quantity == "u":
+            return self._unit("q", joint)
+        factor, _, unit = (text or "").rpartition(" ")
+        return float(factor or 1), unit or None
+
+    def unit(self, quantity: str, joint: str) -> str | None:
+        """Return the unit, without factor, of a logged quantity of a joint; None if the settings contain none."""
+        return self._unit(quantity, joint)[1]
+
+    @property
+    def time_scale(self) -> float:
+        """Factor that converts logged times to seconds."""
+        factor, _, unit = self.units.t.rpartition(" ")
+        return float(factor or 1) * TIMES[unit]
 
     def scale(self, quantity: str, joint: str) -> float:
         """Return the factor, with sign, that converts logged values of a quantity of a joint to SI units."""
-        logged, unit = self.joint(joint), self.unit(quantity, joint)
+        logged, (multiple, unit) = self.joint(joint), self._unit(quantity, joint)
         factor = SCALES.get(unit or "", 1.0)
         if quantity == "tau" and logged.gain is not None:
             factor *= logged.gain
@@ -415,7 +467,7 @@ class LogMapping(Group):
         elif unit in COUNTS:
             turn = logged.counts_per_turn
             factor = 2 * pi / turn if turn else 1.0 / (logged.counts_per_metre or 1.0)
-        return logged.sign * factor
+        return logged.sign * factor * multiple
 
     def offset(self, quantity: str, joint: str) -> float:
         """Return the offset of a quantity of a joint in SI units, which is added after multiplication by `scale`."""

@@ -148,6 +148,14 @@ class Settings(Group):
     comparison: ComparisonSettings = ComparisonSettings()
     logs: LogMapping = LogMapping()
 
+    @field_validator("gravity")
+    @classmethod
+    def _of_a_planet(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        # 981 and 9810 are the gravity of the Earth in cm/s^2 and mm/s^2; the largest one of a planet is 25 m/s^2.
+        if max(map(abs, value)) > 100:
+            raise ValueError("m/s^2, such as [0, 0, -9.81], and not mm/s^2")
+        return value
+
     @field_validator("joints", mode="before")
     @classmethod
     def _by_name(cls, joints: object) -> object:
@@ -262,9 +270,7 @@ def _require_joints(
 
     found: (location, name) of each joint in the file.
     """
-    collect(
-        [unknown_name(place, "joint", name, names, document) for place, name in found if name not in names]
-    )
+    collect([unknown_name(place, "joint", x, names, document) for place, x in found if x not in names])
 
 
 def _joint_names(settings: Settings) -> Iterator[tuple[Location, str]]:

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from spelgen.settings.yaml_document import Count, Group, Inputs, NonNegative, Number, Positive, Share, Whole
+from spelgen.settings.yaml_document import Count, Group, Inputs, NonNegative, Place, Positive, Share, Whole
 
 
 class SimulationSettings(Group):
@@ -35,7 +35,7 @@ class SimulationSettings(Group):
     sample_rate: Positive = 20.0
     inputs: Inputs = (-2.0, -1.0, 0.0, 1.0, 2.0)
     test_fraction: Share = 0.5
-    positions: dict[str, tuple[Number, Number]] | None = None
+    positions: dict[str, tuple[Place, Place]] | None = None
     coulomb_smoothing_velocity: Positive = 0.05
     presliding: NonNegative = 0.0
     torque_noise: NonNegative = 0.0
@@ -88,7 +88,7 @@ class TrackingSettings(Group):
         cutoff: Cutoff frequency of the zero-phase low-pass filter on the measured positions [Hz].
     """
 
-    amplitude: Positive = 0.5235987755982988
+    amplitude: Annotated[Place, Field(gt=0)] = 0.5235987755982988
     frequency: Positive = 0.125
     paths: Literal["same", "own", "excitation"] = "same"
     control: Literal["pid", "computed-torque"] = "pid"

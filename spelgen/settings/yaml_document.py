@@ -7,6 +7,7 @@ the base class of their groups of keys.
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import pi
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar, get_args
 
@@ -27,6 +28,7 @@ EXPECTED = {
     "list_type": "a list", "too_short": "a longer list", "too_long": "a shorter list", "float_type": "a number",
     "float_parsing": "a number", "int_parsing": "a whole number", "int_from_float": "a whole number",
     "bool_parsing": "true or false", "bool_type": "true or false", "string_type": "a text, in quotes",
+    "invalid_key": "a name as key; in braces, write numbers with a decimal point, 1.5",
 }  # fmt: skip
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -254,7 +256,16 @@ def bounded(value: float) -> float:
     return value
 
 
+def in_si(value: float) -> float:
+    """Return a position in settings, unchanged. Raises ValueError if it is probably in degrees or mm."""
+    # A joint of an arm turns less than four times, and positions in radians are rarely whole numbers.
+    if abs(value) > 8 * pi and value == round(value):
+        raise ValueError("rad or m, and not degrees or mm")
+    return value
+
+
 Number = Annotated[float, BeforeValidator(no_bool), Field(allow_inf_nan=False), AfterValidator(bounded)]
+Place = Annotated[Number, AfterValidator(in_si)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Share = Annotated[Number, Field(ge=0, lt=1)]

@@ -107,9 +107,8 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     notes.add_as_warnings(optional)
     if kind not in JOINT_TYPES or parent is None or child is None:
         return None
-    return UrdfJoint(
-        name, kind, parent, child, xyz, rpy, axis, *limits, damping, friction, mimic, joint.line, soft
-    )
+    pose = xyz, rpy, axis
+    return UrdfJoint(name, kind, parent, child, *pose, *limits, damping, friction, mimic, joint.line, soft)
 
 
 def _read_end(joint: Element, tag: str) -> str | None:
@@ -179,7 +178,7 @@ def _read_mimic(mimic: Element) -> Mimic | None:
 
 
 def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) -> Transmission:
-    """Return the transmission of a <transmission> element in the form of ROS (<type>, <joint>, <actuator>).
+    """Return the transmission of a <transmission> element (<type>, <joint>, <actuator>) of ROS or ros2_control.
 
     Unknown joints and unusable numbers are added to ``notes`` as warnings. The unusable numbers are also stored in the
     field ``errors`` of the transmission, for callers that need the transmission.
@@ -200,11 +199,16 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
             message = f"names the unknown joint {joint_name!r}; {suggestion(joint_name, joints)}"
             notes.warn(joint.line, "unknown-transmission-joint", where, message)
             continue
-        driven.append((joint_name, joint.number_in_text("mechanicalReduction")))
+        driven.append((joint_name, joint.number_in_text(_reduction_tag(element))))
     actuators = []
     for element in xml.findall("actuator"):
-        actuators.append(Element(optional, element, where).number_in_text("mechanicalReduction"))
+        actuators.append(Element(optional, element, where).number_in_text(_reduction_tag(element)))
     notes.add_as_warnings(optional)
     # The type of a transmission is an element in ROS 1, and an attribute in the files of some exporters.
-    kind = (xml.findtext("type") or xml.get("type") or "").strip()
+    kind = (xml.findtext("type") or xml.findtext("plugin") or xml.get("type") or "").strip()
     return Transmission(kind, tuple(driven), tuple(actuators), tuple(optional.errors))
+
+
+def _reduction_tag(element: etree._Element) -> str:
+    """Return the name of the element of the reduction in the dialect of a joint or actuator of a transmission."""
+    return "mechanicalReduction" if element.find("mechanical_reduction") is None else "mechanical_reduction"

@@ -56,7 +56,10 @@ def read_urdf(path: Path) -> Robot:
         digest=hashlib.sha256(document.data).hexdigest(),
         links=tuple(links),
         joints=tuple(joints),
-        transmissions=tuple(read_transmission(notes, x, names) for x in root.findall("transmission")),
+        transmissions=tuple(
+            read_transmission(notes, x, names)
+            for x in [*root.findall("transmission"), *root.findall("ros2_control/transmission")]
+        ),
         root="",
         diagnostics=(),
     )

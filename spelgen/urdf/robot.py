@@ -87,9 +87,8 @@ class UrdfJoint(NamedTuple):
             return None
         low, high = sorted((self.lower, self.upper))
         soft_low, soft_high = self.soft or (low, high)
-        return (
-            (max(low, soft_low), min(high, soft_high)) if soft_low < high and soft_high > low else (low, high)
-        )
+        is_inside = soft_low < high and soft_high > low
+        return (max(low, soft_low), min(high, soft_high)) if is_inside else (low, high)
 
     @property
     def moves(self) -> bool:

@@ -121,9 +121,8 @@ class Element:
         if self.xml is None:
             for sibling in parent.iterchildren(etree.Element):
                 name = etree.QName(sibling).localname
-                if sibling.tag not in _LEAVES and (
-                    _is_spelling(name, tag) or (name, tag) == ("pose", "origin")
-                ):
+                is_meant = _is_spelling(name, tag) or (name, tag) == ("pose", "origin")
+                if is_meant and sibling.tag not in _LEAVES:
                     got = f"the element <{f'{sibling.prefix}:' if sibling.prefix else ''}{name}>"
                     self.notes.error(sibling.sourceline, self.where, got, f"<{tag}>", "correct or remove it")
         elif tag in _LEAVES:
