@@ -21,9 +21,6 @@ from spelgen.fitting.torque.selection import (
 )
 from spelgen.fitting.torque.tuning import TUNING
 
-EFFECT_GROUPS = ("effects", "load_dependence")
-"""Groups of the Stribeck effect, saturation and load dependence of friction, which not every joint has."""
-
 
 def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     """Fit the free parameters from the prior mean; return the MAP estimate.
@@ -166,14 +163,18 @@ def _smaller_in_most_blocks(residual: torch.Tensor, reference: torch.Tensor) -> 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose the joints with Stribeck effect, saturation and load dependence of friction; return the new estimate.
 
-    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. The effects
-    are removed at joints at which they do not improve Akaike's criterion with one parameter (see `_rejected`).
+    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. Saturation is
+    used only if most joints show strong evidence for it: the evidence of a single joint is also an error of its load,
+    and saturation extrapolates that error to other speeds. The other effects are removed at joints at which they do not
+    improve Akaike's criterion with one parameter (see `_rejected`).
     """
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
-    effects = torch.stack(
-        [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
-    )  # effects: (n, effects), indices of the coefficients in x
+    unsaturated = _without(estimate, index["friction.raw_saturation"])
+    if log_likelihood_ratio(estimate, unsaturated).median() < TUNING.strong_evidence:
+        estimate = unsaturated
+    # effects: (n, effects), indices of the coefficients in x
+    effects = torch.stack([index[name] for name in rigid.names("effects", "load_dependence")], dim=-1)
     plain = _without(estimate, effects.flatten())
     # 2 is the penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
