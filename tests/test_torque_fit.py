@@ -465,8 +465,8 @@ def test_friction_has_the_effects_that_samples_show(emitted, shown):
 
 
 @pytest.mark.parametrize(("joints", "used"), [(1, False), (6, True)])
-def test_saturation_is_used_if_most_joints_show_it(emitted, joints, used):
-    """Saturation of friction is used if most joints show it, and at no joint if a single joint does."""
+def test_saturation_is_used_if_several_joints_show_it(emitted, joints, used):
+    """Saturation of friction is used if the joints show it together, and at no joint if a single joint shows it."""
     module = emitted["six_dof"][0]
     true, found = drawn(module, seed=2, deviation=0.3), module.Model()
     true.friction.raw_saturation.data[:joints] += 1.0
