@@ -165,8 +165,8 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
     The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. An effect has
     to improve Akaike's criterion with one parameter. Saturation is tested first, at all joints together: the evidence
-    of each joint is limited to strong evidence, since an error of the model at a single joint can have any evidence, and
-    saturation would extrapolate this error to other speeds. Then all effects are tested (see `_rejected`).
+    of each joint is limited to strong evidence, since saturation may explain another error of the model at one joint,
+    and would extrapolate this error to other speeds. Then all effects are tested (see `_rejected`).
     """
     # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     penalty, limit = 2.0, TUNING.strong_evidence
