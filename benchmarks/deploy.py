@@ -28,12 +28,11 @@ from spelgen.emission.build import build
 from spelgen.exporting.c_export import called_by_c, compile_library, compiler
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import ENTRY_POINTS, TrainedModel
+from spelgen.exporting.describe import Trained, TrainedModel
 from spelgen.exporting.mjcf_export import check_mjcf, mjcf_text
 from spelgen.exporting.model_expressions import expression_functions
 from spelgen.exporting.onnx_export import called_by_onnx, onnx_model, onnx_session
-from spelgen.exporting.parity import PROGRAMS, Called, Parity, check_parity
+from spelgen.exporting.parity import ENTRY_POINTS, PROGRAMS, Called, Parity, check_parity
 from spelgen.exporting.rigid_body_projection import rigid_body_projection
 
 ROBOTS = Path(__file__).parents[1] / "robots"

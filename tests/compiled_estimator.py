@@ -18,7 +18,7 @@ from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimat
 from spelgen.exporting.c_export import compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.describe import describe
-from spelgen.exporting.description import ENTRY_POINTS
+from spelgen.exporting.parity import ENTRY_POINTS
 from spelgen.live.estimator import EstimatorState
 from spelgen.live.intake import REFUSALS
 from spelgen.live.noise import BlockNoise, NoiseLevels

@@ -133,8 +133,9 @@ def test_the_urdf_is_a_baseline_without_and_with_drives(robots):
     names = [coordinate.name for coordinate in arm.chain.coordinates]
     q = torch.zeros(1, 4, 3, dtype=torch.float64)
     probe = Windows(torch.full((1, 3), 0.05, dtype=torch.float64), q, q, q[:, :3])
-    plain, driven = urdf_values(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
-    assert (plain.name, driven.name) == (URDF, URDF_WITH_DRIVES)
+    predictors = urdf_values(EvaluatedArm(names, arm.robot.path, {}, None, probe, []))
+    plain, driven = predictors.values()
+    assert list(predictors) == [URDF, URDF_WITH_DRIVES]
     at = torch.full((1, 3), 0.3, dtype=torch.float64)
     rotors = [arm.settings.joint(name) for name in names]
     expected = [x.rotor_inertia * x.gear**2 for x in rotors]

@@ -23,7 +23,7 @@ from spelgen.comparison import jobs
 from spelgen.comparison.arms import ComparedArm, Comparison, arm_inputs, load_comparison
 from spelgen.comparison.figures import spread_windows
 from spelgen.comparison.study import prepare_study, run_study
-from spelgen.comparison.tables import arm_sections, arm_sentence, arm_tables, comparison_sentence
+from spelgen.comparison.tables import arm_results, arm_sections, comparison_sentence
 from spelgen.errors import RunError, SettingsError, SpelgenError
 from spelgen.evaluation.rollout import mass_error, true_mass
 from spelgen.fitting.fitted import load_run
@@ -236,7 +236,7 @@ def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, res
     assert comparison_sentence([section, section]).endswith(" on 2 arms.")
     better = {"prediction loss, 1 s": {"model": 0.2, "URDF": 0.1}}
     known = [replace(result, errors=better) for result in results.values()]
-    assert arm_sentence(known) == (
+    assert arm_results("arm", known, {}).sentence == (
         "phnode and hybrid have the smallest prediction loss, 1 s: 0.2; "
         "but these baselines have a smaller one: URDF (0.1)."
     )
@@ -274,9 +274,9 @@ def test_the_page_opens_with_the_sentence_and_the_table(study):
 def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
     result = results["hybrid"]
     broken = replace(result, seed=1, errors={label: {"model": None} for label in result.errors})
-    tables = arm_tables([result, broken, broken], {})
-    assert cells(tables)["prediction loss, 1 s"]["hybrid"] == "-"
-    assert arm_sentence([result, broken, broken]) == "No model has a finite prediction loss, 1 s."
+    section = arm_results("arm", [result, broken, broken], {})
+    assert cells(section.tables)["prediction loss, 1 s"]["hybrid"] == "-"
+    assert section.sentence == "No model has a finite prediction loss, 1 s."
 
 
 def test_decimated_windows_start_at_a_multiple_of_the_decimation():

@@ -23,9 +23,8 @@ from spelgen.emission.assemble import load_module
 from spelgen.emission.build import build
 from spelgen.emission.specify import generate
 from spelgen.errors import Diagnostic, LogError, RunError
-from spelgen.evaluation.evaluate import evaluate
+from spelgen.evaluation.evaluate import evaluate, read_test_logs
 from spelgen.evaluation.rollout import rollout
-from spelgen.evaluation.subject import read_test_logs
 from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.fitted import load_run
@@ -250,7 +249,7 @@ def test_predicted_windows_start_at_a_time_of_the_log(run):
 def test_parts_of_an_evaluation_that_are_omitted_are_stated(run):
     result = evaluated(run, run.parent / "logs" / "train.parquet", seconds=(5.0,))
     assert {x.code: x.message for x in result.diagnostics} == {
-        "tested-on-training-data": "names also used in training: motion_00, motion_01, motion_02, motion_03; "
+        "tested-on-training-data": "samples also used in training: motion_00, motion_01, motion_02, motion_03; "
         "errors on training data are not test errors",
         "horizon-too-long": "no prediction over 5 s: the longest trajectory has 24 steps",
         "low-rate": "20 Hz: too slow for fits to torques, which need 24 Hz; motion faster than 10 Hz, delays below "

@@ -21,9 +21,8 @@ from spelgen.exporting.c_export import c_files, called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, write_c
 from spelgen.exporting.casadi_export import export_casadi
 from spelgen.exporting.describe import Trained, identifier
-from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.export import export
-from spelgen.exporting.parity import check_parity, random_inputs, require_parity
+from spelgen.exporting.parity import ENTRY_POINTS, check_parity, random_inputs, require_parity
 
 ONE_JOINT = """<robot name="one"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>

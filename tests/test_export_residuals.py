@@ -12,8 +12,7 @@ from spelgen.exporting.c_export import called_by_c, compile_library
 from spelgen.exporting.c_source import c_functions, c_texts, write_c
 from spelgen.exporting.casadi_export import called_by_state, casadi_functions
 from spelgen.exporting.describe import Trained, describe
-from spelgen.exporting.description import ENTRY_POINTS
-from spelgen.exporting.parity import check_parity
+from spelgen.exporting.parity import ENTRY_POINTS, check_parity
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine")
 ENTRIES = {name: entry for name, entry in ENTRY_POINTS.items() if name != "servo_torque"}

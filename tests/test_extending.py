@@ -15,7 +15,6 @@ import spelgen.exporting
 from spelgen import design
 from spelgen.arm.configured_arm import load_arm
 from spelgen.baselines import registry
-from spelgen.baselines.predictor import Predictor
 from spelgen.emission import specify
 from spelgen.emission.assemble import load_module
 from spelgen.errors import RunError
@@ -96,7 +95,7 @@ def test_a_baseline(robots, monkeypatch, log):
         return q, 0 * q
 
     def stands_still(arm):
-        return [Predictor("stands still", still)]
+        return {"stands still": still}
 
     monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)

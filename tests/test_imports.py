@@ -44,7 +44,7 @@ DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 # the modules of `emission` that make models in memory, and so import torch
 MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
-OF_A_RUN = {f"render.{name}" for name in ("charts", "plots", "scene")}
+OF_A_RUN = {f"render.{name}" for name in ("charts", "scene")}
 # modules that fit least squares as well, whose base parameters are exact
 LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]

@@ -24,8 +24,10 @@ from spelgen.fitting.fitted import load_run
 from spelgen.live import levels as live_levels
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
+from spelgen.live.intake import Intake
 from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
+from spelgen.live.noise import NoiseLevels
 from spelgen.live.payload import find_payload
 from spelgen.live.replay import load_changes, replay
 from spelgen.live.tuning import TUNING
@@ -336,6 +338,26 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
         assert step(101 + k, t=0.001 * k) == "reversed"
     assert step(110, t=0.1) == "gap"
     assert step(111, t=0.1 + 1 / RATE) == "used"
+
+
+@pytest.mark.parametrize(("effort", "expected"), [(np.inf, "used"), (1.0, "saturated")])
+def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
+    """A load may need torques far above the logged ones: without a limit in the URDF such samples are used.
+
+    effort: torque limit of the URDF, divided by the largest logged torque.
+    """
+    model, log, _ = arm
+    largest = np.abs(log.tau).max(axis=0)
+    folds = [(model, [log[:1200]]), (model, [log[1200:]])]
+    levels = live_levels.find_levels(folds, effort * largest, np.zeros(3), 0.0)
+    for factor, refusal in ((1.0, "used"), (4.0, expected), (30.0, "saturated")):
+        intake = Intake(levels, bristle_reach(model))
+        intake.accept(log.t[0], log.q[0], log.qd[0], log.tau[0])
+        assert intake.accept(log.t[1], log.q[1], log.qd[1], factor * largest) == refusal
+    stored = levels.model_dump(mode="json")
+    assert len(stored.pop("saturation")) == model.n
+    # runs of earlier versions have no such entry: all their torque limits are used
+    assert NoiseLevels.model_validate(stored).saturation.tolist() == [1.0]
 
 
 def test_hostile_samples_give_finite_estimates(arm, levels, run):

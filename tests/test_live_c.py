@@ -90,13 +90,14 @@ def test_c_equals_python_along_recordings(name, tmp_path):
 def test_c_equals_python_with_couplings_and_hostile_samples(tmp_path):
     """C and Python estimators give equal outputs with mimic and prismatic joints, coupled motors and a passive joint.
 
-    Some samples are unusable, and torques are early.
+    Some samples are unusable, torques are early, and the torque limits of some joints are unknown.
     """
     (tmp_path / "arm.urdf").write_text(COUPLED)
     (tmp_path / "arm.yaml").write_text(MOTORS)
     model = randomised(tmp_path / "arm.urdf", "closed-form")
     log = hostile(motion_of(model, 20.0))
     levels = levels_of(model, motion_of(model, 20.0), 0.02, delay=-0.025)
+    levels = levels.model_copy(update={"saturation": np.linspace(1.0, 10.0, model.n)})
     compiled = CompiledEstimator(model, load_arm(tmp_path / "arm.urdf"), levels)
     found = compiled.run(*log)
     fit = load_run(saved_run(model, tmp_path / "arm.urdf", tmp_path / "run").path)

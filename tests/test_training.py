@@ -21,8 +21,7 @@ from rich.console import Console
 from spelgen.emission.assemble import load_module
 from spelgen.emission.text import read_spec
 from spelgen.errors import LogError, ModuleError, RunError
-from spelgen.evaluation.evaluate import evaluate
-from spelgen.evaluation.subject import read_test_logs
+from spelgen.evaluation.evaluate import evaluate, read_test_logs
 from spelgen.fitting.dataset import FitRequest, TrainingData, prepare_data
 from spelgen.fitting.fit import RunOptions, fit
 from spelgen.fitting.optimizers import LBFGS, MiniBatchAdamW

@@ -239,22 +239,12 @@ class Solver:
         return substeps
 
 
-@dataclass(frozen=True)
-class Predictor:
-    """Predictor of the motion in windows, from the first sample and the torques of each window.
+Predictors = dict[str, Callable[[Windows], States]]
+"""{name: predictor of the motion in windows from the first sample and the torques of each window}.
 
-    solver: function that returns q and qd of W windows of K samples, (W, K-1, n) each, at all samples except the first;
-    a `Solver` if the prediction integrates dynamics. dynamics: the integrated dynamics, or None.
-    """
-
-    name: str
-    solver: Callable[[Windows], States]
-    dynamics: RigidDynamics | None = None
-
-
-def of_dynamics(name: str, dynamics: RigidDynamics, probe: Windows) -> Predictor:
-    """Return the predictor of motion by `dynamics`; the windows `probe` determine its number of integration steps."""
-    return Predictor(name, Solver(dynamics, probe), dynamics)
+A predictor returns q and qd of W windows of K samples, (W, K-1, n) each, at all samples except the first. It is a
+`Solver` if it integrates dynamics.
+"""
 
 
 class CommandFollower(Protocol):

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from spelgen.arm.configured_arm import Arm
 from spelgen.baselines.fit import FRICTION, FittedBaselines
-from spelgen.baselines.predictor import CommandFollower, Predictor, States, of_dynamics
+from spelgen.baselines.predictor import CommandFollower, Predictors, Solver, States
 from spelgen.dynamics.regressor_dynamics import identified_dynamics
 from spelgen.errors import Diagnostic, in_one_line
 from spelgen.labels import (
@@ -47,9 +46,9 @@ class EvaluatedArm:
     notes: list[Diagnostic]
 
 
-def constant_velocity(arm: EvaluatedArm) -> list[Predictor]:
-    """Return a list with one predictor, for which all joints keep the velocity of the first sample of a window."""
-    return [Predictor(CONSTANT_VELOCITY, hold_velocity)]
+def constant_velocity(arm: EvaluatedArm) -> Predictors:
+    """Return one predictor, for which all joints keep the velocity of the first sample of a window."""
+    return {CONSTANT_VELOCITY: hold_velocity}
 
 
 def hold_velocity(windows: Windows) -> States:
@@ -62,30 +61,30 @@ def hold_velocity(windows: Windows) -> States:
     return windows.q[:, :1] + qd * elapsed, qd.expand(-1, elapsed.shape[1], -1)
 
 
-def urdf_values(arm: EvaluatedArm) -> list[Predictor]:
+def urdf_values(arm: EvaluatedArm) -> Predictors:
     """Return one or two baselines with the inertial parameters of the URDF.
 
     The first baseline has only rigid bodies. The second baseline also has rotors and friction; it is omitted if the
-    settings of the URDF specify neither of them. If Pinocchio is absent or cannot read the URDF, the list is empty and
-    a note is added to ``arm.notes``.
+    settings of the URDF specify neither of them. If Pinocchio is absent or cannot read the URDF, the result is empty
+    and a note is added to ``arm.notes``.
     """
     if arm.urdf is None:
         arm.notes.append(_missing("robot.urdf", "no arm is known"))
-        return []
+        return {}
     try:
         # Pinocchio is an optional dependency, so the import is in this function.
         from spelgen.dynamics.pinocchio_dynamics import drives_known, urdf_dynamics
 
         plain = urdf_dynamics(arm.urdf, arm.joints)
-        predictors = [of_dynamics(URDF, plain, arm.probe)]
+        predictors: Predictors = {URDF: Solver(plain, arm.probe)}
         # The baseline with rotors and friction is omitted if the settings specify neither: it would equal `plain`.
         if drives_known(arm.urdf, arm.joints):
             driven = urdf_dynamics(arm.urdf, arm.joints, drives=True)
-            predictors.append(of_dynamics(URDF_WITH_DRIVES, driven, arm.probe))
+            predictors[URDF_WITH_DRIVES] = Solver(driven, arm.probe)
     # Pinocchio and its URDF parser raise exceptions of many types. The evaluation continues without this baseline.
     except Exception as error:
         arm.notes.append(_missing(arm.urdf.name, in_one_line(error)))
-        return []
+        return {}
     return predictors
 
 
@@ -93,32 +92,35 @@ def _missing(where: str, reason: str) -> Diagnostic:
     return Diagnostic("info", "no-urdf-baseline", where, None, f"no comparison with the URDF: {reason}")
 
 
-def least_squares(arm: EvaluatedArm) -> list[Predictor]:
+def least_squares(arm: EvaluatedArm) -> Predictors:
     """Return one predictor per friction model, with the parameters that `fit_baselines` has identified.
 
-    The list is empty if these parameters are unknown.
+    The result is empty if these parameters are unknown.
     """
     if arm.fitted_arm is None or "parameters" not in arm.fitted:
-        return []
+        return {}
     drives = arm.fitted_arm.actuation.drives()
-    predictors = []
+    predictors: Predictors = {}
     for name, (key, friction) in FRICTION.items():
         dynamics = identified_dynamics(arm.fitted_arm.chain, friction, np.array(arm.fitted[key]), drives)
-        predictors.append(of_dynamics(name, dynamics, arm.probe))
+        predictors[name] = Solver(dynamics, arm.probe)
     return predictors
 
 
-BASELINES: tuple[Callable[[EvaluatedArm], list[Predictor]], ...] = (
+BASELINES: tuple[Callable[[EvaluatedArm], Predictors], ...] = (
     constant_velocity,
     urdf_values,
     least_squares,
 )
-"""Functions that return predictors under torques, or [] if data or a package that they need is absent."""
+"""Functions that return predictors under torques, or {} if data or a package that they need is absent."""
 
 
-def torque_predictors(arm: EvaluatedArm) -> list[Predictor]:
+def torque_predictors(arm: EvaluatedArm) -> Predictors:
     """Return all baselines for an arm under torques."""
-    return list(chain.from_iterable(baseline(arm) for baseline in BASELINES))
+    predictors: Predictors = {}
+    for baseline in BASELINES:
+        predictors |= baseline(arm)
+    return predictors
 
 
 def command_followers(

@@ -11,8 +11,7 @@ import typer
 
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, say
-from spelgen.cli.options import argument, flag, option, output_option
-from spelgen.cli.train_settings import UsageError
+from spelgen.cli.options import UsageError, argument, flag, option, output_option
 from spelgen.evaluation.tables import LIMITS, limit_figures, summary
 from spelgen.files import write_json
 from spelgen.listing import WIDTH
@@ -45,9 +44,8 @@ def evaluate(
     # Options --limit are checked first, so that a misspelt name is reported before minutes of rollouts.
     paths = options.logs(data, extra_logs)
     limits = list(map(_limit, limit or []))
-    from spelgen.evaluation.evaluate import SECONDS, STEPS
+    from spelgen.evaluation.evaluate import SECONDS, STEPS, read_test_logs
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
-    from spelgen.evaluation.subject import read_test_logs
     from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing

@@ -28,6 +28,14 @@ Declared: TypeAlias = Any
 """Declaration of an option or argument, as the default value of a parameter of any type."""
 
 
+class UsageError(typer.BadParameter):
+    """Usage error about an option that does not apply; the message names the option."""
+
+    def format_message(self) -> str:
+        """Return the message without the prefix that typer adds, which names a parameter."""
+        return self.message
+
+
 def option(
     metavar: str,
     text: str,

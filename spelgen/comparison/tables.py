@@ -38,28 +38,32 @@ def arm_sections(study: Study) -> list[ArmResults]:
         if job.name in study.results:
             arms.setdefault(job.arm, []).append(study.results[job.name])
     published = {job.arm: job.protocol.published for job in study.jobs}
-    sections = []
-    for name, results in arms.items():
-        runs, measure = _by_preset(results), next(iter(results[0].errors))
-        # The errors include baselines, which have no runs.
-        best = next(model for model in _by_error(_medians(runs, measure)) if model in runs)
-        tables = tuple(arm_tables(results, published[name]))
-        sections.append(ArmResults(name, best, arm_sentence(results), tables))
-    return sections
+    return [arm_results(name, results, published[name]) for name, results in arms.items()]
 
 
-def arm_tables(results: Sequence[RunResult], published: Mapping[str, PublishedFigures]) -> list[Listing]:
-    """Return the tables of an arm, the main result first. published: {preset: figures of a publication}."""
-    runs = _by_preset(results)
+def arm_results(
+    name: str, results: Sequence[RunResult], published: Mapping[str, PublishedFigures]
+) -> ArmResults:
+    """Return the results of one arm. results: at least one run. published: {preset: figures of a publication}."""
+    runs: dict[str, list[RunResult]] = {}
+    for result in results:
+        runs.setdefault(result.preset, []).append(result)
+    medians = {measure: _medians(runs, measure) for measure in results[0].errors}
+    measure, errors = next(iter(medians.items()))
+    ranked = _by_error(errors)
+    # The errors include baselines, which have no runs.
+    best = next(model for model in ranked if model in runs)
     # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
-    return [_losses(runs, published), _sizes(runs)] if results[0].sizes else [_ranking(runs)]
+    tables = (_losses(medians, published), _sizes(runs)) if results[0].sizes else (_ranking(medians, runs),)
+    return ArmResults(name, best, _sentence(measure, ranked, runs), tables)
 
 
-def arm_sentence(results: Sequence[RunResult]) -> str:
-    """Return a sentence that names the best model of an arm and compares its error with the errors of all others."""
-    runs, measure = _by_preset(results), next(iter(results[0].errors))
-    medians = _by_error(_medians(runs, measure))
-    errors = {name: error for name, error in medians.items() if error is not None}
+def _sentence(measure: str, ranked: Numbers, runs: Runs) -> str:
+    """Return a sentence that names the best model of an arm and compares its error with the errors of all others.
+
+    ranked: errors of models and baselines by ``measure``, the smallest one first.
+    """
+    errors = {name: error for name, error in ranked.items() if error is not None}
     models = [name for name in errors if name in runs]
     if not models:
         return f"No model has a finite {measure}."
@@ -93,17 +97,12 @@ def comparison_sentence(sections: Sequence[ArmResults]) -> str:
     return f"The preset with the smallest error is {listed(counts)}."
 
 
-def _by_preset(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
-    runs: dict[str, list[RunResult]] = {}
-    for result in results:
-        runs.setdefault(result.preset, []).append(result)
-    return runs
+def _ranking(medians: Mapping[str, Numbers], runs: Runs) -> Listing:
+    """Return a table of the errors of models and baselines on logs of the user, sorted by error.
 
-
-def _ranking(runs: Runs) -> Listing:
-    """Return a table of the errors of models and baselines on logs of the user, sorted by error."""
-    rows = {measure: _by_error(_medians(runs, measure)) for measure in next(iter(runs.values()))[0].errors}
-    measures = list(rows)
+    medians: {measure: median errors}.
+    """
+    rows = {measure: _by_error(errors) for measure, errors in medians.items()}
     rows["parameters"] = {name: x[0].parameters for name, x in runs.items()}
     rows["runs"] = {name: len(x) for name, x in runs.items()}
     rows["training time [s]"] = {
@@ -111,7 +110,7 @@ def _ranking(runs: Runs) -> Listing:
     }
     title = "Errors on the test logs, best first; medians over seeds and splits"
     note = "relative RMS: 0: no error, 1: as if the arm had stood still; columns without parameters are baselines"
-    return table(title, rows, note, unranked=rows.keys() - measures)
+    return table(title, rows, note, unranked=rows.keys() - medians)
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
@@ -129,12 +128,11 @@ def _by_error(medians: Numbers) -> Numbers:
     return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 
-def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Listing:
+def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFigures]) -> Listing:
     """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
-    rows = {label: _medians(runs, label) for label in next(iter(runs.values()))[0].errors}
-    losses = list(rows)
+    rows, presets = dict(medians), next(iter(medians.values()))
     # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
-    records = {name: published[name].model_dump(exclude_none=True) for name in runs if name in published}
+    records = {name: published[name].model_dump(exclude_none=True) for name in presets if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
         if values:
@@ -143,7 +141,7 @@ def _losses(runs: Runs, published: Mapping[str, PublishedFigures]) -> Listing:
         "Squared errors summed over joints [rad, m, s], mean over samples and windows, and the relative error of M; "
         "median over seeds; below, published figures"
     )
-    return table(title, rows, unranked=rows.keys() - losses)
+    return table(title, rows, unranked=rows.keys() - medians)
 
 
 def _sizes(runs: Runs) -> Listing:

@@ -7,8 +7,8 @@ import numpy as np
 import pinocchio as pin
 
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_dynamics import PinocchioDynamics
+from spelgen.dynamics.tip_frame import body_constraint
 from spelgen.errors import ArmError, collect
 from spelgen.settings.settings import Settings
 

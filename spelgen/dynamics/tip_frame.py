@@ -1,4 +1,4 @@
-"""Frames of the tip link and of all links of an arm, relative to the bodies that carry them."""
+"""Frames of all links relative to the bodies that carry them, and positions of the joints of all bodies."""
 
 from dataclasses import dataclass
 
@@ -7,6 +7,7 @@ import numpy as np
 from spelgen.arm.arm import Chain, lump_links, make_arm
 from spelgen.arm.chain import choose_chain
 from spelgen.arm.configured_arm import Arm
+from spelgen.dynamics.constraint import Constraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,3 +50,12 @@ def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int
         pose[:3, :3], pose[:3, 3] = frame.rotation, frame.position
         poses[link] = frame.body, pose
     return poses
+
+
+def body_constraint(arm: Chain) -> Constraint:
+    """Return the joint positions of all bodies, (bodies,) [rad, m], as a function K q + offset of q, (n,) [rad, m]."""
+    jacobian = np.zeros((len(arm.bodies), len(arm.coordinates)))
+    for row, body in enumerate(arm.bodies):
+        jacobian[row, body.coordinate] = float(body.multiplier)
+    offset = np.array([body.offset for body in arm.bodies], dtype=float)
+    return Constraint(tuple(body.name for body in arm.bodies), jacobian, offset)

@@ -13,8 +13,7 @@ from torch import Tensor
 
 import spelgen.runtime as runtime
 from spelgen.dynamics.parameters import parameter_count
-from spelgen.emission.parts import Sums, base_class, entry_sums, model_parts
-from spelgen.emission.source import Call, Code
+from spelgen.emission.parts import Call, Code, Sums, base_class, entry_sums, model_parts
 from spelgen.errors import ModuleError
 from spelgen.labels import printable
 from spelgen.runtime.port_hamiltonian import PortHamiltonian

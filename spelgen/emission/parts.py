@@ -12,8 +12,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.design import BREAKAWAY, SERVO_STRIBECK_ROUNDING
-from spelgen.emission.source import Call, Code, call
 from spelgen.spec import ConstantSpec, JointSpec, LinkSpec, ModelSpec, OutputSpec
+
+
+@dataclass(frozen=True)
+class Code:
+    """A name in source code, such as the name of a table, written without quotes; a ``str`` is a string literal."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Call:
+    """A call of a class or function in source code.
+
+    arguments: pairs (name, value); the name of a positional argument is None.
+    """
+
+    callee: str
+    arguments: tuple[tuple[str | None, object], ...]
+
+
+def call(callee: str, *positional: object, **named: object) -> Call:
+    """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
+    arguments = [(None, value) for value in positional]
+    return Call(callee, (*arguments, *named.items()))
+
 
 GENERATOR, JOINTS, LINKS = Code("generator"), Code("JOINTS"), Code("LINKS")
 FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code("mass_entries")

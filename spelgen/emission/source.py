@@ -2,35 +2,12 @@
 
 import ast
 import json
-from dataclasses import dataclass
+
+from spelgen.emission.parts import Call, Code
 
 WIDTH = 110
 _STEP = 4  # blanks per level of indentation
 SKIP = "  # fmt: skip"  # With this comment in a module, ruff does not reformat its rows of numbers.
-
-
-@dataclass(frozen=True)
-class Code:
-    """A name in source code, such as the name of a table, written without quotes; a ``str`` is a string literal."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Call:
-    """A call of a class or function in source code.
-
-    arguments: pairs (name, value); the name of a positional argument is None.
-    """
-
-    callee: str
-    arguments: tuple[tuple[str | None, object], ...]
-
-
-def call(callee: str, *positional: object, **named: object) -> Call:
-    """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
-    arguments = [(None, value) for value in positional]
-    return Call(callee, (*arguments, *named.items()))
 
 
 def filled(start: str, value: object, indent: int, reserved: int = 0) -> str:

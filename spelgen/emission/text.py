@@ -14,7 +14,7 @@ from pathlib import Path
 from textwrap import fill, wrap
 
 from spelgen.emission import parts
-from spelgen.emission.source import SKIP, WIDTH, Call, filled, listed_call, names_in
+from spelgen.emission.source import SKIP, WIDTH, filled, listed_call, names_in
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
 from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
@@ -55,7 +55,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     torch only.
     """
     assembly = parts.model_parts(spec)
-    call = listed_call("super().__init__", Call("", assembly.model.arguments), 8) + SKIP
+    call = listed_call("super().__init__", parts.Call("", assembly.model.arguments), 8) + SKIP
     names = names_in(ast.parse(call))
     arm = "\n\n".join(_rows(spec, assembly))
     if parts.MASS_ENTRIES.text in names:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from spelgen.baselines.predictor import Predictor, Solver, States
+from spelgen.baselines.predictor import Predictors, Solver, States
 from spelgen.dynamics.bristles import BristleReach
 from spelgen.dynamics.protocol import integrable, known_past, memory_along
 from spelgen.errors import Diagnostic
@@ -219,7 +219,7 @@ def predict(
     name: str,
     steps: int,
     logs: EvaluatedLogs,
-    predictors: Sequence[Predictor],
+    predictors: Predictors,
     tip: TipPosition | None,
     notes: list[Diagnostic],
 ) -> tuple[Horizon, Predictions]:
@@ -249,19 +249,19 @@ def predict(
     states = {}
     # The open-loop rollout and the rollout with the observed disturbance start from the same friction state, the state
     # at the end of the observer's steps.
-    for predictor in predictors:
-        if not past or not isinstance(predictor.solver, Solver):
-            states[predictor.name] = predictor.solver(ahead)
+    for predictor, solver in predictors.items():
+        if not past or not isinstance(solver, Solver):
+            states[predictor] = solver(ahead)
             continue
         with torch.no_grad():
-            started, disturbance = observe(integrable(predictor.solver.dynamics), windows, past)
+            started, disturbance = observe(integrable(solver.dynamics), windows, past)
         # The rollouts without and with the disturbance form one batch: two batches would need twice the number of calls
         # of torch.
         disturbances = torch.cat([torch.zeros_like(disturbance), disturbance])
-        q, qd = predictor.solver(joined([started, started]), disturbances)
+        q, qd = solver(joined([started, started]), disturbances)
         count = len(started)
-        states[predictor.name] = q[:count], qd[:count]
-        states[observed(predictor.name)] = q[count:], qd[count:]
+        states[predictor] = q[:count], qd[:count]
+        states[observed(predictor)] = q[count:], qd[count:]
     errors = {name: end_errors(state, ahead, logs.joint_types, tip) for name, state in states.items()}
     seconds = ahead.dt.sum(dim=1).mean().item()
     starts = [(piece, first + past) for piece, first in logs.starts(past + steps, window_count)]

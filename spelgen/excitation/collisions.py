@@ -14,9 +14,8 @@ import pinocchio as pin
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.pinocchio_arm import kinematic_model
-from spelgen.dynamics.tip_frame import link_poses
+from spelgen.dynamics.tip_frame import body_constraint, link_poses
 from spelgen.excitation.bounds import MotionBounds, Surroundings
 from spelgen.excitation.trajectory import Motion
 from spelgen.excitation.tuning import TUNING

@@ -13,9 +13,9 @@ import casadi as ca
 import numpy as np
 
 from spelgen.exporting.c_source import CFunction, c_function
-from spelgen.exporting.description import TORQUE, TrainedModel, entry_point
-from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function
-from spelgen.exporting.residual_expressions import residual_symbols
+from spelgen.exporting.describe import TrainedModel
+from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function, residual_symbols
+from spelgen.exporting.parity import TORQUE, entry_point
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.tuning import TUNING
@@ -92,11 +92,12 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         # C has no empty arrays, so a model without bristles gets one unused break-away displacement, zero.
         "breakaway": model.breakaway.ravel() if model.memory else [0.0],
         "rest_speed": levels.rest_speed,
+        "saturation": levels.effort * levels.saturation,
     }
     for name, level in levels:
         if isinstance(level, BlockNoise):
             tables |= {f"{name}_{key}": row for key, row in level}
-        elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay"):
+        elif name not in ("minutes", "point", "peak_count", "load_freedom", "delay", "saturation"):
             tables[name] = np.ravel(level)
     values = {
         "name": model.name,

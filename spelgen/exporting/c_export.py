@@ -13,9 +13,8 @@ from spelgen.errors import RunError
 from spelgen.exporting.c_estimator import CALLED, estimator_c_functions, estimator_texts
 from spelgen.exporting.c_source import FRICTION_STATES, CFunction, c_functions, write_c
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.parity import Called, Values, check_parity
+from spelgen.exporting.parity import ENTRY_POINTS, Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
 # Compiler warnings are errors, because users compile the files with the strict flags of their own projects.

@@ -8,11 +8,10 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import BSpline
 
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import EntryPoint, Residuals, SigmoidNetwork, TrainedModel, spline_energy
+from spelgen.exporting.describe import Residuals, SigmoidNetwork, Trained, TrainedModel, spline_energy
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.model_expressions import expression_functions, residuals_needed
-from spelgen.exporting.parity import Called, Values, check_parity
+from spelgen.exporting.parity import Called, EntryPoint, Values, check_parity
 from spelgen.exporting.rigid_expressions import constant
 from spelgen.exporting.tuning import TUNING
 
@@ -92,7 +91,7 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return {name of a residual term, see `residual_expressions`: its value as an expression in q and qd}.
+    """Return {name of a residual term, see `model_expressions`: its value as an expression in q and qd}.
 
     q, qd: symbols, (n, 1) each; qd: None if no term that depends on velocity is needed.
     """

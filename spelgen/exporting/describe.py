@@ -1,22 +1,24 @@
-"""``Trained``, a model with its arm, which every exporter gets as argument, and its conversion to NumPy arrays."""
+"""``Trained``, a model with its arm, which every exporter gets as argument, and ``TrainedModel``, its NumPy arrays."""
 
 import copy
 import keyword
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from scipy.interpolate import BSpline
 from torch import Tensor
 
+from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.protocol import motors_of, residual_terms
-from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.dynamics.tip_frame import Tip, tip_frame
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.exporting import description
+from spelgen.exporting.parity import ENTRY_POINTS, EntryPoint, select_names
 from spelgen.listing import Listing
 from spelgen.live.noise import NoiseLevels
 from spelgen.runtime.friction_laws import FrictionConstants
@@ -24,6 +26,145 @@ from spelgen.runtime.networks import JointEncoding
 from spelgen.runtime.parts import Layers
 from spelgen.runtime.residual_terms import ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
+
+
+@dataclass(frozen=True, eq=False)
+class SigmoidNetwork:
+    """A network with layers of sigmoids, then a linear layer. Its inputs are cos q, sin q and q of all joints, (3 n,).
+
+    weights: one matrix per layer, (units, units of the previous layer). biases: one vector per layer, (units,).
+    """
+
+    weights: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """Torque ripple of one joint [Nm], as a function of its position q [rad].
+
+    The torque is the sum of cosines[k - 1] cos(k frequency q) + sines[k - 1] sin(k frequency q) over k = 1, 2, ...
+    """
+
+    joint: int
+    frequency: float
+    cosines: np.ndarray
+    sines: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """The nonzero residual terms of a model, which are added to its rigid bodies.
+
+    Splines are cubic, and zero outside of their knots.
+
+    Attributes:
+        mass: network whose outputs are added to M.
+        entries: (row, column) in the lower triangle of M to which each output is added.
+        potential: network whose output is added to V.
+        torque: {joint: spline of q that is added to dV/dq [Nm, N]}.
+        ripple: harmonics in the position of a joint that are added to dV/dq [Nm].
+        friction: {joint: spline of q, logarithm of the factor on the friction of the joint's drive}.
+    """
+
+    entries: tuple[tuple[int, int], ...]
+    mass: SigmoidNetwork | None
+    potential: SigmoidNetwork | None
+    torque: dict[int, BSpline]
+    ripple: tuple[Harmonics, ...]
+    friction: dict[int, BSpline]
+
+    def __bool__(self) -> bool:
+        return bool(self.mass or self.potential or self.has_torque or self.friction)
+
+    @property
+    def has_torque(self) -> bool:
+        """True if any joint has a residual torque that depends on its position, a spline or ripple."""
+        return bool(self.torque or self.ripple)
+
+
+def spline_energy(spline: BSpline) -> BSpline:
+    """Return the potential energy [J] of a torque spline as a function of q, its antiderivative.
+
+    As in the runtime, its constant is chosen such that the energies at both ends differ only in sign.
+    """
+    energy = spline.antiderivative()
+    count = len(energy.t) - energy.k - 1
+    half = energy(spline.t[-4]) / 2
+    return BSpline(energy.t, energy.c[:count] - half, energy.k)
+
+
+@dataclass(frozen=True, eq=False)
+class Servos:
+    """Constants of position servos, (n,) each, as in ``runtime.PositionServo``.
+
+    Attributes:
+        kp, kd: gains [Nm/rad, N/m] and [Nm s/rad, N s/m].
+        limit: largest torque [Nm, N]; infinite for a servo without a limit.
+        dead_zone: half the width of the dead zone [rad, m].
+        delay: delay of the commands [s], one number.
+    """
+
+    kp: np.ndarray
+    kd: np.ndarray
+    limit: np.ndarray
+    dead_zone: np.ndarray
+    delay: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """A trained model of an arm with n joints: rad and Nm for revolute joints, m and N for prismatic joints.
+
+    Attributes:
+        name: identifier of the robot in code.
+        arm: kinematic chain of the arm.
+        joint_labels: names of the joints for comments, only letters, digits and _.
+        inertias: (bodies, 10), inertial parameters in the frames of the joints.
+        constant_mass: (n, n), armature and constant residual terms of M.
+        motors: C, (n, n), motor velocities = C qd.
+        residuals: residual terms that depend on q.
+        friction: the ``FrictionConstants`` of the runtime, as arrays.
+        breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
+        inputs: G, (n, n), joint torques = G times motor torques.
+        actuated: (n,), 0 for a passive joint, otherwise 1.
+        torque_offset: (n,), measured torque at zero torque.
+        friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
+            without measuring it.
+        tip: frame of the tip.
+        servos: position servos of the joints; None for an arm under torques.
+    """
+
+    name: str
+    arm: Chain
+    joint_labels: tuple[str, ...]
+    inertias: np.ndarray
+    constant_mass: np.ndarray
+    motors: np.ndarray
+    residuals: Residuals
+    friction: Any
+    breakaway: np.ndarray
+    inputs: np.ndarray
+    actuated: np.ndarray
+    torque_offset: np.ndarray
+    friction_compensation: np.ndarray
+    tip: Tip
+    servos: Servos | None = None
+
+    @property
+    def n(self) -> int:
+        """Number of joints of the arm."""
+        return len(self.arm.coordinates)
+
+    @property
+    def memory(self) -> int:
+        """Number of friction bristles of all joints, the size of the friction state z; 0 without a state."""
+        return int(self.breakaway.size)
+
+    @property
+    def input_inverse(self) -> np.ndarray:
+        """Matrix (n, n) from joint torques to motor torques: inverse of G with 1 on the diagonal for passive joints."""
+        return np.linalg.inv(self.inputs + np.diag(1 - self.actuated))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +188,7 @@ class Trained:
     levels: NoiseLevels | None = None
 
     @cached_property
-    def described(self) -> description.TrainedModel:
+    def described(self) -> TrainedModel:
         """The trained model with NumPy arrays in place of PyTorch modules.
 
         Raises RunError for a model without rigid bodies.
@@ -55,19 +196,19 @@ class Trained:
         return describe(self.model, self.arm)
 
     @cached_property
-    def entry_points(self) -> dict[str, description.EntryPoint]:
+    def entry_points(self) -> dict[str, EntryPoint]:
         """The functions of the model to export, by name, such as inverse_dynamics.
 
         Raises RunError for unknown names in ``entries``.
         """
-        available = list(description.ENTRY_POINTS)
+        available = list(ENTRY_POINTS)
         if self.described.servos is None:
             available.remove("servo_torque")
-        names = description.select_names(self.entries, available)
-        return {name: description.ENTRY_POINTS[name] for name in names}
+        names = select_names(self.entries, available)
+        return {name: ENTRY_POINTS[name] for name in names}
 
 
-def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
+def describe(model: ArmModel, loaded: Arm) -> TrainedModel:
     """Return a trained model as NumPy arrays, from which C and CasADi code is generated.
 
     Raises RunError for a model without rigid bodies. loaded: arm of the model.
@@ -84,12 +225,12 @@ def describe(model: ArmModel, loaded: Arm) -> description.TrainedModel:
         )
     weights = exact.prepare()
     constant_mass = array(weights.armature)
-    residuals = description.Residuals((), None, None, {}, (), {})
+    residuals = Residuals((), None, None, {}, (), {})
     # The constant part of a residual term of M is added to the armature: exports evaluate only the varying part.
     if residual_terms(exact) is not None:
         constant_mass += array(weights.residual.constant).reshape(exact.n, exact.n)
         residuals = _residuals(exact)
-    return description.TrainedModel(
+    return TrainedModel(
         name=identifier(loaded.chain.name),
         arm=loaded.chain,
         joint_labels=tuple(_letters_and_digits(name) or "joint" for name in model.joint_names),
@@ -127,15 +268,15 @@ def array(value: Tensor) -> np.ndarray:
     return np.array(value.detach().double().cpu().numpy())
 
 
-def servos_of(model: ArmModel) -> description.Servos | None:
+def servos_of(model: ArmModel) -> Servos | None:
     """Return the constants of the position servos of a model as NumPy arrays; None for a model under torques."""
     if model.input_quantity == "torque":
         return None
     kp, kd, limit, dead_zone = map(array, model.servo.prepare())
-    return description.Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
+    return Servos(kp, kd, limit, dead_zone, float(model.servo.delay))
 
 
-def _residuals(model: ArmModel) -> description.Residuals:
+def _residuals(model: ArmModel) -> Residuals:
     """Return the residual terms of a model as NumPy arrays and splines, without the terms that are zero."""
     terms, weights = model.residuals, model.prepare().residual
     functions = array(weights.functions)
@@ -144,7 +285,7 @@ def _residuals(model: ArmModel) -> description.Residuals:
     mass = _network(weights.mass, terms.encoding, functions[:, entries @ (model.n, 1)])
     if mass is None:
         entries = entries[:0]
-    return description.Residuals(
+    return Residuals(
         entries=tuple(map(tuple, entries.tolist())),
         mass=mass,
         potential=_network(weights.potential, terms.encoding),
@@ -156,7 +297,7 @@ def _residuals(model: ArmModel) -> description.Residuals:
 
 def _network(
     layers: Layers | None, encoding: JointEncoding, functions: np.ndarray | None = None
-) -> description.SigmoidNetwork | None:
+) -> SigmoidNetwork | None:
     """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
     The result computes y(q), the outputs of the given network, or tanh(y(q)) @ functions. Sigmoids take less time in C.
@@ -186,7 +327,7 @@ def _network(
         # after it, the weights are doubled, and the sum of the original weights is subtracted from the bias.
         weights[k - 1], biases[k - 1] = 2 * weights[k - 1], 2 * biases[k - 1]
         weights[k], biases[k] = 2 * weights[k], biases[k] - weights[k].sum(axis=1)
-    return description.SigmoidNetwork(tuple(weights), tuple(biases))
+    return SigmoidNetwork(tuple(weights), tuple(biases))
 
 
 def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
@@ -204,7 +345,7 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
     return splines
 
 
-def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonics, ...]:
+def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     """Return the torque ripple of all joints: up to two elements per joint, for harmonics of joint and motor.
 
     terms: residual terms, for the frequencies. weights: (n, 2 H), coefficients of H cosines, then of H sines. The H
@@ -226,5 +367,5 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[description.Harmonic
             # removed.
             if used.size:
                 last = used[-1] + 1
-                ripple.append(description.Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))
+                ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))
     return tuple(ripple)

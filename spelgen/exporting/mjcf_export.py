@@ -11,12 +11,10 @@ from lxml import etree
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.body_constraint import body_constraint
 from spelgen.dynamics.body_regressor import about_center, quaternion
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.dynamics.tip_frame import link_poses, tip_frame
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import Servos
+from spelgen.dynamics.tip_frame import body_constraint, link_poses, tip_frame
+from spelgen.exporting.describe import Servos, Trained
 from spelgen.exporting.exported import Exported, with_readme
 from spelgen.exporting.parity import Parity, Values, random_inputs, relative, require_parity
 from spelgen.exporting.rigid_body_projection import RigidBodyProjection, rigid_body_projection

@@ -1,7 +1,14 @@
 """CasADi expressions of the functions of a trained model (entry points), for example of inverse dynamics.
 
 The variables of an expression are the inputs of the entry point, for example q and qd, and symbols that represent the
-residual terms (see `residual_expressions`).
+residual terms, so that exported code can compute these terms by loops over network weights and lookup of splines. R is
+the part of M that a network computes, with m nonzero entries in the lower triangle; k is the number of joints whose
+friction depends on q. The symbols of residual terms are:
+
+- ``mass`` (m, 1), entries of R; ``rate`` (m, 1), d mass / dt; ``kinetic`` (n, 1), d/dq of 1/2 qd^T R qd;
+- ``energy`` (1, 1), the network of the potential energy V; ``gravity`` (n, 1), d energy / dq;
+- ``torque`` (n, 1), torques that depend on the position of a single joint; ``torque_energy`` (1, 1), their energy;
+- ``factor`` (k, 1), logarithms of the friction factors.
 """
 
 from collections.abc import Mapping
@@ -9,10 +16,11 @@ from collections.abc import Mapping
 import casadi as ca
 import numpy as np
 
-from spelgen.exporting.description import EntryPoint, Servos, TrainedModel
-from spelgen.exporting.residual_expressions import Symbols, residual_symbols, symmetric
+from spelgen.exporting.describe import Servos, TrainedModel
+from spelgen.exporting.parity import EntryPoint
 from spelgen.exporting.rigid_expressions import RigidBodies, constant, frame_kinematics, mass_and_potential
 
+Symbols = dict[str, ca.SX]
 RESIDUAL = "residual_"
 """Prefix of the names of residual terms among the inputs of a function."""
 
@@ -61,6 +69,42 @@ def named_function(
 def residuals_needed(function: ca.Function) -> list[str]:
     """Return the names of the residual terms on which a function made by ``expression_functions`` depends."""
     return [name.removeprefix(RESIDUAL) for name in function.name_in() if name.startswith(RESIDUAL)]
+
+
+def residual_symbols(model: TrainedModel) -> Symbols:
+    """Return {name: CasADi symbol} of all residual terms of a model; absent terms are structural zeros."""
+    n = model.n
+    residuals = model.residuals
+    entries, factors = len(residuals.entries), len(residuals.friction)
+    has_potential = residuals.potential is not None
+    # {name: (whether the model has this term, number of rows)}
+    sizes = {
+        "mass": (entries, entries),
+        # `rate` and `kinetic` are directional derivatives of the network. Each is computed in one pass through the
+        # network; the Jacobian of `mass` would take n passes.
+        "rate": (entries, entries),
+        "kinetic": (entries, n),
+        "energy": (has_potential, 1),
+        "gravity": (has_potential, n),
+        "torque": (residuals.has_torque, n),
+        "torque_energy": (residuals.has_torque, 1),
+        "factor": (factors, factors),
+    }
+    symbols = {}
+    for name, (exists, rows) in sizes.items():
+        symbols[name] = ca.SX.sym(name, rows) if exists else ca.SX(rows, 1)
+    return symbols
+
+
+def symmetric(model: TrainedModel, values: ca.SX) -> ca.SX:
+    """Return the symmetric matrix (n, n) with the structure of R, the residual term of M.
+
+    values: (m, 1), for the m nonzero entries in the lower triangle of R.
+    """
+    matrix = ca.SX(model.n, model.n)
+    for k, (row, column) in enumerate(model.residuals.entries):
+        matrix[row, column] = matrix[column, row] = values[k]
+    return matrix
 
 
 def _expressions(model: TrainedModel, inputs: Symbols, residuals: Symbols) -> dict[str, ca.SX]:

@@ -1,8 +1,14 @@
-"""Parity check: the largest difference between an export and the torch model at random states."""
+"""The functions that an export contains (entry points), and their comparison with the torch model at random states.
+
+The comparison (parity check) gives the largest difference between an export and the model.
+"""
+
+from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,9 +19,10 @@ from spelgen.dynamics.prepared import PreparedModel
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.errors import RunError
 from spelgen.excitation.bounds import SPEEDS
-from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import ENTRY_POINTS
 from spelgen.exporting.tuning import TUNING
+
+if TYPE_CHECKING:
+    from spelgen.exporting.describe import Trained
 
 Values = dict[str, np.ndarray]
 """Inputs or outputs of an entry point by name, (states, ...) each."""
@@ -26,19 +33,34 @@ The input z is (states, n, K) for K bristles per joint.
 """
 
 
-PROGRAMS: dict[str, Callable[..., Tensor]] = {
-    "inverse_dynamics": PreparedModel.inverse_dynamics,
-    "forward_dynamics": PreparedModel.forward_dynamics,
-    "mass_matrix": PreparedModel.mass_matrix,
-    "bias": PreparedModel.bias,
-    "gravity": PreparedModel.gravity,
-    "friction": PreparedModel.friction_torque,
-    "friction_step": PreparedModel.memory_after,
-    "friction_memory": PreparedModel.memory,
-    "tip_pose": PreparedModel.pose,
-    "tip_jacobian": PreparedModel.jacobian,
-}
-"""The entry points that are exported as torch and ONNX programs, and the methods that compute them."""
+@dataclass(frozen=True)
+class EntryPoint:
+    """A function of the model that exports contain, such as inverse_dynamics.
+
+    Attributes:
+        about: description.
+        inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
+            and z, the friction state.
+        outputs: {name of a result: unit}.
+        reference: function of the torch model (a ``PreparedModel``) and the inputs, (states, ...) each, with the same
+            result; None for a function that only the exported estimator calls.
+    """
+
+    name: str
+    about: str
+    inputs: tuple[str, ...]
+    outputs: dict[str, str]
+    reference: Callable[..., Tensor] | None
+
+
+TORQUE = "Nm, N"
+
+
+def entry_point(
+    name: str, about: str, inputs: str, reference: Callable[..., Tensor] | None = None, **outputs: str
+) -> EntryPoint:
+    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result."""
+    return EntryPoint(name, about, tuple(inputs.split()), outputs, reference)
 
 
 def _energy(prepared: PreparedModel, q: Tensor, qd: Tensor) -> Tensor:
@@ -47,12 +69,60 @@ def _energy(prepared: PreparedModel, q: Tensor, qd: Tensor) -> Tensor:
     return torch.stack([kinetic, prepared.model.potential_energy(q)], dim=-1)
 
 
-_REFERENCES = PROGRAMS | {
-    "momentum": PreparedModel.momentum,
-    "energy": _energy,
-    "servo_torque": lambda prepared, u, q, qd: prepared.model.servo(u, q, qd),
-}
-"""The torch model's functions of entry points, by name."""
+_ENTRY_POINTS = (
+    entry_point(
+        "inverse_dynamics", "the torques that give qdd, friction included", "q qd qdd z",
+        PreparedModel.inverse_dynamics, tau=TORQUE,
+    ),
+    entry_point(
+        "forward_dynamics", "the accelerations under the torques tau", "q qd tau z",
+        PreparedModel.forward_dynamics, qdd="rad/s^2, m/s^2",
+    ),
+    entry_point("mass_matrix", "M, armature included", "q", PreparedModel.mass_matrix, mass="kg m^2, kg m, kg"),
+    entry_point("bias", "Coriolis, centrifugal and gravity torques", "q qd", PreparedModel.bias, bias=TORQUE),
+    entry_point("gravity", "the torques that hold the arm still, dV/dq", "q", PreparedModel.gravity, gravity=TORQUE),
+    entry_point("friction", "the torques of friction", "q qd z", PreparedModel.friction_torque, friction=TORQUE),
+    entry_point(
+        "friction_step", "the friction state after a displacement dq of each joint", "z dq",
+        PreparedModel.memory_after, z_next="rad, m",
+    ),
+    entry_point(
+        "friction_memory", "the initial friction state of joints that have moved at constant qd", "qd",
+        PreparedModel.memory, z_start="rad, m",
+    ),
+    entry_point("momentum", "M qd", "q qd", PreparedModel.momentum, momentum="Nm s, N s"),
+    entry_point("energy", "kinetic energy, then potential", "q qd", _energy, energy="J"),
+    entry_point(
+        "tip_pose", "the tip's homogeneous transform in the root link's frame", "q", PreparedModel.pose, pose="1, m",
+    ),
+    entry_point(
+        "tip_jacobian", "the tip's linear, then angular velocity by qd, in the root link's axes", "q",
+        PreparedModel.jacobian, jacobian="m, 1",
+    ),
+    entry_point(
+        "servo_torque", "the torques of position servos under a command u, which the caller delays", "u q qd",
+        lambda prepared, u, q, qd: prepared.model.servo(u, q, qd), tau=TORQUE,
+    ),
+)  # fmt: skip
+
+ENTRY_POINTS = {entry.name: entry for entry in _ENTRY_POINTS}
+"""All entry points by name."""
+PROGRAMS = [name for name in ENTRY_POINTS if name not in ("momentum", "energy", "servo_torque")]
+"""The entry points that are exported as torch and ONNX programs."""
+
+
+def select_names(names: Sequence[str], available: Iterable[str]) -> list[str]:
+    """Return the `names` of functions in the order of `available`; if `names` is empty, all available ones.
+
+    Raises RunError for names that are not available.
+    """
+    options = list(available)
+    for name in names:
+        if name not in options:
+            expected = f"one of {', '.join(options)}"
+            raise RunError(f"the function {name!r}", expected=expected)
+    # The functions have a fixed order, not the user's order, so that the same selection gives the same files.
+    return [name for name in options if name in names or not names]
 
 
 @dataclass(frozen=True)
@@ -119,7 +189,8 @@ def check_parity(
         entry = ENTRY_POINTS[name]
         (output,) = entry.outputs
         arguments = [torch.from_numpy(inputs[key]) for key in entry.inputs]
-        expected = _REFERENCES[name](exact, *arguments).detach().numpy()
+        assert entry.reference is not None
+        expected = entry.reference(exact, *arguments).detach().numpy()
         # The output of the export is reshaped, since for an arm of one joint some formats return a vector in place of a
         # matrix.
         values = called(name, inputs)[output].reshape(expected.shape)

@@ -15,8 +15,7 @@ from spelgen.dynamics.parameters import without_residuals
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
-from spelgen.exporting.describe import array, servos_of
-from spelgen.exporting.description import Servos
+from spelgen.exporting.describe import Servos, array, servos_of
 from spelgen.exporting.parity import nominal_speeds, random_inputs
 from spelgen.exporting.tuning import TUNING
 from spelgen.fitting.optimizers import minimise

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from spelgen.arm.arm import Body, Chain
-from spelgen.exporting.description import TrainedModel
+from spelgen.exporting.describe import TrainedModel
 from spelgen.structure.recursion import Position, base_denominators, energies
 
 _Z = ca.sparsify(ca.DM([0, 0, 1]))

@@ -12,9 +12,8 @@ from torch import Tensor, nn
 from spelgen.dynamics.prepared import PreparedModel
 from spelgen.dynamics.tip import tip_kinematics
 from spelgen.exporting.describe import Trained
-from spelgen.exporting.description import ENTRY_POINTS, select_names
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.parity import PROGRAMS, Called, Values, check_parity
+from spelgen.exporting.parity import ENTRY_POINTS, PROGRAMS, Called, Values, check_parity, select_names
 from spelgen.exporting.tuning import TUNING
 
 FRICTION_STATE = ("friction_step", "friction_memory")
@@ -145,7 +144,9 @@ class _Program(nn.Module):
 
     def __init__(self, model: PreparedModel, name: str) -> None:
         super().__init__()
-        self._model, self._function = model, PROGRAMS[name]
+        function = ENTRY_POINTS[name].reference
+        assert function is not None
+        self._model, self._function = model, function
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the output, (batch, ...), of the entry point, a function of the model such as inverse_dynamics.

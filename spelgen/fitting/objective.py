@@ -10,11 +10,14 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content, Record
+from spelgen.logs.fingerprints import fingerprint_of
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
 from spelgen.settings.yaml_document import validated
 
+STORED_HASHES = 8
+"""Number of hashes of each recording in config.json, enough to recognize a copy or a half of a recording."""
 Status = Literal["finished", "stopped early", "out of time", "interrupted"]
 
 
@@ -99,6 +102,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         data_digest=prepared.digest,
         training=list(prepared.training_names),
         validation=list(prepared.validation_names),
+        fingerprints={x.name: fingerprint_of(x)[:STORED_HASHES] for x in request.recordings},
         training_windows=prepared.window_counts[0],
         validation_windows=prepared.window_counts[1],
         mapping=options.mapping or LogMapping(input=model.input_quantity),

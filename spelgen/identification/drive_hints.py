@@ -154,11 +154,10 @@ class DriveProblem:
 
     @cached_property
     def errors(self) -> np.ndarray:
-        """Squared torque residual of each of n joints, summed over each of B blocks of samples, (B, n) [1].
+        """Relative squared torque residual (B, n) [1] of each of n joints in each of B blocks of samples.
 
-        It is divided by `size`, the mean squared torque of the joint per block.
-
-        The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
+        The sum of squared residuals in a block is divided by `size`, the mean over the blocks of the sum of squared
+        torques. The parameters are fitted to all other blocks; with a single block, they are fitted to this block.
         """
         products = self.products / np.where(self.size > 0, self.size, 1.0)[:, None, None, None]
         fitted = products.sum(axis=0)
@@ -257,9 +256,9 @@ def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: in
     """Return True if a candidate for a coupling significantly lowers the errors of B blocks of time.
 
     Args:
-        logged: (B,) errors without the candidate.
-        mended: (B,) errors with the candidate.
-        gain: largest accepted ratio of the mean error with the candidate to the mean error without it.
+        logged: (B,) errors without the candidate coupling.
+        mended: (B,) errors with the candidate coupling.
+        gain: upper bound for the mean error with the candidate, divided by the mean error without it.
         candidates: number of candidates of which this candidate is the best.
     """
     if mended.mean() >= gain * logged.mean():

@@ -118,7 +118,9 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
     """Return the indices of the recordings whose torques contradict the other recordings; at most half of all.
 
-    Parameters fitted to the other recordings explain the torques of these recordings, but not of the deviating one.
+    A recording deviates if parameters fitted to all other recordings explain the torques of the others, but not its own
+    torques. Deviating recordings are removed one by one, the worst first. [] is returned for two recordings: nothing
+    shows which of the two is wrong.
     """
     coarse = problem.thinned(GEOMETRY.confirming_samples)
     number, unchanged = coarse.samples.recording, coarse.unchanged

@@ -65,8 +65,16 @@ class GeometryProblem:
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
+        return self._on(self.samples.thinned(count))
+
+    def selected(self, rows: np.ndarray) -> GeometryProblem:
+        """Return the same least-squares problem on the samples that a mask (S,) selects."""
+        return self._on(self.samples.part(rows))
+
+    def _on(self, samples: MotionSamples) -> GeometryProblem:
+        """Return the same least-squares problem on other samples."""
         fewer = copy(self)
-        fewer.samples, fewer._equations = self.samples.thinned(count), {}
+        fewer.samples, fewer._equations = samples, {}
         return fewer
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
@@ -211,7 +219,7 @@ class GeometryProblem:
             errors = np.maximum(squares / variance, 0.0)
             distance = float((x - mean) @ precision @ (x - mean))
             scale = 2 * freedom / (freedom + distance)
-            misfit = 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+            misfit = self.misfit(errors)
             cost = misfit + freedom * float(np.log1p(distance / freedom))
             if iteration == 0 or cost < lowest or not self._has_free_gains:
                 lowest, best = cost, (x, errors, misfit, matrix)
@@ -220,12 +228,25 @@ class GeometryProblem:
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
+    def misfit(self, errors: np.ndarray) -> float:
+        """Return the negative log likelihood for relative squared residuals `errors` (n,) of the joints."""
+        return 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
 
         The parameters of `fit` are estimated together with the quantities. columns: (S, n, D) derivative of the torque
         residual with respect to the quantities.
         """
+        return solution(*self._linearized(fit, columns))[len(fit.parameters) :]
+
+    def estimate(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Gauss-Newton step (K + D,) of K parameters and D quantities (see `step`), and its covariance."""
+        matrix, vector = self._linearized(fit, columns)
+        return solution(matrix, vector), inverse(matrix)
+
+    def _linearized(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`."""
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
@@ -235,7 +256,7 @@ class GeometryProblem:
         matrix[:count, :count] += self._precision
         vector = flat.T @ ((tau - rows @ fit.parameters) * np.sqrt(weights)).ravel()
         vector[:count] += self._precision @ (self.prior_mean - fit.parameters)
-        return solution(matrix, vector)[count:]
+        return matrix, vector
 
     def descend(
         self,
@@ -358,7 +379,8 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
     The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
-    prior of a body without <inertial> in the URDF has mean 0 and is wide.
+    prior of a body without <inertial> in the URDF has mean 0 and is wide. The prior of a body that carries no joint
+    includes a tool or load that the URDF does not contain.
     """
     masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
     typical = float(np.median(masses)) if masses else 1.0
@@ -367,7 +389,11 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
         lengths = [np.linalg.norm(np.array(x.translation, dtype=float)) for x in arm.bodies if x.parent == k]
         mean.append(np.array(body.inertia or (0.0,) * 10, dtype=float))
         root = _root(mean[-1], float(max(lengths, default=0.0)), typical)
-        precisions.append(np.linalg.inv(root @ root.T))
+        covariance = root @ root.T
+        if not lengths:
+            deviations = GEOMETRY.load * typical * np.power(GEOMETRY.load_distance, [0, 1, 2])
+            covariance += np.diag(np.square(np.repeat(deviations, (1, 3, 6))))
+        precisions.append(np.linalg.inv(covariance))
     return np.concatenate(mean), block_diag(*precisions)
 
 

@@ -90,6 +90,11 @@ class LogGeometryTuning:
     no_advice: float = 0.2
     # [1] Relative residual variance of the unchanged log above which its torques are no joint torques.
     no_torque: float = 0.6
+    # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
+    # the arm's links.
+    load: float = 0.5
+    # [m] Standard deviation of the distance of its centre of mass from the origin of the last body.
+    load_distance: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.

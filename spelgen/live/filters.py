@@ -53,9 +53,8 @@ class Block(NamedTuple):
         duration = self.duration + later.duration
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
-        y, load, friction, uncertainty = (
-            a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)
-        )
+        means = [a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)]
+        y, load, friction, uncertainty = means
         return Block(duration, y, load, friction, uncertainty, self.moving & later.moving)
 
 

@@ -121,7 +121,7 @@ class Intake:
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"
-        return "saturated" if (np.abs(tau) >= self.levels.effort).any() else "used"
+        return "saturated" if (np.abs(tau) >= self.levels.effort * self.levels.saturation).any() else "used"
 
 
 def balance_along(

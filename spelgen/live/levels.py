@@ -154,12 +154,13 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # `levels` has no noise values at first, but the limits by which samples are accepted or refused: the noise is
     # estimated from the accepted samples.
-    # The torque limit in the URDF is replaced if logged torques exceed it.
+    # The torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, torques may
+    # exceed `limit`, for example under a payload, and are no saturation.
     limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
-        speed=np.abs(joined_column(logs, "qd")).max(axis=0), encoder=encoder, effort=limit,
-        minutes=sum(log.duration for log in logs) / 60, point=point, delay=delay,
+        speed=np.abs(joined_column(logs, "qd")).max(axis=0), encoder=encoder, effort=limit, point=point, delay=delay,
+        minutes=sum(log.duration for log in logs) / 60, saturation=np.where(effort < np.inf, 1.0, TUNING.jump),
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments, pairs = [], []
@@ -170,8 +171,8 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
         pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    levels = levels.model_copy(update={"load_variance": factor, "load_freedom": freedom})
-    return _with_observer(levels, tested)
+    payload = {"load_variance": factor, "load_freedom": freedom}
+    return _with_observer(levels.model_copy(update=payload), tested)
 
 
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:

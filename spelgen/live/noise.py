@@ -67,7 +67,9 @@ class NoiseLevels(BaseModel):
         load_freedom: Degrees of freedom of the estimate of `load_variance`.
         speed: Largest speed of the training logs, (n,) [rad/s, m/s].
         encoder: Encoder step, (n,) [rad, m].
-        effort: Torque limit, (n,) [Nm, N].
+        effort: Torque limit, (n,) [Nm, N]; for an unknown limit a multiple of the largest logged torque.
+        saturation: Torque from which a sample is saturated, divided by `effort`: 1, or more for joints with an unknown
+            limit, (n,) or (1,) [1].
         minutes: Duration of the training logs [min].
         point: Position of the tip in the frame of the last body, (3,) [m].
         delay: Delay of measured torques relative to positions, as found by the fit [s].
@@ -91,6 +93,7 @@ class NoiseLevels(BaseModel):
     minutes: float
     point: Vector
     delay: float
+    saturation: Vector = np.ones(1)
 
     @property
     def rest_speed(self) -> np.ndarray:

@@ -132,9 +132,8 @@ def payload_sentence(payload: Payload) -> str:
         )
         return f"payload of {payload.mass:.2f} kg ({low:.2f} to {high:.2f}), centre of mass {center} m"
     limit = f"at most {payload.limit:.2g} kg" if np.isfinite(payload.limit) else "record motion of the joints"
-    if payload.status == "no payload":
-        return f"no payload ({limit})"
-    return f"not determined yet whether there is a payload ({limit})"
+    is_none = payload.status == "no payload"
+    return f"{'no payload' if is_none else 'not determined yet whether there is a payload'} ({limit})"
 
 
 def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None = None) -> list[LogEstimate]:

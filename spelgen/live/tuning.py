@@ -18,7 +18,8 @@ class LiveTuning:
     # [s] Longest time between two samples of a block. After a longer gap the friction state is unknown.
     gap: float = 0.25
     # [1] A sample is refused if its velocity, or the change of position since the last sample divided by the time,
-    # exceeds this multiple of the largest speed of the training logs.
+    # exceeds this multiple of the largest speed of the training logs. A torque of a joint whose torque limit is unknown
+    # is saturated from this multiple of `NoiseLevels.effort`.
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5

@@ -6,7 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from spelgen.errors import Diagnostic, LogError, Severity, collect
-from spelgen.log_checks.check_torque_logs import COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, TorqueLogs
+from spelgen.log_checks.check_torque_logs import (
+    COUPLED,
+    CURRENT,
+    LOADS,
+    WITHOUT_GRAVITY,
+    WRONG_LINK,
+    TorqueLogs,
+)
 from spelgen.log_checks.geometry_finding import WARNINGS
 from spelgen.log_checks.limits_in_logs import AT_A_STOP
 from spelgen.log_checks.report import LogReport, joint_report
@@ -20,7 +27,9 @@ if TYPE_CHECKING:
     from spelgen.log_checks.check_servo_logs import ServoLogs
     from spelgen.settings.log_mapping import LogMapping
 
-ABOUT_ARM = {COUPLED, CURRENT, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS} | {x.code for x in CHECKS}
+ABOUT_ARM = {COUPLED, CURRENT, LOADS, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS} | {
+    x.code for x in CHECKS
+}
 
 
 def check_logs(

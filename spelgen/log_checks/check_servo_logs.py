@@ -219,7 +219,7 @@ def _steady_state_errors(pieces: Sequence[Trajectory]) -> list[float | None]:
 def _midpoints(x: np.ndarray) -> np.ndarray:
     """Return the means (T - 1, ...) of neighbouring samples of x (T, ...): positions in the middle between two samples.
 
-    They are compared with the commands, which act from one sample to the next.
+    A command acts from one sample to the next. It is compared with the position at the middle of this interval.
     """
     return np.asarray((x[1:] + x[:-1]) / 2)
 
@@ -314,8 +314,8 @@ class ServoLogs:
     def _geometry_problems(self) -> list[GeometryProblem]:
         """Return the least-squares problems of the torques kp (u - q), with an unknown gain kp of each servo.
 
-        There is a problem for each of `COMMAND_DELAYS`, and none for too few samples, or if u = q in all of them. The
-        friction terms include the damping of the servos.
+        There is one problem per delay of the command in `COMMAND_DELAYS`; a delay at which u = q in all samples is
+        omitted. [] is returned for too few samples. The friction terms include the damping of the servos.
         """
         chain, alone = self._arm.chain, np.eye(len(self._names))
         collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())
@@ -453,8 +453,10 @@ def _command_faults(
 def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
     """Return the correlation (n,) of each position with the sum of the commands of its joint.
 
-    It is 0 unless the amplitude of the position is, within a factor of 2, the amplitude of the sum (commands that are
-    increments) or of the integral (velocities): a sum of periodic commands correlates with any motion of this period.
+    The sum of the commands is the position if the commands are increments. Their integral (the sum divided by the
+    sample rate) is the position if they are velocities. The result is 0 for a joint whose position has neither the
+    amplitude of the sum nor of the integral, within a factor of 2: any motion with the period of the commands is
+    correlated with their sum.
     """
     u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
     summed = measure_following([replace(log, u=u)], following.saturation)

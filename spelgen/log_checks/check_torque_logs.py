@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.errors import Diagnostic, LogError, SpelgenError
+from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
 from spelgen.identification.column_faults import UNITS, TorqueUnit
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.least_squares import varying
+from spelgen.identification.load_changes import LoadChange, load_changes
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
-SMALL_MOTION = "small-motion"
+SMALL_MOTION, LOADS = "small-motion", "different-loads"
 # Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
@@ -118,11 +119,14 @@ class TorqueLogs:
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
             samples = [motion, motion if moving is None else moving]
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted)
+            loads = [] if unscaled else self._load_changes(motion, moving)
+            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
             summary.extend(geometry)
             is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
+            if is_right:
+                summary.notes.extend(self._load_notes(loads))
         # Torques beyond the limits of the drives are not reported if the log has an error, since they are a consequence
         # of it, and if the torques agree with the gravity of the URDF: the limits are then placeholders.
         faults = dict[Check[JointEvidence], dict[str, str]]()
@@ -152,20 +156,27 @@ class TorqueLogs:
         return evidence
 
     def _geometry_findings(
-        self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
+        self,
+        samples: Sequence[MotionSamples],
+        evidence: Sequence[JointEvidence],
+        accepted: set[str],
+        loads: Sequence[LoadChange],
     ) -> list[LogError | Diagnostic]:
         """Return the findings about the geometry of the logs.
 
         Recordings whose torques agree are tested together. If they have no errors, each recording that contradicts
-        them is tested by itself; its errors name it, and its warnings are omitted.
+        them, or has another load, is tested by itself; its errors name it, and its warnings are omitted.
 
         Args:
             samples: unfiltered samples, then filtered ones, which are used unless they are too few.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
+            loads: changes of the load between recordings.
         """
-        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 else None
-        deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not loads else None
+        deviating = [change.recording for change in loads]
+        if unfiltered is not None:
+            deviating = deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
         for numbers in (agreeing, *([k] for k in deviating)):
@@ -188,6 +199,37 @@ class TorqueLogs:
                     where = f"trajectory {name}, {error.element}"
                     findings.append(replace(error, file=file, element=where, do=OF_ONE))
         return findings
+
+    def _load_changes(self, motion: MotionSamples, moving: MotionSamples | None) -> list[LoadChange]:
+        """Return the changes of the load between recordings.
+
+        motion: unfiltered samples of all recordings. moving: filtered samples, which are used if they are of all
+        recordings: they show smaller changes.
+        """
+        problem = self._problem(motion)
+        if problem is None or len(self._sources) == 1:
+            return []
+        if moving is not None and len(np.unique(moving.recording)) == len(self._sources):
+            filtered = self._problem(moving)
+            problem = problem if filtered is None else filtered.with_hysteresis()
+        return load_changes(problem)
+
+    def _load_notes(self, loads: Sequence[LoadChange]) -> Iterator[Diagnostic]:
+        """Yield a warning if there are changes of the load between recordings."""
+        masses = []
+        for change in loads:
+            width = 2 * change.deviation
+            text = (
+                f"{change.mass:+.2g} +- {width:.1g} kg" if abs(change.mass) > width else "mass undetermined"
+            )
+            masses.append(f"{self._sources[change.recording][0]} ({text})")
+        if masses:
+            message = (
+                f"recordings with another load than {self._sources[loads[0].reference][0]}: {shortened(masses, 5)}; a "
+                "model that is fitted to all of them is wrong for each: train on the recordings of one load, and adapt "
+                "the model to another load by 'train --from RUN'"
+            )
+            yield Diagnostic("warning", LOADS, "logs", None, message)
 
     def _unscaled_currents(self) -> list[Diagnostic]:
         """Return a warning about logged motor currents whose gain is still 1, as in the draft of a mapping.
@@ -334,11 +376,11 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 
 
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
-    """Yield a warning for each link whose least-squares mass or first moment is beyond 0.4 to 2.5 times the URDF's.
+    """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
     The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference from the URDF must also change the torque of a joint by more than half of this torque's standard
-    deviation, since parameters with a small effect on the torques are uncertain.
+    difference from the URDF must also exceed four standard deviations of the fitted value, and change the torque of a
+    joint by more than half of this torque's standard deviation.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)

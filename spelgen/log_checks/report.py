@@ -227,9 +227,9 @@ def joint_report(
 
 
 def _median(values: np.ndarray, share: float) -> float | None:
-    """Return the median of the finite values of a statistic, one per trajectory.
+    """Return the median of the finite numbers in `values`, one value of a statistic per trajectory.
 
-    None is returned if the fraction of finite values is at most `share`.
+    None is returned if at most the fraction `share` of the values is finite.
     """
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) > share * len(values) else None

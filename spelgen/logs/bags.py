@@ -207,9 +207,9 @@ def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[Sta
 
 
 def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
-    """Yield the encoded joint states on all topics of a bag, which the function `open_bag` of `rosbags` opens.
+    """Yield the encoded joint states on all topics of a bag.
 
-    Raises LogError if there are none.
+    open_bag: function that opens the bag, a reader class of `rosbags`. Raises LogError if the bag has no joint states.
     """
     with open_bag(path) as reader:
         connections = [x for x in reader.connections if x.msgtype == MESSAGE]
@@ -222,10 +222,11 @@ def _read_by(open_bag: Callable[[Path], Any], path: Path) -> Iterator[RawState]:
 
 
 def _of_other_recorders(path: Path, remarks: list[str]) -> list[Path]:
-    """Return all MCAP files of a bag if one of them lacks its end or the profile of ROS 2; [] if none does.
+    """Return all MCAP files of a bag that `rosbags` cannot open; [] if it can open the bag.
 
-    `rosbags` cannot open such a bag, so `_joint_states_in` reads all its files. remarks: list to which a remark on a
-    recorder that was killed is added.
+    `rosbags` cannot open a bag if one of its files was not closed (the end of the file is missing), or does not state
+    the profile "ros2" in its header. `_joint_states_in` reads such files. remarks: list to which a remark is added if
+    a file was not closed.
     """
     files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
     is_closed = is_ros2 = True

@@ -14,6 +14,7 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
+from spelgen.logs.fingerprints import Fingerprints, fingerprint_of
 from spelgen.logs.joint_signals import (
     Advice,
     JointSignals,
@@ -104,7 +105,8 @@ class Findings:
 
         where: trajectory or joints with the fault, for the message. file: path of the log. keys: settings of the group
         `logs` that correct the fault. A fault with such a correction is always an error, so that no model is trained on
-        the log without the correction. is_partial: True if the settings may be wrong for other recordings.
+        the log without the correction. is_partial: True if other recordings lack the fault, so that `keys` may be wrong
+        for them; the advice then includes this condition.
         """
         if not keys and check.severity != "error":
             self.notes.append(Diagnostic(check.severity, check.code, where, None, message))
@@ -190,6 +192,8 @@ CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", fi
 # rows (REPAIRED) or properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
+# This check compares a trajectory with earlier ones: `LogChecks` computes its message.
+REPEATED: Check[Trajectory] = Check("repeated-samples", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
     # Jumps are searched before frozen signals: a velocity in raw register words differs from dq/dt as a frozen signal
     # does, and would otherwise be reported as one.
@@ -258,6 +262,7 @@ class LogChecks:
         self._joints, self._kinds = joints, joint_types
         self._results: dict[tuple[str, AnyCheck], list[tuple[Advice, str, Path | None]]] = {}
         self._count = 0
+        self._fingerprints = Fingerprints()
 
     def add(self, trajectory: Trajectory) -> None:
         """Apply all checks that need no robot to a trajectory, and collect the findings."""
@@ -265,6 +270,12 @@ class LogChecks:
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
         findings += [(REMARKED, Advice(message)) for message in trajectory.remarks]
+        fingerprint = fingerprint_of(trajectory)
+        original = self._fingerprints.original(fingerprint)
+        self._fingerprints.add(trajectory.name, fingerprint)
+        if original:
+            message = f"a quarter or more of its samples are also in trajectory {original}: omit one of both"
+            findings.append((REPEATED, Advice(message)))
         for check, advice in findings:
             self._add(advice.message, check, advice, trajectory)
         products = velocity_products(trajectory)

@@ -92,7 +92,7 @@ def dynamics_samples(
 def long_pieces(trajectory: Trajectory, gap: float) -> list[Trajectory]:
     """Return the gap-free pieces of a trajectory that last at least 1 s.
 
-    gap: a time step longer than this multiple of the median step, and longer than 0.03 s, is a gap.
+    gap: multiple of the median time step. A longer time step is a gap if it is also longer than 0.03 s.
     """
     return [piece for piece in split_at_gaps(trajectory, gap, HOLE) if piece.duration >= SHORTEST]
 

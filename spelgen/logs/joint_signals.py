@@ -111,14 +111,17 @@ class JointSignals(NamedTuple):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the measured signals, of "q", "qd" and "tau", without commands and differentiated velocities."""
+        """Names of the measured signals: the logged ones of "q", "qd" and "tau".
+
+        The result is ("q",) for logs of position commands and for logs without torques.
+        """
         if self.trajectory.u is None and self.trajectory.tau.size:
             return self.trajectory.mapping.quantities
         return ("q",)
 
     @property
     def step(self) -> float:
-        """Median time between samples [s]; 0 for a single sample."""
+        """Median time step between samples [s]; 0 for a single sample."""
         steps = np.diff(self.trajectory.t)
         return float(np.median(steps)) if steps.size else 0.0
 
@@ -211,7 +214,8 @@ class WordReading(NamedTuple):
     Attributes:
         key: setting of the mapping that decodes the signal, "period" or "sign_bit".
         size: value of this setting, in the unit of the log.
-        in_degrees: True if the mapping states no unit, and the size is a number of revolutions in degrees.
+        in_degrees: True if the angle is probably in degrees: the mapping states no unit, and `size` is 360 times a
+            power of two.
     """
 
     key: Decoding

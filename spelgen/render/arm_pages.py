@@ -18,8 +18,7 @@ from spelgen.labels import named_joints
 from spelgen.log_checks.report import LogReport
 from spelgen.logs.trajectory import Trajectory, joined_column, split_at_gaps
 from spelgen.render.arm_section import AnimatedMotion, arm_section, matrix
-from spelgen.render.charts import TUNING
-from spelgen.render.plots import JointRow, Panel, stacks
+from spelgen.render.charts import TUNING, JointRow, Panel, stacks
 from spelgen.templates import render_page
 
 if TYPE_CHECKING:

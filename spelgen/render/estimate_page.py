@@ -10,8 +10,7 @@ from spelgen.fitting.fitted import Fit
 from spelgen.labels import named_joints
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.replay import LogEstimate, payload_sentence
-from spelgen.render.charts import Band, Chart, Line, Mark, line_chart
-from spelgen.render.plots import JointRow, Panel, stacks
+from spelgen.render.charts import Band, Chart, JointRow, Line, Mark, Panel, line_chart, stacks
 from spelgen.templates import render_page
 
 

@@ -12,8 +12,18 @@ from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, NamedJoint, entry_name, named_joints, thousandths
 from spelgen.listing import number
-from spelgen.render.charts import TUNING, Band, Chart, Dots, Line, Mark, line_chart
-from spelgen.render.plots import JointRow, Panel, stacks
+from spelgen.render.charts import (
+    TUNING,
+    Band,
+    Chart,
+    Dots,
+    JointRow,
+    Line,
+    Mark,
+    Panel,
+    line_chart,
+    stacks,
+)
 from spelgen.spec import ModelSpec
 
 

@@ -174,10 +174,6 @@ class Spans:
         self.change_bases = [field.row_basis(change[:, self.order]) for change in changes]
         self.varying = field.row_basis(np.concatenate(self.change_bases))[:, np.argsort(self.order)]
         self.floats = float_samples(arm, assume, 2 * count)
-        # For each joint, echelon bases of the sum of the T_i of all joints nearer the root, and of all joints nearer
-        # the tip, are stored, since `outside` needs them for many sets of joints.
-        self._nearer_root = _sums(self.change_bases)
-        self._nearer_tip = _sums(self.change_bases[::-1])[::-1]
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
@@ -194,14 +190,5 @@ class Spans:
         It is a basis, in the prime field, of the sum of the spans T_i (see the class) of these other joints i. The
         columns are the entries of M in the order of the attribute ``order``.
         """
-        first, last = min(joints), max(joints)
-        between = [self.change_bases[k] for k in range(first, last) if k not in joints]
-        return field.row_basis(np.concatenate([self._nearer_root[first], *between, self._nearer_tip[last]]))
-
-
-def _sums(bases: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return echelon bases, (dimension, entries) each: element k is a basis of the row space of ``bases[:k]``."""
-    sums = [bases[0][:0]]
-    for basis in bases[:-1]:
-        sums.append(field.row_basis(np.concatenate([sums[-1], basis])))
-    return sums
+        others = [basis for k, basis in enumerate(self.change_bases) if k not in joints]
+        return field.row_basis(np.concatenate([self.varying[:0], *others]))

@@ -1,0 +1,64 @@
+"""Fingerprints of recordings, by which copies and parts of a recording are recognized under another name."""
+
+from collections import Counter
+from collections.abc import Collection
+
+import numpy as np
+
+from spelgen.logs.trajectory import Trajectory
+
+SIZE = 32
+"""Number of hashes in a fingerprint. Recordings with a common quarter of their samples share about 8."""
+RUN = 4
+"""Number of consecutive samples from which a hash is computed."""
+
+
+class Fingerprints:
+    """Fingerprints of recordings by name."""
+
+    def __init__(self) -> None:
+        self._recordings: dict[str, Collection[int]] = {}
+        self._names: dict[int, str] = {}
+
+    def add(self, name: str, fingerprint: Collection[int]) -> None:
+        """Add the fingerprint of a recording."""
+        self._recordings[name] = fingerprint
+        for number in fingerprint:
+            self._names.setdefault(number, name)
+
+    def original(self, fingerprint: Collection[int]) -> str | None:
+        """Return the name of an added recording that has a quarter or more of the samples of the shorter recording.
+
+        Return None if there is none. The quarter is estimated from the hashes that both fingerprints contain.
+        """
+        common = Counter(self._names[number] for number in fingerprint if number in self._names)
+        for name, count in common.most_common(1):
+            if 4 * count >= min(len(fingerprint), len(self._recordings[name])):
+                return name
+        return None
+
+
+def fingerprint_of(trajectory: Trajectory) -> list[int]:
+    """Return the `SIZE` smallest hashes of runs of `RUN` consecutive samples in motion, [] without motion.
+
+    A hash depends on the positions, and on the torques or commands, in single precision, and not on the times. Samples
+    at rest are omitted, since two recordings may have equal samples there. A recording that is a part of another one
+    shares a part of its hashes (bottom-k sketch, Broder 1997).
+    """
+    inputs = trajectory.tau if trajectory.u is None else trajectory.u
+    # Zero is added because -0.0 and 0.0 have different bits.
+    values = np.hstack([trajectory.q, inputs]).astype(np.float32) + np.float32(0)
+    hashes = _hashes(values.view(np.uint32).astype(np.uint64))
+    runs = np.lib.stride_tricks.sliding_window_view(hashes, min(RUN, len(hashes)))
+    q = trajectory.q
+    moving = (q[len(q) - len(runs) :] != q[: len(runs)]).any(axis=1)
+    return [int(number) for number in np.unique(_hashes(runs[moving]))[:SIZE]]
+
+
+def _hashes(words: np.ndarray) -> np.ndarray:
+    """Return a hash (T,) of each row of words (T, k), 64-bit unsigned integers (splitmix64 of a weighted sum)."""
+    weights = np.uint64(0x9E3779B97F4A7C15) ** np.arange(1, words.shape[1] + 1, dtype=np.uint64)
+    number = words @ weights
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        number = (number ^ (number >> np.uint64(shift))) * np.uint64(factor)
+    return number ^ (number >> np.uint64(31))
