@@ -166,7 +166,7 @@ def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, res
             for start in range(len(log.t) - samples + 1)
         ]
         windows = joined([cut_windows([each], samples, measured=False) for each in cut])
-        substeps = load_run(job.folder).substeps
+        substeps = load_run(job.folder).checkpoint.substeps
         with torch.no_grad():
             predicted = [x.numpy() for x in roll_out(model, windows, substeps)]
         q, qd = (np.stack([getattr(each, name)[1:] for each in cut]) for name in ("q", "qd"))

@@ -84,10 +84,10 @@ def test_a_saved_fit_is_loaded_as_it_was(tmp_path):
         found.preprocessing,
         found.record,
     )
-    assert (loaded.history, loaded.best_epoch, loaded.substeps) == (
+    assert (loaded.history, loaded.checkpoint.best_epoch, loaded.checkpoint.substeps) == (
         found.history,
-        found.best_epoch,
-        found.substeps,
+        found.checkpoint.best_epoch,
+        found.checkpoint.substeps,
     )
     assert (loaded.status, loaded.folder, found.folder) == (None, folder, None)
     with pytest.raises(RunError, match="there is a run in this folder"):

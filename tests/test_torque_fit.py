@@ -464,6 +464,17 @@ def test_friction_has_the_effects_that_samples_show(emitted, shown):
     assert nmse(found, recorded(true, 10.0, 0.0, seed=9)) < 1e-3
 
 
+@pytest.mark.parametrize(("joints", "used"), [(1, False), (6, True)])
+def test_saturation_is_used_if_several_joints_show_it(emitted, joints, used):
+    """Saturation of friction is used if the joints show it together, and at no joint if a single joint shows it."""
+    module = emitted["six_dof"][0]
+    true, found = drawn(module, seed=2, deviation=0.3), module.Model()
+    true.friction.raw_saturation.data[:joints] += 1.0
+    true.friction.raw_saturation.data[joints:] = NEGLIGIBLE
+    fit_torque(found, [recorded(true, 20.0, 0.02)])
+    assert (found.friction.raw_saturation.exp() > 1e-12).any() == used
+
+
 def test_compensation_belongs_to_the_input(emitted):
     """Friction compensation by a drive is part of the input torque, not of friction."""
     model = drawn(emitted["six_dof"][0], seed=2)

@@ -536,7 +536,7 @@ def test_the_line_search_turns_back_from_numbers_that_blow_up():
 
 def test_the_objective_momentum_predicts_no_windows():
     result, start = (fit(Model(), motions(), MomentumFit(momentum_steps=k, **ADAMW)) for k in (200, 1))
-    assert (result.status, result.epochs, result.steps) == ("finished", 0, 0)
+    assert (result.status, result.epochs, result.checkpoint.step) == ("finished", 0, 0)
     assert result.best_validation < 0.5 * start.best_validation
 
 

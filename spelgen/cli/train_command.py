@@ -153,7 +153,7 @@ def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> Non
     """Print the outcome of the fit; exit with 130 if it was interrupted. payload: payload in the logs, or None."""
     posterior = fit.posterior if fit.checkpoint.posterior else None
     record: dict[str, object] = {"run": str(folder), "status": fit.status, "objective": fit.config.objective}
-    record |= {"steps": fit.steps, "epochs": fit.epochs, "seconds": fit.seconds}
+    record |= {"steps": fit.checkpoint.step, "epochs": fit.epochs, "seconds": fit.checkpoint.seconds}
     # The loss of a diverged rollout is infinite. JSON has no infinity, so it is written as null.
     record["validation_loss"] = fit.best_validation if math.isfinite(fit.best_validation) else None
     record["torque_nmse"] = fit.torque_nmse
@@ -177,8 +177,8 @@ def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> Non
 
 def _outcome(fit: Fit) -> tuple[str, str]:
     """Return two sentences for the terminal: the status of a fit with its reason, and the result of the fit."""
-    config, result = fit.config, fit.result
-    reason = ""
+    config, result, reason = fit.config, fit.result, ""
+    progress = fit.checkpoint
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
     # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
@@ -189,14 +189,14 @@ def _outcome(fit: Fit) -> tuple[str, str]:
         if summary is not None:
             result = summary.text
         elif not fit.record.validation_windows:
-            result = f"{fit.steps} steps were taken"
-        return f"{fit.status}: {config.objective} fitted in {fit.seconds:.0f} s{reason}", result
+            result = f"{progress.step} steps were taken"
+        return f"{fit.status}: {config.objective} fitted in {progress.seconds:.0f} s{reason}", result
     if fit.status == "stopped early":
-        reason = f": no better validation loss since epoch {fit.best_epoch}"
+        reason = f": no better validation loss since epoch {progress.best_epoch}"
     elif fit.status == "finished":
         reason = ": all epochs are run" if fit.epochs >= config.epochs else ": no way further down"
-    end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {fit.steps} steps, {fit.seconds:.0f} s{reason}"
-    return end, f"best {result}, at epoch {fit.best_epoch}"
+    end = f"{fit.status} after {counted(fit.epochs, 'epoch')}, {progress.step} steps, {progress.seconds:.0f} s{reason}"
+    return end, f"best {result}, at epoch {progress.best_epoch}"
 
 
 def _default_folder(module: Path | None, source: Path | None, *, resume: bool) -> Path:

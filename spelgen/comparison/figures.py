@@ -66,7 +66,7 @@ def simulated_figures(
     truth: URDF with the true parameters of the arm. training: logs for the training loss and the duration of a step.
     testing: logs for all other results.
     """
-    model, substeps = fit.model, int(fit.substeps)
+    model, substeps = fit.model, int(fit.checkpoint.substeps)
     decimation = fit.preprocessing.decimation or 1
     config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))

@@ -79,16 +79,6 @@ class Fit:
         return self.checkpoint.epoch
 
     @property
-    def steps(self) -> int:
-        """Number of optimizer steps on windows in the fit."""
-        return self.checkpoint.step
-
-    @property
-    def best_epoch(self) -> int:
-        """Number of the epoch with the lowest validation loss; 0: the model before the first epoch was best."""
-        return self.checkpoint.best_epoch
-
-    @property
     def best_validation(self) -> float:
         """Lowest validation loss: `rollout_loss`; for position servos, RMS position error [rad, m]."""
         return self.checkpoint.best_loss
@@ -113,16 +103,6 @@ class Fit:
         return (
             f"torque nMSE {mean:.3g}, at worst {nmse[worst]:.3g} ({worst}), of the samples that were fitted"
         )
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the fit [s]."""
-        return self.checkpoint.seconds
-
-    @property
-    def substeps(self) -> int:
-        """Number of rk4 steps per sample interval that makes the integration error of rollouts small."""
-        return self.checkpoint.substeps
 
     @property
     def parameters(self) -> int:

@@ -69,7 +69,7 @@ def _rendered(fit: Fit, run: RunFolder, robot: Path | str | None) -> str:
         picture = arm_section(arm.chain, Path(robot or arm.robot.path), evaluated_motions(traces))
         cells = matrix(arm.chain, derive(arm.chain, spec.options.assume))
     if fit.history:
-        losses = loss_chart(fit.history, fit.best_epoch)
+        losses = loss_chart(fit.history, fit.checkpoint.best_epoch)
     posterior = fit.posterior if fit.checkpoint.posterior is not None else None
     joints = named_joints(spec.joint_names, spec.joint_types)
     return render_page(

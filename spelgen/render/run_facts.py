@@ -56,7 +56,8 @@ def training_facts(fit: Fit) -> dict[str, str]:
     # Only fits with epochs have metrics; fits to torques have none.
     if fit.history:
         last = fit.history[-1]
-        origin = f"epoch {fit.best_epoch}" if fit.best_epoch else "the start: no epoch was better"
+        best = fit.checkpoint.best_epoch
+        origin = f"epoch {best}" if best else "the start: no epoch was better"
         facts["length"] = f"{last['epoch']} epochs, {last['step']:,} steps, {duration(last['seconds'])}"
         facts["kept"] = f"the model of {origin}, validation loss {number(last['best'])}"
         if record.options.get("solver", "rk4") == "rk4":

@@ -21,9 +21,6 @@ from spelgen.fitting.torque.selection import (
 )
 from spelgen.fitting.torque.tuning import TUNING
 
-EFFECT_GROUPS = ("effects", "load_dependence")
-"""Groups of the Stribeck effect, saturation and load dependence of friction, which not every joint has."""
-
 
 def initial_fit(problem: TorqueProblem) -> TorqueEstimate:
     """Fit the free parameters from the prior mean; return the MAP estimate.
@@ -166,17 +163,23 @@ def _smaller_in_most_blocks(residual: torch.Tensor, reference: torch.Tensor) -> 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose the joints with Stribeck effect, saturation and load dependence of friction; return the new estimate.
 
-    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. The effects
-    are removed at joints at which they do not improve Akaike's criterion with one parameter (see `_rejected`).
+    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. An effect has
+    to improve Akaike's criterion with one parameter. Saturation is tested first, at all joints together: the evidence
+    of each joint is limited to strong evidence, since saturation may explain another error of the model at one joint,
+    and would extrapolate this error to other speeds. Then all effects are tested (see `_rejected`).
     """
+    # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
+    penalty, limit = 2.0, TUNING.strong_evidence
     rigid = estimate.problem.jacobian.rigid
     index = rigid.unflatten(torch.arange(len(estimate.state.x)))
-    effects = torch.stack(
-        [index[name] for name in rigid.names(*EFFECT_GROUPS)], dim=-1
-    )  # effects: (n, effects), indices of the coefficients in x
+    unsaturated = _without(estimate, index["friction.raw_saturation"])
+    evidence = log_likelihood_ratio(estimate, unsaturated) - penalty
+    if evidence.clamp(-limit, limit).sum() < 0:
+        estimate = unsaturated
+    # effects: (n, effects), indices of the coefficients in x
+    effects = torch.stack([index[name] for name in rigid.names("effects", "load_dependence")], dim=-1)
     plain = _without(estimate, effects.flatten())
-    # 2 is the penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
-    rejected = _rejected(log_likelihood_ratio(estimate, plain) - 2)
+    rejected = _rejected(log_likelihood_ratio(estimate, plain) - penalty)
     if rejected.all():
         return plain
     return _without(estimate, effects[rejected].flatten()) if rejected.any() else estimate
