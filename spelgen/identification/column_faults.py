@@ -17,6 +17,10 @@ from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
+GIVE_GEAR = (
+    "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
+    "the gear ratio"
+)
 
 
 class WrongOrder(Fault):
@@ -150,8 +154,13 @@ class WrongScale(Fault):
         if motion < 0:
             keys["sign"] = -present.sign
         if abs(motion) != 1:
-            unit = position_unit(correction, joint)
+            unit = position_unit(correction, joint) or "counts"
             units = {"q": unit, "qd": f"{unit}/s"}
+            if unit == "counts":
+                ratio = 1 / abs(float(correction.hypothesis.scale[0, joint]))
+                is_turning = correction.arm.joint_types[joint] == "revolute"
+                key, turn = ("counts_per_turn", 2 * np.pi) if is_turning else ("counts_per_metre", 1.0)
+                keys[key] = plain_number(turn * ratio)
         gain = torque * np.sign(motion)
         if correction.mapping.unit("tau", name) == "mNm" and np.isclose(abs(gain), 1e3):
             units["tau"] = "Nm"
@@ -345,10 +354,76 @@ def rounded_factor(factor: float) -> float:
 
 
 class PositionUnit(WrongScale):
-    """Kind of fault of a log: positions of all revolute or all prismatic joints in another unit than in the mapping."""
+    """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
+
+    The unit of all joints of a type is one of `UNITS`. The factor of a single joint is optimised, since its positions
+    may be those of its motor, before a gear of any ratio.
+    """
 
     code = "joint-unit"
     rarity = 2
+    is_optimised = True
+
+    def __init__(
+        self, factors: Sequence[np.ndarray], joints: Sequence[int] = (), open_fault: PositionUnit | None = None
+    ) -> None:
+        """Define the candidates for other units of the positions of n joints.
+
+        Args:
+            factors: candidates for the factors of all joints of a type, (2, n) each.
+            joints: indices of the joints whose factor is also optimised separately.
+            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
+                a fault, and no setting is advised for it.
+        """
+        super().__init__(factors)
+        self._joints, self._open_fault = joints, open_fault
+        self.advice = "" if open_fault else GIVE_GEAR
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with other units of all joints, and with the best factor of each single joint.
+
+        The factor of a joint whose unit `base` already changes remains.
+        """
+        yield from super().fits(problem, base)
+        for k in self._joints:
+            if abs(base.hypothesis.scale[0, k]) == abs(problem.unchanged.scale[0, k]):
+                yield self._single(problem, base, k)
+
+    def _single(self, problem: GeometryProblem, base: HypothesisFit, joint: int) -> HypothesisFit:
+        """Return the least-squares fit with the best factor on the positions of one joint.
+
+        A unit in `UNITS` is preferred if its cost is about equal. Other factors are rounded to three digits.
+        """
+        scale, present = base.hypothesis.scale, abs(float(problem.unchanged.scale[0, joint]))
+        span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joint]))
+
+        def fitted(exponent: float, form: tuple[int, int, int], fault: PositionUnit = self) -> HypothesisFit:
+            factors, (sense, torque_sense, power) = np.ones_like(scale), form
+            factors[:, joint] = sense * np.exp(exponent), torque_sense * np.exp(-power * exponent)
+            return problem.fit(base.hypothesis.changed(fault, scale=scale * factors))
+
+        # Forms (sense of the motion, sense of the torque, power): the torque of the joint (power 0), of either sense
+        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        forms = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
+        # the motion ranges over at least 0.05 rad or m, and at most two turns
+        exponents = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
+        costs = np.array([[fitted(x, form).cost for form in forms] for x in exponents])
+        row, column = np.unravel_index(costs.argmin(), costs.shape)
+        form, start = forms[column], float(exponents[row])
+        best = minimize_scalar(
+            lambda x: fitted(x, form).cost,
+            bounds=(start - 0.15, start + 0.15), method="bounded", options={"xatol": 0.002},
+        )  # fmt: skip
+        # The factor is undetermined if a factor that is 10 % larger or smaller explains the log about equally well, or
+        # if another form does.
+        sides = [fitted(best.x + change, form).cost for change in (-0.1, 0.1)]
+        sides += np.delete(costs.min(axis=0) - GEOMETRY.ambiguous + GEOMETRY.right_angle, column).tolist()
+        fault = self if min(sides) > best.fun + GEOMETRY.right_angle else self._open_fault or self
+        known = [np.log(SCALES.get(x, 1.0) / present) for x in UNITS[problem.arm.joint_types[joint]]]
+        unit = fitted(min(known, key=lambda x: abs(x - best.x)), form, fault)
+        if unit.cost < best.fun + GEOMETRY.right_angle:
+            return unit
+        return fitted(-np.log(float(f"{np.exp(-best.x) / present:.3g}") * present), form, fault)
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
@@ -358,9 +433,14 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with the name of the unit in `correction`."""
-        joints = np.flatnonzero(self.has(*correction.factors)).tolist()
-        return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
+        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        motion, torque = correction.factors
+        texts = []
+        for k in np.flatnonzero(self.has(motion, torque)).tolist():
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            gear = f"about {abs(1 / motion[k]):.3g} times as large as the joint's{sense}, as at the motor of a gear"
+            texts.append(f"positions in {unit}{sense}" if unit else f"positions {gear}")
+        return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
@@ -381,11 +461,11 @@ def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
     return candidates
 
 
-def position_unit(correction: Correction, joint: int) -> str:
+def position_unit(correction: Correction, joint: int) -> str | None:
     """Return the unit, such as "deg", that a hypothesis about a log assumes for the positions of a joint.
 
-    It is the unit whose factor to SI units is nearest to the scale of the positions in the hypothesis.
+    None is returned for a scale of the positions that is no unit in `UNITS`.
     """
     scale = abs(float(correction.hypothesis.scale[0, joint]))
-    units = UNITS[correction.arm.coordinates[joint].joint_type]
-    return min(units, key=lambda unit: abs(np.log(scale / SCALES.get(unit, 1.0))))
+    units = UNITS[correction.arm.joint_types[joint]]
+    return next((unit for unit in units if np.isclose(scale, SCALES.get(unit, 1.0))), None)

@@ -29,12 +29,18 @@ RANK = attrgetter("rank")
 
 
 def kinds_of_faults(
-    arm: Chain, torque_unit: TorqueUnit | None = None, position_scale: np.ndarray | None = None
+    arm: Chain,
+    torque_unit: TorqueUnit | None = None,
+    position_scale: np.ndarray | None = None,
+    unscaled: Sequence[int] = (),
 ) -> tuple[Fault, ...]:
     """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
 
-    torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
-    logged positions to SI units; None: the unit of positions is right.
+    Args:
+        arm: the arm.
+        torque_unit: candidates for another unit of the torques; None: the unit is right.
+        position_scale: (n,) factor from logged positions to SI units; None: the unit of positions is right.
+        unscaled: indices of joints whose positions may have a factor of their own.
     """
     n, units = len(arm.coordinates), [] if position_scale is None else position_factors(arm, position_scale)
     return (
@@ -45,7 +51,7 @@ def kinds_of_faults(
         WrongOrder("motion-order", "the positions and velocities of other joints", (0,), starts=3),
         JointSense(n),
         TorqueSense(n),
-        PositionUnit(units),
+        PositionUnit(units, unscaled, PositionUnit([])),
         *([] if torque_unit is None else [torque_unit]),
         ZeroOffset(),
         Delay(),

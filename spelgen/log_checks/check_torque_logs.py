@@ -106,7 +106,8 @@ class TorqueLogs:
         completed = [joint.report for joint in evidence]
         # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
         # hints.
-        is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        guessed = [k for k, x in enumerate(self._arm.chain.joint_names) if x in summary.guessed]
+        is_sound = len(summary.errors) <= bool(guessed) and not any(x.code == WRONG_VELOCITY for x in summary.notes)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
@@ -118,7 +119,11 @@ class TorqueLogs:
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
             samples = [motion, motion if moving is None else moving]
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted)
+            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, guessed)
+            if guessed:
+                # The torques may show the unit, and then the error that the unit is unknown is replaced.
+                geometry = [x for x in geometry if isinstance(x, LogError)] or list(summary.errors)
+                summary.errors.clear()
             summary.extend(geometry)
             is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
@@ -152,7 +157,11 @@ class TorqueLogs:
         return evidence
 
     def _geometry_findings(
-        self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
+        self,
+        samples: Sequence[MotionSamples],
+        evidence: Sequence[JointEvidence],
+        accepted: set[str],
+        guessed: Sequence[int] = (),
     ) -> list[LogError | Diagnostic]:
         """Return the findings about the geometry of the logs.
 
@@ -163,8 +172,9 @@ class TorqueLogs:
             samples: unfiltered samples, then filtered ones, which are used unless they are too few.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
+            guessed: indices of joints with positions in an unknown unit, which contradict the model in all recordings.
         """
-        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 else None
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not guessed else None
         deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
@@ -176,7 +186,7 @@ class TorqueLogs:
                 continue
             joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
             flat = FlatTops.joined([self._flat[k] for k in numbers])
-            results = list(self._findings(problem, flat, joints, accepted))
+            results = list(self._findings(problem, flat, joints, accepted, guessed))
             if numbers is agreeing:
                 findings += results
                 if any(isinstance(x, LogError) for x in results):
@@ -223,7 +233,12 @@ class TorqueLogs:
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
 
     def _findings(
-        self, problem: GeometryProblem, flat: FlatTops, evidence: Sequence[JointEvidence], accepted: set[str]
+        self,
+        problem: GeometryProblem,
+        flat: FlatTops,
+        evidence: Sequence[JointEvidence],
+        accepted: set[str],
+        guessed: Sequence[int],
     ) -> Iterator[LogError | Diagnostic]:
         """Yield the findings about the geometry of recordings, in the order of the tests.
 
@@ -236,6 +251,7 @@ class TorqueLogs:
             flat: extreme values at which positions and torques are constant.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
+            guessed: indices of joints with positions in an unknown unit.
         """
         motion = problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
@@ -248,15 +264,16 @@ class TorqueLogs:
             )
             yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
             return
-        wrong: Sequence[SpelgenError] = find_unsigned(problem) if UNSIGNED not in accepted else []
-        if not wrong:
+        # Positions in a wrong unit contradict all torques, so that their signs and limits are not tested.
+        wrong: Sequence[SpelgenError] = find_unsigned(problem) if not guessed and UNSIGNED not in accepted else []
+        if not wrong and not guessed:
             limits = find_limits(problem, flat)
             yield from limits.notes
             wrong = limits.errors if CLIPPED not in accepted else []
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
-        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem, guessed))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
@@ -276,7 +293,9 @@ class TorqueLogs:
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
-    def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
+    def _faults(
+        self, evidence: Sequence[JointEvidence], problem: GeometryProblem, guessed: Sequence[int]
+    ) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
         The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
@@ -295,7 +314,12 @@ class TorqueLogs:
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
         scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
+        # `wide`: joints whose motion is too large for their limits, or for a joint without limits
+        width = [high - low for x in evidence for low, high in [x.limits()]]
+        span = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0)
+        is_wide = (span > np.minimum(width, 4 * np.pi)) & (np.array(width) > 0)
+        wide = [] if scale is None else sorted({*guessed, *np.flatnonzero(is_wide).tolist()})
+        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale, wide)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

@@ -80,7 +80,18 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
-    if distance > log(1.25):
+    is_known, gear = _knows_ratio(signals), abs(signals.factor)
+    # The ratio of dq/dt to qd is more exact than a factor of 1.25 if both are closely correlated.
+    tolerance = 0.06 + (1 - signals.correlation**2) if is_known and is_far else log(1.25)
+    if distance > tolerance and is_known and is_far and np.abs(signals.q).max() < TURNS * gear:
+        logged = mapping.joint(joint)
+        keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
+        # The setting `sign` of a motor of the opposite sense also reverses the velocity and the torque, which are right.
+        is_opposite = signals.factor < 0
+        keys |= {"sign": -logged.sign, "gain": -(logged.gain or 1.0)} if is_opposite else {}
+        message = f"q that changes {signals.factor:.3g} times as fast as qd, as at the motor of a gear"
+        return Advice(message, keys, {"velocity": "differentiated"} if is_opposite else {})
+    if distance > tolerance:
         registers = signals.qd / mapping.scale("qd", joint)
         if is_far or not (registers == registers.round()).all():
             return message if is_far else None
@@ -90,12 +101,15 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # The unit advised for q also applies to commands, unless the commands move much less than q: they are then SI.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
-    return Advice(f"{message}: {units}", keys) if keys else None
+    # The range of positions does not distinguish degrees from the motion of a motor before a gear; a ratio to the
+    # velocities that differs from 1 does.
+    is_guess = is_far and not (is_known and gear > 1.25)
+    return Advice(f"{message}: {units}", keys, is_guess=is_guess) if keys else None
 
 
 def _knows_ratio(signals: JointSignals) -> bool:
     """Return True if velocities qd were logged and are proportional to dq/dt: the ratio qd : dq/dt then shows units."""
-    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
@@ -122,7 +136,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     for unit in positions if stated and is_known and largest < 0.1 else ():
         ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
         if 0.5 < largest * ratio < TURNS:
-            yield abs(log(signals.factor * ratio)) + 0.01, {"units": {"q": unit}}
+            yield abs(log(abs(signals.factor) * ratio)) + 0.01, {"units": {"q": unit}}
     if stated:
         positions = positions[:1]
     elif is_far and (signals.is_whole or not is_known):
@@ -134,12 +148,12 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         if scale < min(smallest, 1.0):
             continue
         units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
-        distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
+        distance = abs(log(abs(signals.factor) * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
         if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
         if 2 * np.pi / counts >= smallest:
-            distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
+            distance = abs(log(abs(signals.factor) * 2 * np.pi / counts)) + 0.02
             yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
 
 
