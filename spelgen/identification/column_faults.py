@@ -365,7 +365,10 @@ class PositionUnit(WrongScale):
     is_optimised = True
 
     def __init__(
-        self, factors: Sequence[np.ndarray], joints: Sequence[int] = (), open_fault: PositionUnit | None = None
+        self,
+        factors: Sequence[np.ndarray],
+        joints: Sequence[int] = (),
+        open_fault: PositionUnit | None = None,
     ) -> None:
         """Define the candidates for other units of the positions of n joints.
 

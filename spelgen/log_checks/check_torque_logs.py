@@ -12,7 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError
-from spelgen.identification.column_faults import UNITS, TorqueUnit
+from spelgen.identification.column_faults import UNITS, PositionUnit, TorqueUnit, position_factors
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
@@ -70,6 +70,7 @@ class TorqueLogs:
         self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
+        self._guessed: set[str] = set()
         self._sources: list[tuple[str, Path | None]] = []
 
     def add(self, trajectory: Trajectory) -> None:
@@ -106,8 +107,11 @@ class TorqueLogs:
         completed = [joint.report for joint in evidence]
         # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
         # hints.
-        guessed = [k for k, x in enumerate(self._arm.chain.joint_names) if x in summary.guessed]
-        is_sound = len(summary.errors) <= bool(guessed) and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
+        self._guessed = summary.guessed
+        is_sound = len(summary.errors) <= bool(self._guessed) and not any(
+            x.code == WRONG_VELOCITY for x in summary.notes
+        )
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
@@ -119,9 +123,8 @@ class TorqueLogs:
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
             samples = [motion, motion if moving is None else moving]
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, guessed)
-            if guessed:
-                # The torques may show the unit, and then the error that the unit is unknown is replaced.
+            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted)
+            if self._guessed:
                 geometry = [x for x in geometry if isinstance(x, LogError)] or list(summary.errors)
                 summary.errors.clear()
             summary.extend(geometry)
@@ -157,11 +160,7 @@ class TorqueLogs:
         return evidence
 
     def _geometry_findings(
-        self,
-        samples: Sequence[MotionSamples],
-        evidence: Sequence[JointEvidence],
-        accepted: set[str],
-        guessed: Sequence[int] = (),
+        self, samples: Sequence[MotionSamples], evidence: Sequence[JointEvidence], accepted: set[str]
     ) -> list[LogError | Diagnostic]:
         """Return the findings about the geometry of the logs.
 
@@ -172,9 +171,8 @@ class TorqueLogs:
             samples: unfiltered samples, then filtered ones, which are used unless they are too few.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
-            guessed: indices of joints with positions in an unknown unit, which contradict the model in all recordings.
         """
-        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not guessed else None
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not self._guessed else None
         deviating = [] if unfiltered is None else deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
@@ -186,7 +184,7 @@ class TorqueLogs:
                 continue
             joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
             flat = FlatTops.joined([self._flat[k] for k in numbers])
-            results = list(self._findings(problem, flat, joints, accepted, guessed))
+            results = list(self._findings(problem, flat, joints, accepted))
             if numbers is agreeing:
                 findings += results
                 if any(isinstance(x, LogError) for x in results):
@@ -233,12 +231,7 @@ class TorqueLogs:
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
 
     def _findings(
-        self,
-        problem: GeometryProblem,
-        flat: FlatTops,
-        evidence: Sequence[JointEvidence],
-        accepted: set[str],
-        guessed: Sequence[int],
+        self, problem: GeometryProblem, flat: FlatTops, evidence: Sequence[JointEvidence], accepted: set[str]
     ) -> Iterator[LogError | Diagnostic]:
         """Yield the findings about the geometry of recordings, in the order of the tests.
 
@@ -251,7 +244,6 @@ class TorqueLogs:
             flat: extreme values at which positions and torques are constant.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
-            guessed: indices of joints with positions in an unknown unit.
         """
         motion = problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
@@ -265,15 +257,17 @@ class TorqueLogs:
             yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
             return
         # Positions in a wrong unit contradict all torques, so that their signs and limits are not tested.
-        wrong: Sequence[SpelgenError] = find_unsigned(problem) if not guessed and UNSIGNED not in accepted else []
-        if not wrong and not guessed:
+        wrong: Sequence[SpelgenError] = (
+            find_unsigned(problem) if not self._guessed and UNSIGNED not in accepted else []
+        )
+        if not wrong and not self._guessed:
             limits = find_limits(problem, flat)
             yield from limits.notes
             wrong = limits.errors if CLIPPED not in accepted else []
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
-        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem, guessed))
+        unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
@@ -293,9 +287,7 @@ class TorqueLogs:
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
-    def _faults(
-        self, evidence: Sequence[JointEvidence], problem: GeometryProblem, guessed: Sequence[int]
-    ) -> tuple[Fault, ...]:
+    def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
         The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
@@ -313,13 +305,20 @@ class TorqueLogs:
         # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
-        scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
-        # `wide`: joints whose motion is too large for their limits, or for a joint without limits
-        width = [high - low for x in evidence for low, high in [x.limits()]]
-        span = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0)
-        is_wide = (span > np.minimum(width, 4 * np.pi)) & (np.array(width) > 0)
-        wide = [] if scale is None else sorted({*guessed, *np.flatnonzero(is_wide).tolist()})
-        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale, wide)
+        torque_unit = TorqueUnit(factors, is_open, is_milli)
+        if not motion <= {(None, None), *stated}:
+            return kinds_of_faults(problem.arm, [torque_unit])
+        # The unit of a single joint is tested if its motion is larger than its limits, or than two turns.
+        width = np.array(
+            [
+                min(high - low, 4 * np.pi) if high > low else np.inf
+                for low, high in (x.limits() for x in evidence)
+            ]
+        )
+        is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
+        wide = [k for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        units = position_factors(problem.arm, problem.unchanged.scale[0])
+        return kinds_of_faults(problem.arm, [PositionUnit(units, wide, PositionUnit([])), torque_unit])
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

@@ -80,18 +80,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
-    is_known, gear = _knows_ratio(signals), abs(signals.factor)
-    # The ratio of dq/dt to qd is more exact than a factor of 1.25 if both are closely correlated.
-    tolerance = 0.06 + (1 - signals.correlation**2) if is_known and is_far else log(1.25)
-    if distance > tolerance and is_known and is_far and np.abs(signals.q).max() < TURNS * gear:
-        logged = mapping.joint(joint)
-        keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
-        # The setting `sign` of a motor of the opposite sense also reverses the velocity and the torque, which are right.
-        is_opposite = signals.factor < 0
-        keys |= {"sign": -logged.sign, "gain": -(logged.gain or 1.0)} if is_opposite else {}
-        message = f"q that changes {signals.factor:.3g} times as fast as qd, as at the motor of a gear"
-        return Advice(message, keys, {"velocity": "differentiated"} if is_opposite else {})
-    if distance > tolerance:
+    if distance > log(1.25):
         registers = signals.qd / mapping.scale("qd", joint)
         if is_far or not (registers == registers.round()).all():
             return message if is_far else None
@@ -103,8 +92,9 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     # The range of positions does not distinguish degrees from the motion of a motor before a gear; a ratio to the
     # velocities that differs from 1 does.
-    is_guess = is_far and not (is_known and gear > 1.25)
-    return Advice(f"{message}: {units}", keys, is_guess=is_guess) if keys else None
+    is_guess = is_far and not (_knows_ratio(signals) and abs(signals.factor) > 1.25)
+    of_log = {"velocity": "differentiated"} if "sign" in keys else {}
+    return Advice(f"{message}: {units}", keys, of_log, is_guess) if keys else None
 
 
 def _knows_ratio(signals: JointSignals) -> bool:
@@ -151,7 +141,16 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         distance = abs(log(abs(signals.factor) * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
         if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
-    for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
+    gear = abs(signals.factor)
+    if is_far and is_known and not signals.is_whole and np.abs(signals.q).max() < TURNS * gear:
+        # Any other ratio is possible at the motor of a gear. The correlation shows how exact the measured ratio is.
+        keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
+        if signals.factor < 0:
+            # The setting `sign` also reverses the torque, which is assumed to have the sense of the velocity.
+            keys |= {"sign": -mapping.joint(joint).sign, "gain": -(mapping.joint(joint).gain or 1.0)}
+        yield 0.05 + 1 - signals.correlation**2, keys
+    is_encoder = is_known and "turns" in positions and (signals.is_whole or not is_far)
+    for counts in (2 ** np.arange(10, 21)).tolist() if is_encoder else ():
         if 2 * np.pi / counts >= smallest:
             distance = abs(log(abs(signals.factor) * 2 * np.pi / counts)) + 0.02
             yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
