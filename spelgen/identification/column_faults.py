@@ -245,8 +245,7 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
-        yielded, too.
+        The fits with separate factors of the joints are yielded, too.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -258,8 +257,6 @@ class TorqueUnit(WrongScale):
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
-        if not candidates:
-            return
         for factor in candidates:
             # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
             # is inexact because the masses of the URDF are.
@@ -268,36 +265,49 @@ class TorqueUnit(WrongScale):
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
         fits = list(self._scaled_by(scales, problem, base))
         yield from fits
-        if is_found:
-            return
-        best = lowest = min(fits, key=lambda fit: fit.cost)
-        # The torque factors are optimised for one joint after the other: the dynamic coupling of the joints determines
-        # their ratios. Then a common factor of all joints is optimised, which the masses of the URDF determine.
-        for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
-            exponent = minimize_scalar(
-                lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
-                bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
-            ).x  # fmt: skip
-            best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # Separate factors of the joints are accepted under three conditions. They also correct errors of the URDF's
-        # masses, which lowers the cost a little: (1) therefore at least one factor must be large enough for another
-        # unit, and (2) the cost must decrease significantly, below the other candidates and below the present units,
-        # although each factor is rare. (3) The relative residual of each joint must be small, since no factor explains
-        # torques with another fault, such as a lost sign.
-        is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
-        is_explained = best.errors.max() <= GEOMETRY.unexplained
-        decrease = min(lowest.cost, base.cost) - best.cost
-        if is_unit and is_explained and decrease > GEOMETRY.needed + self.rarity * is_open.sum():
-            yield best
+        if not is_found:
+            yield from self._separate(problem, min((base, *fits), key=lambda fit: fit.cost), base)
 
-    def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
+    def _separate(
+        self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit
+    ) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The product of `factors` and the correction factors in `fit` is rounded to two digits before the fit.
+        The factors are those of a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. They are therefore accepted only if (1) the cost falls significantly, although each factor is rare, (2)
+        each factor is determined, and (3) the relative residual of each joint is small.
         """
-        (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
-        rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
-        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
+        present, scale = base.hypothesis, base.hypothesis.scale
+        tau = present.signals(problem.samples).tau
+        torque = problem.residual(present, problem.with_free_gains().fit(present).parameters) + tau
+        products = (torque * tau).sum(axis=0)
+        gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
+        common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
+        is_free = self._is_open & (gains > 0)
+        is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
+
+        def fitted(factors: np.ndarray) -> HypothesisFit:
+            rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
+            return problem.fit(present.changed(self, scale=rounded))
+
+        for factors, changed in (
+            (single, is_other),
+            (gains, is_free & (is_other.any() | is_other_unit(common))),
+        ):
+            if not changed.any() or not (changed | (factors == 1)).all():
+                continue
+            fit = fitted(factors)
+            # A factor is determined if factors of another unit fit worse; errors of masses are as large as this bound.
+            steps = [
+                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
+            ]
+            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
+            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
+            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+                lowest = fit
+                yield fit
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
