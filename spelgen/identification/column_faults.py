@@ -273,7 +273,7 @@ class TorqueUnit(WrongScale):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The factors are those of a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
         the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. They are therefore accepted only if (1) the cost falls significantly, although each factor is rare, (2)
         each factor is determined, and (3) the relative residual of each joint is small.
@@ -367,7 +367,7 @@ class PositionUnit(WrongScale):
     """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
 
     The unit of all joints of a type is one of `UNITS`. The factor of a single joint is optimised, since its positions
-    may be those of its motor, before a gear of any ratio.
+    may be the positions of its motor, before a gear of any ratio.
     """
 
     code = "joint-unit"
@@ -432,8 +432,8 @@ class PositionUnit(WrongScale):
         sides = [fitted(best.x + change, form).cost for change in (-0.1, 0.1)]
         sides += np.delete(costs.min(axis=0) - GEOMETRY.ambiguous + GEOMETRY.right_angle, column).tolist()
         fault = self if min(sides) > best.fun + GEOMETRY.right_angle else self._open_fault or self
-        known = [np.log(SCALES.get(x, 1.0) / present) for x in UNITS[problem.arm.joint_types[joint]]]
-        unit = fitted(min(known, key=lambda x: abs(x - best.x)), form, fault)
+        exact = [np.log(SCALES.get(x, 1.0) / present) for x in UNITS[problem.arm.joint_types[joint]]]
+        unit = fitted(min(exact, key=lambda x: abs(x - best.x)), form, fault)
         if unit.cost < best.fun + GEOMETRY.right_angle:
             return unit
         return fitted(-np.log(float(f"{np.exp(-best.x) / present:.3g}") * present), form, fault)
