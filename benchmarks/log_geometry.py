@@ -37,7 +37,7 @@ from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.identification.column_faults import position_factors
+from spelgen.identification.column_faults import PositionUnit, position_factors
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
@@ -150,7 +150,8 @@ def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
 
 def compared(problem: GeometryProblem) -> list[HypothesisFit]:
     """Return the readings of a log that explain its torques better than the unchanged one, the best first."""
-    faults = kinds_of_faults(problem.arm, position_scale=problem.unchanged.scale[0])
+    units = [PositionUnit(position_factors(problem.arm, problem.unchanged.scale[0]))]
+    faults = kinds_of_faults(problem.arm, units)
     return list(compare_hypotheses(problem, faults)[1:])
 
 

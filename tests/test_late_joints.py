@@ -156,3 +156,30 @@ def test_a_wrong_unit_of_a_prismatic_joint_is_named(robots, stated, logged):
     mapping = LogMapping.model_validate({"joints": {"joint2": {"units": {"q": stated, "qd": f"{stated}/s"}}}})
     error = told(rpr, replace(log, q=log.q * factor, qd=log.qd * factor, mapping=mapping), mapping)
     assert f"'joints: {{joint2: {{units: {{q: {logged}, qd: {logged}/s}}}}}}'" in error
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize(("ratio", "is_motor_torque"), [(50.0, False), (-101.0, True)])
+def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_torque, tmp_path):  # noqa: F811
+    """Positions and velocities of one motor before its gear are no degrees: the line has the ratio of the gear."""
+    log = recorded(arm, 15, noise=0.01)
+    factors = np.where(np.arange(log.q.shape[1]) == 1, ratio, 1.0)
+    tau = log.tau / (factors if is_motor_torque else 1.0)
+    wrong = replace(log, q=log.q * factors, qd=log.qd * factors, tau=tau)
+    error = told(arm, wrong)
+    assert "--accept joint-unit" in error and "deg" not in error.partition("write")[2]
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    again, (read,) = mended(arm, error, tmp_path / "log.csv")
+    assert np.abs(read.q - log.q).max() < 0.02 * np.ptp(log.q[:, 1])
+    assert np.allclose(read.tau, log.tau, rtol=0.02)
+    assert check_logs([read], again).errors == ()
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # noqa: F811
+    """The ratios of the advised gains are exact, since the dynamic coupling of the joints determines them."""
+    log, gains = recorded(arm, 16, noise=0.01), np.array([1.3, 0.02, 0.4, 0.006])
+    error = told(arm, replace(log, tau=log.tau / gains))
+    assert "--accept torque-unit" in error
+    found = np.array([float(x) for x in re.findall(r"gain: ([\d.e-]+)", error)])
+    assert np.ptp(np.log(found / gains)) < 0.3

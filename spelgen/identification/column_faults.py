@@ -17,6 +17,10 @@ from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
+GIVE_GEAR = (
+    "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
+    "the gear ratio"
+)
 
 
 class WrongOrder(Fault):
@@ -150,8 +154,13 @@ class WrongScale(Fault):
         if motion < 0:
             keys["sign"] = -present.sign
         if abs(motion) != 1:
-            unit = position_unit(correction, joint)
+            unit = position_unit(correction, joint) or "counts"
             units = {"q": unit, "qd": f"{unit}/s"}
+            if unit == "counts":
+                ratio = 1 / abs(float(correction.hypothesis.scale[0, joint]))
+                is_turning = correction.arm.joint_types[joint] == "revolute"
+                key, turn = ("counts_per_turn", 2 * np.pi) if is_turning else ("counts_per_metre", 1.0)
+                keys[key] = plain_number(turn * ratio)
         gain = torque * np.sign(motion)
         if correction.mapping.unit("tau", name) == "mNm" and np.isclose(abs(gain), 1e3):
             units["tau"] = "Nm"
@@ -236,8 +245,7 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        If separately optimised factors of the joints lower the cost significantly, the fit with these factors is
-        yielded, too.
+        The fits with separate factors of the joints are yielded, too.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -249,8 +257,6 @@ class TorqueUnit(WrongScale):
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
-        if not candidates:
-            return
         for factor in candidates:
             # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
             # is inexact because the masses of the URDF are.
@@ -259,36 +265,49 @@ class TorqueUnit(WrongScale):
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
         fits = list(self._scaled_by(scales, problem, base))
         yield from fits
-        if is_found:
-            return
-        best = lowest = min(fits, key=lambda fit: fit.cost)
-        # The torque factors are optimised for one joint after the other: the dynamic coupling of the joints determines
-        # their ratios. Then a common factor of all joints is optimised, which the masses of the URDF determine.
-        for joints in (*np.eye(len(is_open))[is_open], 1.0 * is_open):
-            exponent = minimize_scalar(
-                lambda x, fit=best, joints=joints: self._scaled(problem, fit, np.exp(x * joints)).cost,
-                bounds=(-np.log(10), np.log(10)), method="bounded", options={"xatol": 0.05},
-            ).x  # fmt: skip
-            best = min(best, self._scaled(problem, best, np.exp(exponent * joints)), key=lambda fit: fit.cost)
-        # Separate factors of the joints are accepted under three conditions. They also correct errors of the URDF's
-        # masses, which lowers the cost a little: (1) therefore at least one factor must be large enough for another
-        # unit, and (2) the cost must decrease significantly, below the other candidates and below the present units,
-        # although each factor is rare. (3) The relative residual of each joint must be small, since no factor explains
-        # torques with another fault, such as a lost sign.
-        is_unit = is_other_unit(best.hypothesis.scale[1] / problem.unchanged.scale[1]).any()
-        is_explained = best.errors.max() <= GEOMETRY.unexplained
-        decrease = min(lowest.cost, base.cost) - best.cost
-        if is_unit and is_explained and decrease > GEOMETRY.needed + self.rarity * is_open.sum():
-            yield best
+        if not is_found:
+            yield from self._separate(problem, min((base, *fits), key=lambda fit: fit.cost), base)
 
-    def _scaled(self, problem: GeometryProblem, fit: HypothesisFit, factors: np.ndarray) -> HypothesisFit:
-        """Return the least-squares fit of the torques after multiplication by `factors` (n,), one per joint.
+    def _separate(
+        self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit
+    ) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The product of `factors` and the correction factors in `fit` is rounded to two digits before the fit.
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. They are therefore accepted only if (1) the cost falls significantly, although each factor is rare, (2)
+        each factor is determined, and (3) the relative residual of each joint is small.
         """
-        (motion, torque), present = fit.hypothesis.scale, problem.unchanged.scale[1]
-        rounded = np.array([float(f"{x:.2g}") for x in torque * factors / present])
-        return problem.fit(fit.hypothesis.changed(self, scale=np.stack([motion, rounded * present])))
+        present, scale = base.hypothesis, base.hypothesis.scale
+        tau = present.signals(problem.samples).tau
+        torque = problem.residual(present, problem.with_free_gains().fit(present).parameters) + tau
+        products = (torque * tau).sum(axis=0)
+        gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
+        common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
+        is_free = self._is_open & (gains > 0)
+        is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
+
+        def fitted(factors: np.ndarray) -> HypothesisFit:
+            rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
+            return problem.fit(present.changed(self, scale=rounded))
+
+        for factors, changed in (
+            (single, is_other),
+            (gains, is_free & (is_other.any() | is_other_unit(common))),
+        ):
+            if not changed.any() or not (changed | (factors == 1)).all():
+                continue
+            fit = fitted(factors)
+            # A factor is determined if factors of another unit fit worse; errors of masses are as large as this bound.
+            steps = [
+                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
+            ]
+            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
+            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
+            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+                lowest = fit
+                yield fit
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
@@ -345,10 +364,79 @@ def rounded_factor(factor: float) -> float:
 
 
 class PositionUnit(WrongScale):
-    """Kind of fault of a log: positions of all revolute or all prismatic joints in another unit than in the mapping."""
+    """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
+
+    The unit of all joints of a type is one of `UNITS`. The factor of a single joint is optimised, since its positions
+    may be the positions of its motor, before a gear of any ratio.
+    """
 
     code = "joint-unit"
     rarity = 2
+    is_optimised = True
+
+    def __init__(
+        self,
+        factors: Sequence[np.ndarray],
+        joints: Sequence[int] = (),
+        open_fault: PositionUnit | None = None,
+    ) -> None:
+        """Define the candidates for other units of the positions of n joints.
+
+        Args:
+            factors: candidates for the factors of all joints of a type, (2, n) each.
+            joints: indices of the joints whose factor is also optimised separately.
+            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
+                a fault, and no setting is advised for it.
+        """
+        super().__init__(factors)
+        self._joints, self._open_fault = joints, open_fault
+        self.advice = "" if open_fault else GIVE_GEAR
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with other units of all joints, and with the best factor of each single joint.
+
+        The factor of a joint whose unit `base` already changes remains.
+        """
+        yield from super().fits(problem, base)
+        for k in self._joints:
+            if abs(base.hypothesis.scale[0, k]) == abs(problem.unchanged.scale[0, k]):
+                yield self._single(problem, base, k)
+
+    def _single(self, problem: GeometryProblem, base: HypothesisFit, joint: int) -> HypothesisFit:
+        """Return the least-squares fit with the best factor on the positions of one joint.
+
+        A unit in `UNITS` is preferred if its cost is about equal. Other factors are rounded to three digits.
+        """
+        scale, present = base.hypothesis.scale, abs(float(problem.unchanged.scale[0, joint]))
+        span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joint]))
+
+        def fitted(exponent: float, form: tuple[int, int, int], fault: PositionUnit = self) -> HypothesisFit:
+            factors, (sense, torque_sense, power) = np.ones_like(scale), form
+            factors[:, joint] = sense * np.exp(exponent), torque_sense * np.exp(-power * exponent)
+            return problem.fit(base.hypothesis.changed(fault, scale=scale * factors))
+
+        # Forms (sense of the motion, sense of the torque, power): the torque of the joint (power 0), of either sense
+        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        forms = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
+        # the motion ranges over at least 0.05 rad or m, and at most two turns
+        exponents = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
+        costs = np.array([[fitted(x, form).cost for form in forms] for x in exponents])
+        row, column = np.unravel_index(costs.argmin(), costs.shape)
+        form, start = forms[column], float(exponents[row])
+        best = minimize_scalar(
+            lambda x: fitted(x, form).cost,
+            bounds=(start - 0.15, start + 0.15), method="bounded", options={"xatol": 0.002},
+        )  # fmt: skip
+        # The factor is undetermined if a factor that is 10 % larger or smaller explains the log about equally well, or
+        # if another form does.
+        sides = [fitted(best.x + change, form).cost for change in (-0.1, 0.1)]
+        sides += np.delete(costs.min(axis=0) - GEOMETRY.ambiguous + GEOMETRY.right_angle, column).tolist()
+        fault = self if min(sides) > best.fun + GEOMETRY.right_angle else self._open_fault or self
+        exact = [np.log(SCALES.get(x, 1.0) / present) for x in UNITS[problem.arm.joint_types[joint]]]
+        unit = fitted(min(exact, key=lambda x: abs(x - best.x)), form, fault)
+        if unit.cost < best.fun + GEOMETRY.right_angle:
+            return unit
+        return fitted(-np.log(float(f"{np.exp(-best.x) / present:.3g}") * present), form, fault)
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
@@ -358,9 +446,14 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with the name of the unit in `correction`."""
-        joints = np.flatnonzero(self.has(*correction.factors)).tolist()
-        return f"positions in {' and '.join(dict.fromkeys(position_unit(correction, k) for k in joints))}"
+        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        motion, torque = correction.factors
+        texts = []
+        for k in np.flatnonzero(self.has(motion, torque)).tolist():
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            gear = f"about {abs(1 / motion[k]):.3g} times as large as the joint's{sense}, as at the motor of a gear"
+            texts.append(f"positions in {unit}{sense}" if unit else f"positions {gear}")
+        return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
@@ -381,11 +474,11 @@ def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
     return candidates
 
 
-def position_unit(correction: Correction, joint: int) -> str:
+def position_unit(correction: Correction, joint: int) -> str | None:
     """Return the unit, such as "deg", that a hypothesis about a log assumes for the positions of a joint.
 
-    It is the unit whose factor to SI units is nearest to the scale of the positions in the hypothesis.
+    None is returned for a scale of the positions that is no unit in `UNITS`.
     """
     scale = abs(float(correction.hypothesis.scale[0, joint]))
-    units = UNITS[correction.arm.coordinates[joint].joint_type]
-    return min(units, key=lambda unit: abs(np.log(scale / SCALES.get(unit, 1.0))))
+    units = UNITS[correction.arm.joint_types[joint]]
+    return next((unit for unit in units if np.isclose(scale, SCALES.get(unit, 1.0))), None)

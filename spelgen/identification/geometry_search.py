@@ -11,14 +11,7 @@ from operator import attrgetter
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.identification.column_faults import (
-    JointSense,
-    PositionUnit,
-    TorqueSense,
-    TorqueUnit,
-    WrongOrder,
-    position_factors,
-)
+from spelgen.identification.column_faults import JointSense, TorqueSense, WrongOrder
 from spelgen.identification.continuous_faults import Compensation, Gravity, ZeroOffset
 from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
@@ -28,15 +21,12 @@ from spelgen.identification.tuning import GEOMETRY
 RANK = attrgetter("rank")
 
 
-def kinds_of_faults(
-    arm: Chain, torque_unit: TorqueUnit | None = None, position_scale: np.ndarray | None = None
-) -> tuple[Fault, ...]:
+def kinds_of_faults(arm: Chain, units: Sequence[Fault] = ()) -> tuple[Fault, ...]:
     """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
 
-    torque_unit: candidates for another unit of the torques; None: the unit is right. position_scale: (n,) factor from
-    logged positions to SI units; None: the unit of positions is right.
+    units: kinds of wrong units, with their candidates; none if the units are right.
     """
-    n, units = len(arm.coordinates), [] if position_scale is None else position_factors(arm, position_scale)
+    n = len(arm.coordinates)
     return (
         WrongOrder("joint-order", "the columns of other joints", (0, 1)),
         WrongOrder("torque-order", "the torques of other joints", (1,)),
@@ -45,8 +35,7 @@ def kinds_of_faults(
         WrongOrder("motion-order", "the positions and velocities of other joints", (0,), starts=3),
         JointSense(n),
         TorqueSense(n),
-        PositionUnit(units),
-        *([] if torque_unit is None else [torque_unit]),
+        *units,
         ZeroOffset(),
         Delay(),
         JointClock(),

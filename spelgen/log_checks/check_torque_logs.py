@@ -12,7 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import UNITS, TorqueUnit
+from spelgen.identification.column_faults import UNITS, PositionUnit, TorqueUnit, position_factors
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
@@ -71,6 +71,7 @@ class TorqueLogs:
         self._flat: list[FlatTops] = []
         self._declared: list[set[str]] = []
         self._seconds, self._is_bag = 0.0, False
+        self._guessed: set[str] = set()
         self._sources: list[tuple[str, Path | None]] = []
 
     def add(self, trajectory: Trajectory) -> None:
@@ -107,7 +108,11 @@ class TorqueLogs:
         completed = [joint.report for joint in evidence]
         # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
         # hints.
-        is_sound = not summary.errors and not any(x.code == WRONG_VELOCITY for x in summary.notes)
+        # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
+        self._guessed = summary.guessed
+        is_sound = len(summary.errors) <= bool(self._guessed) and not any(
+            x.code == WRONG_VELOCITY for x in summary.notes
+        )
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()
@@ -119,8 +124,11 @@ class TorqueLogs:
             # the lowest cost. Logs whose sample rate is too low for filtered accelerations are tested with unfiltered
             # samples.
             samples = [motion, motion if moving is None else moving]
-            loads = [] if unscaled else self._load_changes(motion, moving)
+            loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
             geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
+            if self._guessed:
+                geometry = [x for x in geometry if isinstance(x, LogError)] or list(summary.errors)
+                summary.errors.clear()
             summary.extend(geometry)
             is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
@@ -173,9 +181,9 @@ class TorqueLogs:
             accepted: codes of the checks that the mapping accepts.
             loads: changes of the load between recordings.
         """
-        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not loads else None
         deviating = [change.recording for change in loads]
-        if unfiltered is not None:
+        unfiltered = self._problem(samples[0]) if len(self._sources) > 1 and not self._guessed else None
+        if unfiltered is not None and not loads:
             deviating = deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
         findings = list[LogError | Diagnostic]()
@@ -290,8 +298,11 @@ class TorqueLogs:
             )
             yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
             return
-        wrong: Sequence[SpelgenError] = find_unsigned(problem) if UNSIGNED not in accepted else []
-        if not wrong:
+        # Positions in a wrong unit contradict all torques, so that their signs and limits are not tested.
+        wrong: Sequence[SpelgenError] = (
+            find_unsigned(problem) if not self._guessed and UNSIGNED not in accepted else []
+        )
+        if not wrong and not self._guessed:
             limits = find_limits(problem, flat)
             yield from limits.notes
             wrong = limits.errors if CLIPPED not in accepted else []
@@ -336,8 +347,20 @@ class TorqueLogs:
         # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
-        scale = problem.unchanged.scale[0] if motion <= {(None, None), *stated} else None
-        return kinds_of_faults(problem.arm, TorqueUnit(factors, is_open, is_milli), scale)
+        torque_unit = TorqueUnit(factors, is_open, is_milli)
+        if not motion <= {(None, None), *stated}:
+            return kinds_of_faults(problem.arm, [torque_unit])
+        # The unit of a single joint is tested if its motion is larger than its limits, or than two turns.
+        width = np.array(
+            [
+                min(high - low, 4 * np.pi) if high > low else np.inf
+                for low, high in (x.limits() for x in evidence)
+            ]
+        )
+        is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
+        wide = [k for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        units = position_factors(problem.arm, problem.unchanged.scale[0])
+        return kinds_of_faults(problem.arm, [PositionUnit(units, wide, PositionUnit([])), torque_unit])
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

@@ -79,10 +79,14 @@ AnyCheck = Check[Any]
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of checks of logs: errors, which prevent training, and notes, which do not."""
+    """Findings of checks of logs: errors, which prevent training, and notes, which do not.
+
+    guessed: names of joints whose positions have an unknown unit, which the torques may show.
+    """
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
+    guessed: set[str] = field(default_factory=set)
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
@@ -213,7 +217,8 @@ CHECKS: list[Check[JointSignals]] = [
     ),
     Check(
         "degrees", "error", find_units, unless=("jumps",), expected="rad and rad/s, m and m/s",
-        do="write 'units' under 'logs' in the robot's YAML, or declare them in the Parquet schema's metadata",
+        do="write 'units' under 'logs' in the robot's YAML, or declare them in the Parquet schema's metadata; "
+        "positions of a motor before a gear are counts, with 'counts_per_turn' of 2 pi times the gear ratio",
     ),
     Check(
         "time-unit", "error", find_time_unit, unless=("degrees", "frozen"), expected="times in seconds",
@@ -313,7 +318,11 @@ class LogChecks:
             if names[0] in self._joints:
                 where += f", joint {', '.join(map(repr, names))}"
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint else {})}
+            if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
+                message, _, _ = message.partition(": ")
+                summary.guessed.update(names)
+                entries = {}
+            keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint and entries else {})}
             # Advised units, columns and sample rates may be wrong for the recordings without the fault. Dropped rows,
             # periods and sign bits do not change recordings without the fault.
             is_partial = len(occurrences) < self._count and any(
@@ -321,6 +330,11 @@ class LogChecks:
             )
             summary.add(check, message, where, file, keys, is_partial)
         return summary
+
+    def _kin(self, joint: str) -> list[str]:
+        """Return the names of all joints of the same type as a joint, revolute or prismatic."""
+        kinds = dict(zip(self._joints, self._kinds, strict=True))
+        return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return the settings of the group `logs` that correct a fault which several joints have in common.
@@ -331,10 +345,9 @@ class LogChecks:
         entries: {joint: settings of this joint that correct the fault}.
         """
         first, *_ = entries
-        units, kinds = entries[first].get("units", {}), dict(zip(self._joints, self._kinds, strict=True))
+        units, kin = entries[first].get("units", {}), self._kin(first)
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
-        kin = [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[first] == "prismatic")]
         is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):

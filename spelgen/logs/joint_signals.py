@@ -29,11 +29,13 @@ class Advice(NamedTuple):
         message: the finding.
         joint: settings that correct the log for this joint, `logs: {joints: {NAME: ...}}`; empty if there are none.
         keys: settings that correct the log for all joints, `logs: {...}`; empty if there are none.
+        is_guess: True if the settings of the joint are only certain if most joints need them.
     """
 
     message: str
     joint: Mapping[str, Any] = {}
     keys: Mapping[str, Any] = {}
+    is_guess: bool = False
 
 
 def settings_line(keys: Mapping[str, object]) -> str:
@@ -282,7 +284,9 @@ def find_jumps(signals: JointSignals) -> str | None:
     """Return a message if the position of the joint jumps, for example between joined recordings."""
     sound = ~is_outlier(signals.q, smooth=True)
     t, q = signals.trajectory.t[sound], signals.q[sound]
-    rows = jumps(t, q)
+    # If both neighbouring steps are similar, the joint moves fast in the unit of the log, such as the motor of a gear.
+    steps = np.pad(np.abs(np.diff(q)), 1)
+    rows = np.array([k for k in jumps(t, q) if 3 * min(steps[k], steps[k + 2]) < steps[k + 1]], int)
     if not rows.size:
         return None
     size = q[rows[0] + 1] - q[rows[0]]

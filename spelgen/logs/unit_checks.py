@@ -90,12 +90,16 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # The unit advised for q also applies to commands, unless the commands move much less than q: they are then SI.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
-    return Advice(f"{message}: {units}", keys) if keys else None
+    # The range of positions does not distinguish degrees from the motion of a motor before a gear; a ratio to the
+    # velocities that differs from 1 does.
+    is_guess = is_far and not (_knows_ratio(signals) and abs(signals.factor) > 1.25)
+    of_log = {"velocity": "differentiated"} if "sign" in keys else {}
+    return Advice(f"{message}: {units}", keys, of_log, is_guess) if keys else None
 
 
 def _knows_ratio(signals: JointSignals) -> bool:
     """Return True if velocities qd were logged and are proportional to dq/dt: the ratio qd : dq/dt then shows units."""
-    is_known = signals.correlation > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
     return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
@@ -122,7 +126,7 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     for unit in positions if stated and is_known and largest < 0.1 else ():
         ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
         if 0.5 < largest * ratio < TURNS:
-            yield abs(log(signals.factor * ratio)) + 0.01, {"units": {"q": unit}}
+            yield abs(log(abs(signals.factor) * ratio)) + 0.01, {"units": {"q": unit}}
     if stated:
         positions = positions[:1]
     elif is_far and (signals.is_whole or not is_known):
@@ -134,12 +138,21 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
         if scale < min(smallest, 1.0):
             continue
         units = {name: x for name, x in (("q", q), ("qd", qd)) if x in SCALES}
-        distance = abs(log(signals.factor * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
+        distance = abs(log(abs(signals.factor) * scale / SCALES.get(qd, 1.0))) if is_known else 0.0
         if not is_far or np.abs(signals.q).max() * scale <= TURNS:
             yield distance + 0.02 * len(units), {"units": units} if units else {}
-    for counts in (2 ** np.arange(10, 21)).tolist() if is_known and "turns" in positions else ():
+    gear = abs(signals.factor)
+    if is_far and is_known and not signals.is_whole and np.abs(signals.q).max() < TURNS * gear:
+        # Any other ratio is possible at the motor of a gear. The correlation shows how exact the measured ratio is.
+        keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
+        if signals.factor < 0:
+            # The setting `sign` also reverses the torque, which is assumed to have the sense of the velocity.
+            keys |= {"sign": -mapping.joint(joint).sign, "gain": -(mapping.joint(joint).gain or 1.0)}
+        yield 0.05 + 1 - signals.correlation**2, keys
+    is_encoder = is_known and "turns" in positions and (signals.is_whole or not is_far)
+    for counts in (2 ** np.arange(10, 21)).tolist() if is_encoder else ():
         if 2 * np.pi / counts >= smallest:
-            distance = abs(log(signals.factor * 2 * np.pi / counts)) + 0.02
+            distance = abs(log(abs(signals.factor) * 2 * np.pi / counts)) + 0.02
             yield distance, {"units": {"q": "counts"}, "counts_per_turn": counts}
 
 
