@@ -216,7 +216,7 @@ def test_missing_files_and_folders_are_told_at_once(tmp_path):
     csv(tmp_path / "log.txt", "")
     with pytest.raises(SpelgenErrors) as caught:
         read_logs([tmp_path / "none.csv", tmp_path / "empty", tmp_path / "log.txt"], JOINTS)
-    kinds = ".parquet, .csv, .tsv, .npz, .jsonl, .ndjson, .mcap, .db3, .bag"
+    kinds = ".parquet, .csv, .tsv, .npz, .jsonl, .ndjson, .json, .mcap, .db3, .bag"
     kinds += ", the folder of a ROS 2 bag or of a LeRobot data set"
     renamed = f"mv {tmp_path}/log.txt {tmp_path}/log.csv"
     assert str(caught.value).splitlines() == [
@@ -611,7 +611,7 @@ def test_a_models_logs_have_the_urdfs_names(tmp_path):
 
 def test_what_is_said_of_many_recordings_is_said_once():
     slow = swing("a", dt=0.05)
-    (note,) = check([slow, replace(slow, name="b")], JOINTS, ("revolute", "revolute"))
+    (note,) = check([slow, replace(slow, name="b", tau=slow.tau + 1)], JOINTS, ("revolute", "revolute"))
     assert (note.code, note.where) == ("low-rate", "trajectory a")
     assert note.message.startswith("20 Hz: ") and note.message.endswith(" (and in 1 more trajectory)")
 

@@ -266,10 +266,11 @@ class TorqueUnit(WrongScale):
         fits = list(self._scaled_by(scales, problem, base))
         yield from fits
         if not is_found:
-            yield from self._separate(problem, min((base, *fits), key=lambda fit: fit.cost), base)
+            lowest = min((base, *fits), key=lambda fit: fit.cost)
+            yield from self._separate(problem, lowest, base, bool(candidates))
 
     def _separate(
-        self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit
+        self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit, has_gravity: bool
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
@@ -286,6 +287,9 @@ class TorqueUnit(WrongScale):
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
         is_free = self._is_open & (gains > 0)
         is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
+        if not (is_other.any() or has_gravity):
+            return
         single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
 
         def fitted(factors: np.ndarray) -> HypothesisFit:

@@ -127,7 +127,8 @@ class TorqueLogs:
             loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
             geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
             if self._guessed:
-                geometry = [x for x in geometry if isinstance(x, LogError)] or list(summary.errors)
+                errors = [x for x in geometry if isinstance(x, LogError)]
+                geometry = [*(errors or [x for x in summary.errors if isinstance(x, LogError)])]
                 summary.errors.clear()
             summary.extend(geometry)
             is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
@@ -359,8 +360,8 @@ class TorqueLogs:
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [k for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
-        units = position_factors(problem.arm, problem.unchanged.scale[0])
-        return kinds_of_faults(problem.arm, [PositionUnit(units, wide, PositionUnit([])), torque_unit])
+        candidates = position_factors(problem.arm, problem.unchanged.scale[0])
+        return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
@@ -401,9 +402,9 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
-    The first moment is the mass times the centre of mass; its component along the URDF's first moment is compared. The
-    difference from the URDF must also exceed four standard deviations of the fitted value, and change the torque of a
-    joint by more than half of this torque's standard deviation.
+    The first moment is the mass times the centre of mass. The torques that both values cause are compared, by
+    regression. The difference from the URDF must also exceed four standard deviations of the fitted value, and change
+    the torque of a joint by more than half of this torque's standard deviation.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
@@ -414,13 +415,16 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
         }
         for name, block in quantities.items():
             stated, found = problem.prior_mean[block], fit.parameters[block]
-            size = float(np.linalg.norm(stated))
-            effect = (rows[..., block] @ (found - stated)).std(axis=0)
-            if not size or not (effect > 0.5 * torque).any():
+            columns = rows[..., block] / np.where(torque > 0, torque, np.inf)[:, None]
+            of_urdf = columns @ stated
+            size = float(np.square(of_urdf).sum())
+            effect = (columns @ (found - stated)).std(axis=0)
+            if not size or not (effect > 0.5).any():
                 continue
-            axis = stated / size
-            ratio = float(axis @ found) / size
-            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis)) / size
+            # The ratio of the torques of the link: components without an effect on the torques are undetermined.
+            axis = np.tensordot(of_urdf, columns, 2) / size
+            ratio = float(axis @ found)
+            deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis))
             # The ratio must be beyond 2.5 or its inverse: masses of CAD models are wrong by less. The difference from
             # the URDF must also exceed four standard deviations of the fitted value: at one of many bodies, it exceeds
             # two by chance.
@@ -430,6 +434,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
                 f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: check its mass and "
                 "centre of mass in the URDF"
             )
+            if all(x.parent != k for x in problem.arm.bodies):
+                message += ", or add the tool or load that it carries"
             yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
             break
 
