@@ -322,10 +322,10 @@ class GeometryProblem:
         """Return the penalty for negative inertias, and for friction that drives the motion on average.
 
         Tested are the rotor inertias, and the mass and moments of inertia of the bodies that carry no joint, which have
-        a wide prior. Each violation adds half of its squared standard score to the cost, up to a bound. The bound is needed,
-        since the right hypothesis may have one violation: a drive may compensate friction, and errors of the friction
-        model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion
-        (joint 6), another one has a negative rotor inertia, and none has both.
+        a wide prior. Each violation adds half of its squared standard score to the cost, up to a bound. The bound is
+        needed, since the right hypothesis may have one violation: a drive may compensate friction, and errors of the
+        friction model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the
+        motion (joint 6), another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.
