@@ -335,10 +335,11 @@ Sums = list[tuple[float, int]]
 
 
 def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
-    """Return the entries of the lower triangle of M as linear combinations of its functions and constants.
+    """Return the entries of the lower triangle of M as linear combinations of learned functions and trained constants.
 
-    The result has a list per row of M, with a list of pairs (factor, index) per entry. An index refers to the list of
-    functions, followed by constants; an entry that is always zero has an empty list.
+    The result has one list per row of M. It contains, for each entry of the row, a list of pairs (factor, index): the
+    entry is the sum of factor times the function or constant with this index. The functions of the specification have
+    the first indices, its constants the following ones. An entry that is always zero has an empty list.
     """
     cells: defaultdict[tuple[int, int], Sums] = defaultdict(list)
     terms: Sequence[OutputSpec | ConstantSpec] = (*spec.outputs, *spec.constants)

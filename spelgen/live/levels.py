@@ -261,10 +261,12 @@ def _likelihood(
 
 
 def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]]) -> NoiseLevels:
-    """Return ``levels`` with the noise of the momentum observer, and the distribution of its largest residuals (peaks).
+    """Return ``levels`` with the fields that determine the contact thresholds (see `NoiseLevels`).
 
-    The new fields `observer`, `resting`, `resting_speed`, `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`
-    determine the contact thresholds. levels: noise levels without these fields. tested: held-out samples of each log.
+    They are the noise of the momentum observer in motion and at rest (`observer`, `resting`, `resting_speed`), and the
+    distribution of the largest values of its residual (`peak_start`, `peak_scale`, `peak_count`).
+
+    levels: noise levels without these fields. tested: held-out samples of each log.
     """
     zeros, ones = np.zeros_like(levels.speed), np.ones_like(levels.speed)
     # The logs have no contacts: with infinite thresholds the observer detects none.

@@ -387,7 +387,8 @@ class ServoLogs:
         for expected, by_joint in faults.items():
             for k, occurrences in by_joint.items():
                 names = ", ".join(name for name, _ in occurrences) if k in sound else ""
-                # A command offset of all recordings is a warning: it may be due to the load of a soft servo.
+                # A command offset that all recordings have is not an error but a warning, which is added elsewhere: the
+                # load of a soft servo has the same effect.
                 if names or expected != ONE_ZERO:
                     groups.setdefault((expected, names), {})[k] = occurrences[0][1]
         for (expected, names), group in groups.items():

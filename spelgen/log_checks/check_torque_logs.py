@@ -415,11 +415,11 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
         }
         for name, block in quantities.items():
             stated, found = problem.prior_mean[block], fit.parameters[block]
-            columns = rows[..., block] / np.where(torque > 0, torque, np.inf)[:, None]
+            columns = rows[..., block]
             of_urdf = columns @ stated
             size = float(np.square(of_urdf).sum())
             effect = (columns @ (found - stated)).std(axis=0)
-            if not size or not (effect > 0.5).any():
+            if not size or not (effect > 0.5 * torque).any():
                 continue
             # The ratio of the torques of the link: components without an effect on the torques are undetermined.
             axis = np.tensordot(of_urdf, columns, 2) / size

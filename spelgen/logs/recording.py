@@ -203,8 +203,9 @@ def _remove_delays(rows: Rows) -> None:
 def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may jump, or be 0 for some time. An
-    outlier of the commands is therefore twice as far from the position as all others, and no 0 next to other zeros.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may jump, or be 0 for some time. A
+    command is therefore an outlier only under two more conditions: its distance from the position is more than twice
+    the largest distance of the commands that are no outliers, and it is not 0 beside another 0.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """

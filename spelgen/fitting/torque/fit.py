@@ -213,10 +213,10 @@ def _compared_fit(
         return significant_reduction(fit.held_out + negligible, other, standard_errors) is not None
 
     def nmse(held_out: torch.Tensor) -> float:
-        """Return the mean nMSE over the joints.
+        """Return the mean nMSE over the joints: the sum of `held_out`, divided by the numbers of samples and of joints.
 
-        held_out: (blocks,), squared errors divided by the variance of the torque, summed over the samples and joints of
-        each block.
+        held_out: (blocks,), squared errors divided by the variance of the joint's torque, summed over the samples and
+        joints of each block.
         """
         return float(held_out.sum()) / samples.count / model.n
 

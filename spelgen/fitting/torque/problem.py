@@ -219,9 +219,10 @@ class TorqueProblem:
         return NormalEquations(curvature, (descent - penalty_gradient)[self.free])
 
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Yield two candidates (K,) for the parameters: x + step, then `TorqueJacobian.curved_step` of x and step.
+        """Yield two candidates (K,) for the parameters after a step: x + step, and the end of a curve.
 
-        step: (k,), step of the k free parameters; the step of fixed parameters is zero.
+        The curve has the tangent `step` at x, and is a straight line in the inertial parameters of the bodies (see
+        `TorqueJacobian.curved_step`). step: (k,), step of the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate
