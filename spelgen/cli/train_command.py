@@ -300,7 +300,7 @@ def selected(values: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
 def adaptation(objective: Objective | None, values: dict[str, Any]) -> Objective:
     """Return the objective of a fit that starts from a fitted model (`--from`), by default "torque".
 
-    A fit to torques estimates only a group of parameters, `adapt`: those of the load, of friction, or all that differ
+    A fit to torques estimates only a group of parameters, `adapt`: the load, friction, or all parameters that differ
     between units of one arm. If `values`, the values of `--set`, have no `adapt`, it is set to "load".
 
     Raises UsageError if `adapt` is set with another objective.

@@ -402,6 +402,9 @@ class PositionUnit(WrongScale):
         The factor of a joint whose unit `base` already changes remains.
         """
         yield from super().fits(problem, base)
+        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
+        if base.errors.max() <= GEOMETRY.explained:
+            return
         for k in self._joints:
             if abs(base.hypothesis.scale[0, k]) == abs(problem.unchanged.scale[0, k]):
                 yield self._single(problem, base, k)

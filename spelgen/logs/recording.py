@@ -205,7 +205,7 @@ def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray
 
     Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may jump, or be 0 for some time. A
     command is therefore an outlier only under two more conditions: its distance from the position is more than twice
-    the largest distance of the commands that are no outliers, and it is not 0 beside another 0.
+    the largest distance of the commands that are no outliers, and it is not 0 next to another 0.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
