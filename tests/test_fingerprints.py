@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spelgen.logs.checks import check
-from spelgen.logs.fingerprints import Fingerprints, fingerprint_of
+from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.trajectory import Trajectory
 
 JOINTS, TYPES = ["a", "b"], ["revolute", "revolute"]
@@ -68,6 +68,6 @@ def test_different_recordings_share_no_samples():
 @pytest.mark.parametrize("samples", [1, 2, 3, 5])
 def test_short_recordings_have_fingerprints(samples):
     known = Fingerprints()
-    known.add("short", fingerprint_of(recording(0, samples=samples)))
-    assert known.original(fingerprint_of(recording(0, samples=samples))) == ("short" if samples > 1 else None)
-    assert known.original(fingerprint_of(recording(1, samples=samples))) is None
+    known.add("short", recording(0, samples=samples).fingerprint)
+    assert known.original(recording(0, samples=samples).fingerprint) == ("short" if samples > 1 else None)
+    assert known.original(recording(1, samples=samples).fingerprint) is None

@@ -194,12 +194,7 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
 
 
 def _coordinate(joint: UrdfJoint, passive: bool) -> Coordinate:
-    lower, upper = joint.lower, joint.upper
-    # Limits in reverse order, of which the URDF reader warns, are used as swapped by all steps: MuJoCo would drop the
-    # limit, and each position in the logs would be beyond one of them.
-    if lower is not None and upper is not None:
-        lower, upper = sorted((lower, upper))
-    limits = lower, upper, joint.effort, joint.velocity
+    limits = *(joint.limits or (joint.lower, joint.upper)), joint.effort, joint.velocity
     is_continuous = joint.type == "continuous"
     friction = joint.damping, joint.friction
     return Coordinate(joint.name, _joint_type(joint), is_continuous, *limits, *friction, passive)

@@ -194,7 +194,8 @@ def _possible_gripper(robot: Robot, last: UrdfJoint, is_mimicked: bool) -> tuple
     of the robot has the name of a gripper: joints with such names are excluded from the chain already. A joint with a
     range of more than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
     """
-    travel = last.upper - last.lower if last.lower is not None and last.upper is not None else 0.0
+    lower, upper = last.limits or (0.0, 0.0)
+    travel = upper - lower
     is_named = bool(_GRIPPER.search(last.child)) and not any(map(_GRIPPER.search, robot.joint))
     is_jaw = is_mimicked or (last.type == "prismatic" and 0 < travel <= _LARGEST_JAW)
     if travel > math.pi or not (is_jaw or is_named):

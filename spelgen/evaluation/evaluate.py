@@ -36,7 +36,7 @@ from spelgen.labels import MODEL
 from spelgen.logs.arm_mapping import GivenMapping
 from spelgen.logs.checks import check
 from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
-from spelgen.logs.fingerprints import Fingerprints, fingerprint_of
+from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory, joined_column, recordings, require_commands, require_torques
@@ -181,7 +181,7 @@ def evaluate(
     logs = recordings(logs, tested.joints)
     notes = check(logs, tested.joints, tested.model.joint_types)
     # Test logs that were also training logs are detected by fingerprints, because a run does not store the logs.
-    seen = [x.name for x in logs if tested.trained_on.original(fingerprint_of(x))]
+    seen = [x.name for x in logs if tested.trained_on.original(x.fingerprint)]
     if seen:
         message = (
             f"samples also used in training: {', '.join(seen)}; errors on training data are not test errors"

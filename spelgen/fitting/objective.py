@@ -10,7 +10,6 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.dataset import FitRequest, PreparedLogs
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content, Record
-from spelgen.logs.fingerprints import fingerprint_of
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 from spelgen.settings.fits import FitConfig
 from spelgen.settings.log_mapping import LogMapping
@@ -102,7 +101,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         data_digest=prepared.digest,
         training=list(prepared.training_names),
         validation=list(prepared.validation_names),
-        fingerprints={x.name: fingerprint_of(x)[:STORED_HASHES] for x in request.recordings},
+        fingerprints={x.name: x.fingerprint[:STORED_HASHES] for x in request.recordings},
         training_windows=prepared.window_counts[0],
         validation_windows=prepared.window_counts[1],
         mapping=options.mapping or LogMapping(input=model.input_quantity),

@@ -66,7 +66,7 @@ def read_bag(path: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
         stamped, times = messages, np.array([message.recorded for message in messages])
     elif len(stamped) < len(messages):
         remarks.append(f"{counted(len(messages) - len(stamped), 'message')} without a stamp left out")
-    columns = {"t": (times - times[0]) * 1e-9} | _states(path, stamped, list(names.values()))
+    columns = {"t": (times - times[0]) * 1e-9} | _joint_states(path, stamped, list(names.values()))
     # ROS defines the fields of a joint state in SI units, so columns and units of the mapping do not apply to bags.
     mapping = mapping.with_joint_columns(dict.fromkeys(joints, dict.fromkeys(FIELDS)))
     mapping = mapping.model_copy(update={"columns": LogColumns()})
@@ -112,7 +112,9 @@ def _of_one_arm(
     return of_arm
 
 
-def _states(path: Path, messages: Sequence[StampedState], names: Sequence[str]) -> dict[str, np.ndarray]:
+def _joint_states(
+    path: Path, messages: Sequence[StampedState], names: Sequence[str]
+) -> dict[str, np.ndarray]:
     """Return the columns `q_<name>`, `qd_<name>` and `tau_<name>` of the joints `names` from T messages, each (T,).
 
     Fields that are empty in all messages are omitted; values of joints that a message does not contain are NaN.

@@ -14,7 +14,7 @@ import numpy as np
 
 from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
 from spelgen.labels import counted
-from spelgen.logs.fingerprints import Fingerprints, fingerprint_of
+from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.joint_signals import (
     Advice,
     JointSignals,
@@ -275,9 +275,8 @@ class LogChecks:
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
         findings += [(REMARKED, Advice(message)) for message in trajectory.remarks]
-        fingerprint = fingerprint_of(trajectory)
-        original = self._fingerprints.original(fingerprint)
-        self._fingerprints.add(trajectory.name, fingerprint)
+        original = self._fingerprints.original(trajectory.fingerprint)
+        self._fingerprints.add(trajectory.name, trajectory.fingerprint)
         if original:
             message = f"a quarter or more of its samples are also in trajectory {original}: omit one of both"
             findings.append((REPEATED, Advice(message)))
@@ -313,15 +312,16 @@ class LogChecks:
             occurrences = self._results[names[0], check]
             advice, where, file = occurrences[0]
             message = advice.message
+            entries = {name: self._results[name, check][0][0].joint for name in names}
+            if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
+                # The unit, after the colon of the message, is not certain.
+                message, _, _ = message.partition(": ")
+                summary.guessed.update(names)
+                entries = {}
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
             if names[0] in self._joints:
                 where += f", joint {', '.join(map(repr, names))}"
-            entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
-                message, _, _ = message.partition(": ")
-                summary.guessed.update(names)
-                entries = {}
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint and entries else {})}
             # Advised units, columns and sample rates may be wrong for the recordings without the fault. Dropped rows,
             # periods and sign bits do not change recordings without the fault.

@@ -5,8 +5,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from spelgen.logs.trajectory import Trajectory
-
 SIZE = 32
 """Number of hashes in a fingerprint. Recordings with a common quarter of their samples share about 8."""
 RUN = 4
@@ -32,25 +30,24 @@ class Fingerprints:
         Return None if there is none. The quarter is estimated from the hashes that both fingerprints contain.
         """
         common = Counter(self._names[number] for number in fingerprint if number in self._names)
-        for name, count in common.most_common(1):
-            if 4 * count >= min(len(fingerprint), len(self._recordings[name])):
-                return name
-        return None
+        if not common:
+            return None
+        name, count = common.most_common(1)[0]
+        return name if 4 * count >= min(len(fingerprint), len(self._recordings[name])) else None
 
 
-def fingerprint_of(trajectory: Trajectory) -> list[int]:
+def smallest_hashes(q: np.ndarray, inputs: np.ndarray) -> list[int]:
     """Return the `SIZE` smallest hashes of runs of `RUN` consecutive samples in motion, [] without motion.
 
-    A hash depends on the positions, and on the torques or commands, in single precision, and not on the times. Samples
-    at rest are omitted, since two recordings may have equal samples there. A recording that is a part of another one
-    shares a part of its hashes (bottom-k sketch, Broder 1997).
+    The hashes are computed in single precision. Samples at rest are omitted, since two recordings may have equal
+    samples there. A recording that is a part of another one shares a part of its hashes (bottom-k sketch, Broder 1997).
+
+    q: (T, n) positions. inputs: (T, m) torques or commands.
     """
-    inputs = trajectory.tau if trajectory.u is None else trajectory.u
     # Zero is added because -0.0 and 0.0 have different bits.
-    values = np.hstack([trajectory.q, inputs]).astype(np.float32) + np.float32(0)
+    values = np.hstack([q, inputs]).astype(np.float32) + np.float32(0)
     hashes = _hashes(values.view(np.uint32).astype(np.uint64))
     runs = np.lib.stride_tricks.sliding_window_view(hashes, min(RUN, len(hashes)))
-    q = trajectory.q
     moving = (q[len(q) - len(runs) :] != q[: len(runs)]).any(axis=1)
     return [int(number) for number in np.unique(_hashes(runs[moving]))[:SIZE]]
 

@@ -15,6 +15,7 @@ import numpy as np
 from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.listing import Listing
+from spelgen.logs.fingerprints import smallest_hashes
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import LogMapping
 
@@ -125,6 +126,11 @@ class Trajectory:
         """Time steps between samples that are no gaps, (steps,) [s]; their mean is the sample interval."""
         steps = np.diff(self.t)
         return steps[steps <= GAP * np.median(steps)] if steps.size else steps
+
+    @cached_property
+    def fingerprint(self) -> list[int]:
+        """Hashes of positions and of torques or commands (see `smallest_hashes`), which a copy has under any name."""
+        return smallest_hashes(self.q, self.tau if self.u is None else self.u)
 
     def __repr__(self) -> str:
         _, samples, duration, rate, joints = _summary(self)

@@ -78,14 +78,24 @@ class UrdfJoint(NamedTuple):
     soft: tuple[float, float] | None = None
 
     @property
+    def limits(self) -> tuple[float, float] | None:
+        """Position limits in increasing order [rad, m]; None if one of both is absent.
+
+        Limits in reverse order, of which the URDF reader warns, are used as swapped by all steps.
+        """
+        if self.lower is None or self.upper is None:
+            return None
+        return min(self.lower, self.upper), max(self.lower, self.upper)
+
+    @property
     def safe_limits(self) -> tuple[float, float] | None:
         """Position limits in increasing order, narrowed to the soft limits [rad, m]; None if one limit is absent.
 
         Soft limits outside the position limits are ignored.
         """
-        if self.lower is None or self.upper is None:
+        if self.limits is None:
             return None
-        low, high = sorted((self.lower, self.upper))
+        low, high = self.limits
         soft_low, soft_high = self.soft or (low, high)
         is_inside = soft_low < high and soft_high > low
         return (max(low, soft_low), min(high, soft_high)) if is_inside else (low, high)
