@@ -335,6 +335,24 @@ def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
         assert report.errors == () and "small-motion" in [x.code for x in report.findings]
 
 
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
+    """A controller holds the last joint: its velocities are smaller than their steps in the log."""
+
+    def held(arm, rng):
+        t, q = excitation(arm, rng)
+        q[:, -1] = 0.004 * np.sin(2 * t)
+        return t, q
+
+    log = recorded(arm, 4, held)
+    rng = np.random.default_rng(1)
+    qd = log.qd.copy()
+    qd[:, -1] = 0.0147 * rng.integers(-2, 3, len(qd))
+    sound = replace(log, qd=qd)
+    assert "velocity-is-no-derivative" not in [x.code for x in check_logs([sound], arm).findings]
+    assert "--accept joint-sense" in told(arm, flipped(sound, 1, True, False))
+
+
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_noise_of_joints_at_rest_is_no_wrong_torque(arm):
     log, rng = recorded(arm, 19), np.random.default_rng(19)

@@ -225,7 +225,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
     if signals.step > SIGNALS.slowest_step:
         return None
-    if np.isnan(correlation) or signals.is_at_rest:
+    if np.isnan(correlation) or signals.is_at_rest or _is_below_resolution(signals):
         return None
     if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
         lag = _velocity_lag(signals)
@@ -258,6 +258,18 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         columns = {"q": mapping.column("qd", signals.joint), "qd": mapping.column("q", signals.joint)}
         return Advice(f"{message}; q is the derivative of qd", {"columns": columns})
     return message + _velocity_sum(signals)
+
+
+def _is_below_resolution(signals: JointSignals) -> bool:
+    """Return True if dq/dt is mostly smaller than the smallest change of qd, so that both cannot be compared.
+
+    An example is a joint that the controller holds, whose position varies by a few steps of its encoder.
+    """
+    t, qd = signals.trajectory.t, signals.trajectory.qd[:, signals.number]
+    span = min(SIGNALS.increments, len(t) - 1)
+    changes = np.abs(np.diff(qd))
+    velocity = (signals.q[span:] - signals.q[:-span]) / (t[span:] - t[:-span])
+    return bool(changes.any() and np.sqrt(np.square(velocity).mean()) < changes[changes > 0].min())
 
 
 def _velocity_sum(signals: JointSignals) -> str:
