@@ -77,6 +77,13 @@ def test_recordings_with_one_load_are_not_doubted(arm, seed):  # noqa: F811
         assert warnings(arm, logs) == []
 
 
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_one_load_among_many_recordings_is_named_once(arm):  # noqa: F811
+    first, *others = parts(recorded(arm, 3), 25)
+    (text,) = warnings(arm, [loaded(arm, first, 3.0), *others])
+    assert masses(text).keys() == {"part 0"} and text.count("part 0 ") == 1
+
+
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_a_tool_that_the_urdf_lacks_is_no_other_zero(arm):  # noqa: F811
     """All recordings have a tool of 3 kg: it is no reason to doubt zeros, senses, order, units or gravity."""

@@ -37,20 +37,22 @@ class LoadChange(NamedTuple):
 def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     """Return the changes of the load between recordings that the torques show; [] if there are none.
 
-    The torques of all recordings are fitted by one set of parameters, and in addition by one mass and first moment of
-    the last body per recording. Changes are returned if these lower the negative log likelihood significantly, and by
-    more than torque offsets, and more than viscous and Coulomb friction, of each recording do. They are returned for
-    recordings whose load differs significantly from the load of the reference, and in which it at least halves the
-    squared residual of a joint.
+    The torques of all recordings are fitted by one set of parameters, and in addition by a mass and first moment of the
+    last body for each recording. These loads must lower the negative log likelihood significantly, and by more than
+    torque offsets, or viscous and Coulomb friction, of each recording would. A change is then returned for each
+    recording whose load differs significantly from the load of the reference, and whose squared residual of some joint
+    is at least halved by its own load.
 
     problem: least-squares problem of the samples of all recordings.
     """
-    changes = list[LoadChange]()
+    changes = dict[int, LoadChange]()
     numbers, counts = np.unique(problem.samples.recording, return_counts=True)
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
-        changes += _changes(problem, [known[0], *known[first : first + TOGETHER]])
-    return changes
+        for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
+            # The first recording is compared with all others, and is returned once.
+            changes.setdefault(change.recording, change)
+    return list(changes.values())
 
 
 def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadChange]:
