@@ -79,7 +79,9 @@ def _lint_inertial(link: str, inertial: Inertial, farthest: float) -> Iterator[F
     smallest, middle, largest = np.linalg.eigvalsh(matrix, UPLO="U").tolist()
     gyration = float(np.sqrt(max(largest, 0.0) / inertial.mass)) if inertial.mass > 0 else 0.0
     if gyration > _LARGEST_GYRATION:
-        message = f"a radius of gyration of {gyration:.3g} m: perhaps a tensor in kg mm2, or a mass in g"
+        message = (
+            f"a radius of gyration of {gyration:.3g} m: perhaps the tensor is in kg mm2, or the mass in g"
+        )
         yield "millimetres", where, line, message
     # A solid sphere of radius r has the radius of gyration r sqrt(2/5).
     volume = 4 / 3 * pi * (gyration * np.sqrt(5 / 2)) ** 3
@@ -132,7 +134,7 @@ def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
     if joint.lower is not None and joint.upper is not None and joint.lower >= joint.upper:
         message = f"lower {joint.lower:g} is above upper {joint.upper:g}: perhaps the two were swapped"
         if joint.lower == joint.upper:
-            message = f"lower and upper are both {joint.lower:g}: no motion, perhaps its type is fixed"
+            message = f"lower and upper are both {joint.lower:g}: it cannot move, perhaps its type is fixed"
         yield "lower-above-upper", f"{where} limit", line, message
 
 
@@ -190,7 +192,9 @@ def _lint_groups(robot: Robot, moving: Sequence[UrdfJoint]) -> Iterator[Finding]
         inertials = [inertial for name in group if (inertial := robot.link[name].inertial)]
         where, line = f"link {joint.child!r}", robot.link[joint.child].line
         if not inertials:
-            message = f"joint {joint.name!r} moves it, but no <inertial> is in it or in a link fixed to it"
+            message = (
+                f"joint {joint.name!r} moves it, but neither it nor a link fixed to it has an <inertial>"
+            )
             yield "missing-inertial", where, line, message
         elif not any(inertial.mass for inertial in inertials):
             message = f"joint {joint.name!r} moves it, but it and the links fixed to it have no mass"
