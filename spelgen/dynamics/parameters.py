@@ -79,7 +79,7 @@ NamedTensors = Mapping[str, Tensor]
 def idle_residuals(model: object) -> list[str]:
     """Return the names of the parameters of idle residual terms, whose value is zero for all q.
 
-    An empty list for a model without residual terms.
+    The list is empty for a model without residual terms.
     """
     terms = residual_terms(model)
     if terms is None:

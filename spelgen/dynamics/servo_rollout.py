@@ -27,8 +27,8 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
 
-    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n), since a
-    rollout with this layout takes two thirds of the time with (..., n, K).
+    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): with
+    this layout, a rollout takes two thirds of the time that it takes with (..., n, K).
     """
 
     servo: ServoConstants

@@ -174,7 +174,7 @@ def _joint_rows(labels: Sequence[str], errors: Mapping[str, Sequence[float | Non
 
 
 def limit_figures(results: Results) -> dict[str, float | None]:
-    """Return {name in `LIMITS`: figure of the model}; None for a figure that is not known.
+    """Return the figures of the model that the option --limit tests, {name in `LIMITS`: figure}; None if unknown.
 
     The relative error of a rollout is the error at the longest horizon, which is the most difficult one.
     """

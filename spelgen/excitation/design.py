@@ -114,7 +114,7 @@ def _checked_harmonics(
 ) -> int:
     """Return ``harmonics``; for None, 0.4 per second of ``duration``, at least 5.
 
-    Raises SettingsError for a bad argument of `excite`, which explains the arguments.
+    Raises SettingsError if an argument has an invalid value. The arguments are explained in `excite`.
     """
     bounded = {"duration": (duration, inf), "sample_rate": (sample_rate, inf)}
     bounded |= {"reach": (reach, 1.0), "speed": (speed, 1.0)}

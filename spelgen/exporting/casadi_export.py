@@ -119,9 +119,9 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
 
 
 def _in_kinetic_energy(model: TrainedModel, qd: ca.MX) -> ca.MX:
-    """Return the coefficients c, (m, 1), with which the residual term R of M gives 1/2 qd^T R qd = c^T r.
+    """Return the coefficients c, (m, 1), of the kinetic energy 1/2 qd^T R qd = c^T r of the residual term R of M.
 
-    r, (m, 1): the m nonzero entries in the lower triangle of R. qd: (n, 1) [rad/s, m/s].
+    r, (m, 1), are the m nonzero entries in the lower triangle of R. qd: (n, 1) [rad/s, m/s].
     """
     products = []
     for row, column in model.residuals.entries:

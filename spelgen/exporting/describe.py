@@ -128,7 +128,7 @@ class TrainedModel:
         breakaway: (n, K) [rad, m], break-away displacements of K bristles per joint.
         inputs: G, (n, n), joint torques = G times motor torques.
         actuated: (n,), 0 for a passive joint, otherwise 1.
-        torque_offset: (n,), measured torque at zero torque.
+        torque_offset: (n,), measured torque of a motor that exerts no torque.
         friction_compensation: (n,) [Nm s/rad, N s/m], coefficient of a torque proportional to qd that the drives add
             without measuring it.
         tip: frame of the tip.

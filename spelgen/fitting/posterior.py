@@ -245,7 +245,7 @@ class Posterior:
     def _root(self) -> Tensor:
         """Square root R (K, k) of the covariance R R^T of the K fitted parameters.
 
-        Its columns are the k eigenvectors of non-negligible variance, each times its standard deviation.
+        The columns of R are the k eigenvectors of non-negligible variance, each times its standard deviation.
         """
         values, vectors = torch.linalg.eigh(self.covariance)
         kept = values > 1e-14 * values.max()
@@ -332,8 +332,8 @@ def posterior_of(model: ArmModel, content: Content | None, delay: float, file: P
 def _tensor(content: Content, name: str, shape: tuple[int, ...]) -> Tensor | None:
     """Return the tensor ``name`` of a posterior's content.
 
-    Return None if the content has no tensor of this name, of the given shape and of type float64, if an element is not
-    finite, or if all elements are zero: such a content is damaged, or of another model.
+    Return None if the content is damaged or belongs to another model: it has no float64 tensor of this name and shape,
+    an element is not finite, or all elements are zero.
     """
     tensor = content.get(name)
     if isinstance(tensor, Tensor) and tensor.shape == shape and tensor.dtype == torch.float64:

@@ -40,7 +40,10 @@ class RolloutObjective(MomentumObjective):
     )  # fmt: skip
 
     def begin(self) -> list[Diagnostic]:
-        """Fit torques if `torque_first`, for a `RigidBodyDynamics`; compute the validation loss; return diagnostics."""
+        """Compute the validation loss of the initial model; return diagnostics for the user.
+
+        With the option `torque_first`, a `RigidBodyDynamics` is first fitted to the torques.
+        """
         if self.config.torque_first and isinstance(self.model, RigidBodyDynamics):
             samples = torque_samples(self.model, self.data)
             if samples is not None:
@@ -62,7 +65,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Minimize `momentum_loss`, then run epochs until the fit ends; call ``save`` after it and after each epoch."""
+        """Run the momentum stage, then epochs until the fit ends; call ``save`` after this stage and each epoch."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)

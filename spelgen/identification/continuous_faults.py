@@ -49,9 +49,8 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # The descent ends at steps of the offset below `smallest`: `min_offset` if it starts at the unchanged zero,
-        # since a smaller offset is only a calibration error. From another start, a multiple of 90 degrees, `smallest`
-        # is smaller, to make the offset accurate.
+        # The descent ends at a step below `smallest`. From the unchanged zero, this is `min_offset`: a smaller offset
+        # is only a calibration error. From a multiple of 90 degrees, it is smaller, so that the offset is accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -167,9 +166,9 @@ class Gravity(Compensation):
             """Return the vector (3,) in the direction of `gravity` with the magnitude `standard` [m/s^2]."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
-        # Gravity along -z is the first start: it is preferred if the log does not determine the sign of gravity, as for
-        # an arm whose only joint with a gravity load is vertical and prismatic: the load is constant, like the torque
-        # offset of the friction model.
+        # Gravity along -z is the first start, so it is preferred if the log does not determine the sign of gravity.
+        # Example: only a vertical prismatic joint carries a gravity load. This load is constant, so the torque offset
+        # of the friction model explains it for either sign.
         starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
         lowest = min(fit.cost for fit in starts)
         start = next(fit for fit in starts if fit.cost < lowest + 1.0)

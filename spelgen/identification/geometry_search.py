@@ -117,7 +117,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     remaining, deviating = np.unique(number).tolist(), list[int]()
 
     def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
-        """Return {recording: squared residual (n,) / torque variance}, with parameters of a fit to only `fitted`."""
+        """Return {recording: squared residual (n,) / torque variance} of a fit to only the recordings `fitted`."""
         counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
         residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
         scale = np.maximum(tau.var(axis=0), 1e-30)

@@ -100,10 +100,10 @@ def _per_signal(values: np.ndarray) -> np.ndarray:
 
 
 def _permuted(values: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Return signals (S, n, 4, E), with the motion of joint source[0, k] and the torque of joint source[1, k] at k.
+    """Return signals in which joint k has the motion of joint source[0, k] and the torque of joint source[1, k].
 
-    values: (S, n, 4, E), see `MotionSamples`. Without a permutation, the result is `values` itself: a copy would take a
-    twentieth of the time of a search.
+    values: signals (S, n, 4, E), see `MotionSamples`; the result has the same shape. Without a permutation, the result
+    is `values` itself: a copy would take a twentieth of the time of a search.
     """
     if (source == np.arange(source.shape[1])).all():
         return values
@@ -220,8 +220,8 @@ class Fault(ABC):
     def thorough_fits(self, problem: GeometryProblem, unchanged: HypothesisFit) -> Iterable[HypothesisFit]:
         """Return least-squares fits of hypotheses that take seconds to find, such as permutations of all columns.
 
-        `compare_hypotheses` calls this method only if none of the quick `fits` explains the torques, or if in the best
-        one the delay of a signal drifts with time. unchanged: fit of the unchanged log.
+        `compare_hypotheses` calls this method in two cases: no quick fit (from `fits`) explains the torques, or the
+        best quick fit has a delay that drifts with time. unchanged: fit of the unchanged log.
         """
         return ()
 
@@ -232,7 +232,8 @@ class Fault(ABC):
     def joints(self, correction: Correction) -> list[str]:
         """Return the names of the joints with the fault, for a message.
 
-        These joints have settings that correct the fault; if no joint has, all joints are returned.
+        A joint has the fault if `joint_keys` returns settings for it. If it returns none for any joint, the names of
+        all joints are returned.
         """
         names = correction.arm.joint_names
         return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)

@@ -103,7 +103,8 @@ class Identification:
             q: (T, n) positions [rad, m].
             qd: (T, n) velocities [rad/s, m/s].
             qdd: (T, n) accelerations [rad/s^2, m/s^2].
-            z: (T, n, K) [rad, m] bristle states of a friction model with hysteresis; None for other friction models.
+            z: (T, n, B) [rad, m] states of the B bristles of each joint, for a friction model with hysteresis; None
+                for other friction models.
         """
         past = None if z is None else torch.as_tensor(z)
         position, velocity, acceleration = (torch.as_tensor(np.asarray(x, float)) for x in (q, qd, qdd))

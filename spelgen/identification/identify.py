@@ -57,9 +57,9 @@ def identify_by(
     methods: Sequence[LeastSquares],
     preprocessing: Preprocessing,
 ) -> list[Identification]:
-    """Return one identification per method (weights and friction model) from the same logs; see `identify`.
+    """Return one identification for each of `methods` (weights and friction model); see `identify`.
 
-    The logs are filtered only once.
+    All identifications use the same logs, which are filtered only once.
     """
     joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
     require_torques(logs)

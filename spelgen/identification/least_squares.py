@@ -100,8 +100,8 @@ def solve(product: np.ndarray, columns: np.ndarray) -> Solution:
 def deviations(residuals: Sequence[np.ndarray], parameters: int) -> np.ndarray:
     """Return standard deviations (n,) of the torque errors [Nm, N] for formulas that assume independent errors.
 
-    The residuals of filtered torques are correlated in time. Their variance is therefore multiplied by their
-    correlation time in samples.
+    The residuals of filtered torques are correlated in time. The variance of the residuals is therefore multiplied by
+    the correlation time, in samples.
 
     Args:
         residuals: torque residuals (T, n) of each trajectory [Nm, N].

@@ -37,11 +37,11 @@ class LoadChange(NamedTuple):
 def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     """Return the changes of the load between recordings that the torques show; [] if there are none.
 
-    The torques of all recordings are fitted by one set of parameters, and in addition by a mass and first moment of the
-    last body for each recording. These loads must lower the negative log likelihood significantly, and by more than
-    torque offsets, or viscous and Coulomb friction, of each recording would. A change is then returned for each
-    recording whose load differs significantly from the load of the reference, and whose squared residual of some joint
-    is at least halved by its own load.
+    The torques of all recordings are fitted by one set of parameters, plus one load per recording: a mass and a first
+    moment that are added to the last body. The loads must lower the negative log likelihood significantly. Two other
+    models must lower it less: one torque offset per joint and recording, and own viscous and Coulomb friction of each
+    recording. A change is then returned for each recording that meets two conditions: its load differs significantly
+    from the load of the reference recording, and its own load at least halves the squared residual of some joint.
 
     problem: least-squares problem of the samples of all recordings.
     """
@@ -50,13 +50,13 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
         for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
-            # The first recording is compared with all others, and is returned once.
+            # The first recording is part of every group; only its first change is returned.
             changes.setdefault(change.recording, change)
     return list(changes.values())
 
 
 def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadChange]:
-    """Return the changes of the load in some recordings (see `load_changes`)."""
+    """Return the changes of the load between the given recordings (indices), see `load_changes`."""
     subset = problem.selected(np.isin(problem.samples.recording, recordings)).thinned(SAMPLES)
     fit = subset.fit(subset.unchanged)
     rows, _ = subset.equations(subset.unchanged)

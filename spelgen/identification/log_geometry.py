@@ -171,8 +171,8 @@ class GeometryProblem:
                 self._chains[hypothesis.gravity] = body_chain(self.arm, hypothesis.gravity)
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
-                # The samples contain deflections for the current mapping, so the joints are permuted and the signs
-                # reversed like the motion.
+                # The deflections of the samples were computed with the current mapping. The hypothesis therefore
+                # exchanges their joints and reverses their signs in the same way as those of the motion.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 rows = np.concatenate([rows, bristle_columns(bent, self.speeds)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
@@ -197,12 +197,14 @@ class GeometryProblem:
         mean, precision, freedom = self.prior_mean, self._precision, self._bodies / 2
         errors, scale = np.full(len(normal), 0.1), 0.1
         x, gains, lowest = mean, np.ones(len(normal)), np.inf
-        # Six reweightings: further ones change the cost by less than 0.1. With unknown gains, the first six iterations
-        # alternate between gains and parameters, and the others are steps of both together, which converge faster near
-        # the minimum; they may oscillate under a wrong hypothesis, so that the iteration of lowest cost is used.
+        # Six reweightings suffice: further ones change the cost by less than 0.1. With unknown gains, the first six
+        # iterations alternate between gains and parameters. The other eight are steps of both together, which converge
+        # faster near the minimum. Under a wrong hypothesis these steps may oscillate, so the iteration of lowest cost
+        # is used.
         for iteration in range(14 if self._has_free_gains else 6):
             if self._has_free_gains and iteration < 6:
-                # regressions of the model's torques on the logged ones; positive, even if they are not correlated
+                # Gain of a joint: coefficient of a regression of the model's torque on the logged torque. It is kept
+                # positive, even if both torques are not correlated.
                 load = np.maximum((normal @ x) @ x, 1e-9 * total)
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
@@ -321,11 +323,12 @@ class GeometryProblem:
     def _implausible(self, x: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> float:
         """Return the penalty for negative inertias, and for friction that drives the motion on average.
 
-        Tested are the rotor inertias, and the mass and moments of inertia of the bodies that carry no joint, which have
-        a wide prior. Each violation adds half of its squared standard score to the cost, up to a bound. The bound is
-        needed, since the right hypothesis may have one violation: a drive may compensate friction, and errors of the
-        friction model may resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the
-        motion (joint 6), another one has a negative rotor inertia, and none has both.
+        Three quantities must not be negative: the rotor inertias, the power that friction dissipates at each joint, and
+        the mass and moments of inertia of bodies that carry no joint (their prior is wide). A negative quantity adds
+        (quantity / standard deviation)^2 / 2 to the penalty, up to a bound. The bound is needed, since the right
+        hypothesis may have one negative quantity: a drive may compensate friction, and errors of the friction model may
+        resemble inertia. Of the arms of benchmarks/recordings.py, one has friction that drives the motion (joint 6),
+        another one has a negative rotor inertia, and none has both.
 
         Args:
             x: (K,) parameters.
@@ -337,8 +340,8 @@ class GeometryProblem:
         functionals = np.zeros((2 * n + len(self._last), len(x)))
         functionals[drives, armature] = 1.0
         # `functionals` @ x: first the n rotor inertias, then for each joint the power dissipated by friction, qd
-        # (viscous qd + Coulomb sign(qd)), summed over the samples. The sums of qd^2 and qd sign(qd) are entries of its
-        # Gram matrix.
+        # (viscous qd + Coulomb sign(qd)), summed over the samples. The sums of qd^2 and qd sign(qd) are entries of the
+        # joint's Gram matrix. The last rows are the mass and moments of inertia of bodies that carry no joint.
         functionals[n + drives, viscous] = normal[drives, viscous, viscous]
         functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
         functionals[2 * n + np.arange(len(self._last)), self._last] = 1.0
@@ -433,8 +436,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # the standard deviations of the prior are 50 %: of the mass, of the body's extent for the centre of mass, and of
-    # mass times squared radius of gyration for the tensor
+    # The standard deviations of the prior are 50 %: for the mass, of the mass; for the centre of mass, of the body's
+    # extent; for the inertia tensor, of mass times squared radius of gyration.
     return 0.5 * root
 
 

@@ -40,8 +40,8 @@ class MotionSamples(NamedTuple):
         values: (S, n, 4, E) q [rad, m], qd, qdd (per s, per s^2) and tau [Nm, N] at the E times `OFFSETS` relative to
             each sample. Before the start and after the end of a recording, the first and last values continue. E = 1 if
             a sample has only the signals at its own time, which suffice if no delays are tested.
-        bent: (S, n, K) deflections of K bristles per joint, divided by the break-away displacements, for the motion as
-            the mapping of the log converts it; K = 0 for samples without a history of motion.
+        bent: (S, n, K) deflections of K bristles per joint, divided by the break-away displacements, computed from
+            positions that were converted by the mapping of the log; K = 0 for samples without a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
         times: (S,) times of the samples since the start of their recording [s]; unused and 0 for E = 1.
         recording: (S,) index of the recording of each sample, in the order in which recordings were added.
@@ -181,7 +181,7 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
-        """Return every `_every`-th sample at which the arm moves, with the signals at the times `OFFSETS` around it.
+        """Return every k-th of the samples in motion (k = `_every`), with the signals at the times `OFFSETS` around it.
 
         start: time from the start of the recording to the first of `samples` [s].
         """

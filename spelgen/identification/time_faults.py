@@ -100,10 +100,11 @@ class JointClock(Fault):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
         """Return the least-squares fit of the torques with a delay that changes linearly with time.
 
-        The search starts from the delay of `base`. If there is no delay, it starts from delays at the start and end of
-        a recording by one Gauss-Newton step from the fit `base`, for each set of `_delayed_signals`. The residual's
-        derivatives with respect to the two delays are (1 - t) d and t d: t is the relative time, 0 to 1, and d the
-        derivative for a constant delay. [] is returned if the delay of `base` already changes.
+        If the hypothesis of `base` has a delay, the search starts from this delay, without a change. Otherwise each set
+        of `_delayed_signals` gives an initial guess: the delays at the start and at the end of a recording after one
+        Gauss-Newton step from zero. The derivatives of the residual with respect to these two delays are (1 - t) d and
+        t d, with the relative time t from 0 to 1 and the derivative d with respect to a constant delay. [] is returned
+        if the delay of `base` already changes.
         """
         reading = base.hypothesis
         if reading.drift.any() or not problem.samples.longest_delay:
@@ -128,9 +129,9 @@ class JointClock(Fault):
         """Return at most three least-squares fits in which the delay of some signals changes linearly with time.
 
         The delay is 0 at the start of a recording. An initial guess has a set of delayed signals (from
-        `_delayed_signals`) and a delay at the end [s] (from `GEOMETRY.clock_starts`). All combinations are tried, and
-        the three of lowest cost are refined, which have the right signals and the right sign of the drift. unchanged:
-        fit of the unchanged log.
+        `_delayed_signals`) and a delay at the end [s] (from `GEOMETRY.clock_starts`). All combinations are evaluated,
+        and the three of lowest cost are refined: one of them probably has the right signals and the right sign of the
+        drift. unchanged: fit of the unchanged log.
         """
         reading, starts = unchanged.hypothesis, []
         for signals in _delayed_signals(len(reading.offset)) if problem.samples.longest_delay else ():

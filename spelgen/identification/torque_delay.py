@@ -156,8 +156,8 @@ def _estimate(rows: np.ndarray) -> _Estimate:
         squares = unexplained @ products.sum(axis=1) @ unexplained
         noise = np.sqrt(np.maximum(squares / len(rows), np.square(TUNING.least_noise * least)))
     spread = np.var([_least(total - block)[0] for block in by_block]) * (HINTS.blocks - 1)
-    # The standard error is infinite for a delay above the limit, where friction may look like a delay, and for equal
-    # jackknife estimates of all blocks, since there are then too few samples.
+    # The standard error is infinite in two cases. Above `longest_delay`, the apparent delay may be due to friction. If
+    # the jackknife estimates of all blocks are equal, there are too few samples.
     unknown = abs(delay) > HINTS.longest_delay or spread == 0
     standard_error = np.inf if unknown else float(np.sqrt(spread))
     return _Estimate(delay, standard_error, float((squares / least**2).sum()))
@@ -167,8 +167,8 @@ def _least(products: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the delay [s] with the smallest torque residual, and the coefficients (K + D,) of this residual.
 
     The residual is Y p - T w, with the regressor Y (K columns), the parameters p, and D columns T of torques at the
-    times `OFFSETS` relative to the samples. The weights w (D,) of a cubic spline interpolate the torque at the delay,
-    which is valid, since filtered torques are smooth over one step. The coefficients are p and -w.
+    times `OFFSETS` relative to the samples. T w is the torque at the delay: w (D,) are the weights of interpolation by
+    a cubic spline, which is accurate because filtered torques are smooth. The coefficients are p and -w.
 
     products: (K + D, K + D) Gram matrix of the columns of Y and T.
     """

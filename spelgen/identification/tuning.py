@@ -93,7 +93,7 @@ class LogGeometryTuning:
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.
     load: float = 0.5
-    # [m] Standard deviation of the distance of its centre of mass from the origin of the last body.
+    # [m] Standard deviation of the distance of this load's centre of mass from the origin of the last body.
     load_distance: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200

@@ -43,11 +43,11 @@ class ContactObserver:
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
-        level: Mean square of the normalised residual in about the last half second, which multiplies its variance if it
-            exceeds 1, (n,). Residuals are larger in some motions than in others, for example if the arm vibrates. The
-            last two blocks of samples (see `Block`) are not part of the level, so that a contact does not raise the
-            threshold before it is detected. The squares are limited to `TUNING.level_limit`, so that slow contacts
-            raise the thresholds by a factor of at most two.
+        level: Mean square of the normalised residual in about the last half second, (n,). If the level exceeds 1, the
+            variance of the residual is multiplied by the level, since residuals are larger in some motions, for example
+            if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that a
+            contact does not raise the threshold before it is detected. The squares are limited to `TUNING.level_limit`,
+            so that slow contacts raise the thresholds by a factor of at most two.
         normalised: Magnitude of the external torque beyond the bound at rest, divided by its standard deviation, which
             is compared with `NoiseLevels.thresholds`, (n,) [1].
     """

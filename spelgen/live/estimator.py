@@ -198,10 +198,9 @@ class Estimator:
 
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.
-            ahead: time from the last sample to the motion [s]. The torques contain the disturbance that the drift
-                filter estimates. It decays during this time; if the time is longer than 0.3 s, the disturbance is
-                omitted. With `compensate_external`, the torque residual of the momentum observer is the disturbance,
-                which decays and is omitted in the same way.
+            ahead: time from the last sample to the motion [s]. The torques contain a disturbance that decays during
+                this time; if the time is longer than 0.3 s, the disturbance is omitted. The disturbance is the estimate
+                of the drift filter or, with `compensate_external`, the torque residual of the momentum observer.
         """
         at = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
         z = torch.from_numpy(self.intake.bounds.mean(axis=0))

@@ -55,7 +55,7 @@ def noise_levels(fit: Fit) -> NoiseLevels:
 
 
 # These fits use one thread, like the fit of the run. With torch 2.13, the factorisation of a batch of large matrices
-# does not end if the number of threads was raised before, and the end of a fit raises it.
+# does not end if the number of threads was raised before, as at the end of a fit.
 @threads_of_torch(1)
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation on its logs.
@@ -336,8 +336,8 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     scale = np.maximum(together - start, 0).sum(axis=0) / count
     # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
     # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
-    # the joints (James and Stein, 1961). It is at most 1 - 1 / n: `peak_count` is then at most n `count`, the number of
-    # peaks of all n joints.
+    # the joints (James and Stein, 1961). This weight is limited to 1 - 1 / n, so that `peak_count` is at most n `count`,
+    # the number of peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)

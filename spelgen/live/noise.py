@@ -1,6 +1,6 @@
-"""Noise levels of an arm for the online estimator: thresholds from them, and storage in the run folder.
+"""Noise levels of an arm for the online estimator, and contact thresholds that are computed from the noise levels.
 
-They are estimated from the training logs (``live.levels``) and stored as estimator.json.
+The noise levels are estimated from the training logs (``live.levels``) and stored in the run folder, as estimator.json.
 """
 
 import math

@@ -189,8 +189,9 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     """Return the indices of the samples at which the load changes.
 
-    A change is omitted if no payload is reported before it and "no payload" is reported later: the two loads differ by
-    less than the errors of the model.
+    Each sample with `load_changed` is returned, except for a change between two loads that are both no payload: the
+    status before it is not "payload", and the status after it is "no payload". Such loads differ by less than the
+    errors of the model.
 
     states: estimates after each sample of a log.
     """

@@ -61,7 +61,7 @@ class AnimatedMotion:
 class AnimatedArm:
     """The animated picture of an arm.
 
-    data: JSON for the script, the shapes of the links and the motions. motions: labels of the motions to choose from.
+    data: shapes of the links and motions, as JSON for the script of the page. motions: labels of the motions.
     tubes: sentence about links without meshes, which are drawn as tubes.
     """
 

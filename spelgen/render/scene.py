@@ -40,7 +40,7 @@ class SceneLink:
         axis: Joint axis in the joint frame, (3,).
         slides: Whether the link moves along the axis; otherwise it rotates about the axis.
         joint: Index of the joint in q; -1 for a link that does not move relative to its parent.
-        ratio: Displacement per displacement of q[joint].
+        ratio: Displacement of the joint divided by the displacement of q[joint].
         offset: Displacement for q[joint] = 0 [rad, m].
         shape: Triangles of the link.
     """

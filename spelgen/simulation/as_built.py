@@ -53,7 +53,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
     """Write `settings` next to the URDF `path`; return the arm that is loaded from both files.
 
-    As for ``arm``, angles of the URDF within its angle tolerance of a multiple of pi/2 are rounded to the multiple.
+    An angle of the URDF is rounded to a multiple of pi/2 if the two differ by less than the angle tolerance of ``arm``.
     """
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)

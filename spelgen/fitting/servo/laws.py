@@ -31,8 +31,8 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    # A cost with a dead zone is NaN or infinite if a rollout diverged: no dead zone is then selected. Costs without are
-    # finite, since the rollouts at x are.
+    # A cost with a dead zone is NaN or infinite if a rollout diverged: no dead zone is then selected. Costs without a
+    # dead zone are finite, since the rollouts at x are finite.
     better = costs_with + TUNING.significance**2 / 2 < costs_without
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
     active[problem.parameters.row(DEAD_ZONE)] = better

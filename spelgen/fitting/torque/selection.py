@@ -207,9 +207,9 @@ def _blocks(count: int) -> list[slice]:
 def _folds(recordings: torch.Tensor, gap: int) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Yield two masks (T,) per fold: the held-out samples, and the fitted samples.
 
-    Of several recordings, each fold holds out one or more, whole. A single recording is divided into blocks, and the
-    `gap` samples before and after a held-out block are in neither mask. recordings: (T,), index of the recording of
-    each sample.
+    If there are several recordings, each fold holds out one or more complete recordings. A single recording is divided
+    into blocks, each held out once; the `gap` samples before and after a held-out block are in neither mask.
+    recordings: (T,), index of the recording of each sample.
     """
     # Whole recordings are held out if possible: they differ in day, load and motion, so their errors differ more than
     # the errors of blocks of one recording.

@@ -164,9 +164,10 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose the joints with Stribeck effect, saturation and load dependence of friction; return the new estimate.
 
     The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. An effect has
-    to improve Akaike's criterion with one parameter. Saturation is tested first, at all joints together: the evidence
-    of each joint is limited to strong evidence, since saturation may explain another error of the model at one joint,
-    and would extrapolate this error to other speeds. Then all effects are tested (see `_rejected`).
+    to improve Akaike's criterion with one parameter. Saturation is tested first, at all joints together: the sum of the
+    joints' evidence must favour it. The evidence of a joint counts at most as `TUNING.strong_evidence`, since at one
+    joint saturation may explain another error of the model, which it would extrapolate to other speeds. Then all
+    effects are tested (see `_rejected`).
     """
     # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     penalty, limit = 2.0, TUNING.strong_evidence
