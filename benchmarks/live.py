@@ -175,7 +175,7 @@ def synthetic_loads(case: Case) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return the estimate of `ahead` seconds before each sample: friction scale minus one, and disturbance, (2, T, n).
+    """Return estimates made `ahead` seconds before each sample: friction scale minus one, and disturbance, (2, T, n).
 
     The disturbance decays with the time constant of the noise levels; after more than 0.3 s it is zero.
     """
@@ -223,7 +223,7 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the times of filtered samples of a log, (T,) [s]: filtered likewise, with the time in place of torques."""
+    """Return the times of filtered samples of a log, (T,) [s]: the time is filtered in place of the torques."""
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)

@@ -29,7 +29,9 @@ SHORTEST = 5.0  # [s] shortest duration of a hold
 
 
 def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
-    """Yield the rows of each hold of a joint: its command is constant since `AT_REST`; at most a minute.
+    """Yield the rows of each hold of a joint, during which the joint's command is constant.
+
+    A hold begins `AT_REST` seconds after the last change of the command, and lasts a minute at most.
 
     t: (T,) [s]. command: (T,) [rad].
     """

@@ -84,7 +84,7 @@ def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleT
 
 
 def printed_without_structure(code: str, path: Path) -> str:
-    """Run Python code with `path` as argument, in a process that cannot import the derivation; return its output."""
+    """Run Python code with `path` as argument, in a process that cannot import spelgen.structure; return its output."""
     blocked = ("sympy", "flint", "spelgen.structure", "spelgen.emission.plan", "spelgen.arm.arm")
     program = f"import sys\nfor name in {blocked}:\n    sys.modules[name] = None\n{code}"
     run = subprocess.run(
@@ -163,7 +163,7 @@ def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
 
 
 def bounded(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
-    """Return at which states q (..., n) the model's bound changes M to keep it positive definite, (...,) boolean."""
+    """Return a mask (...): True for states q (..., n) at which the model changes M to keep it positive definite."""
     part: torch.Tensor = model.at(q).intermediates[1]
     return part < 1
 

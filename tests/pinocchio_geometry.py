@@ -61,7 +61,10 @@ class Seen:
         return np.abs(axis @ down if self.slides(joint) else np.cross(axis, down)).max() < NOTHING
 
     def commute(self, mover: int, others: list[int]) -> bool:
-        """Return True if the motion of joint `mover` changes no axis of `others`: lines, or directions if sliding."""
+        """Return True if the motion of joint `mover` moves no axis of the joints `others`.
+
+        The axis of a revolute joint is a line, the axis of a prismatic joint a direction.
+        """
         for q in self.configurations:
             moved = q + 0.7 * np.eye(self.n)[mover - 1]
             before, after = self._places(q), self._places(moved)

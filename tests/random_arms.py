@@ -44,8 +44,8 @@ class DrawnArm:
 class _Style:
     """Choice of numbers for the URDF of one arm: angles, offsets and axes of joints.
 
-    Right angles go with straight sliding axes: several skew axes have relations, such as 60 degrees, that no rational
-    rotation has, and that spelgen keeps to 1e-11 only.
+    The style "right angles" has prismatic joints along x, y or z only. Two skew axes may have an angle such as 60
+    degrees, which no rational rotation has, so that spelgen represents it with an error of 1e-11.
     """
 
     angles: tuple[str, ...]
@@ -67,7 +67,7 @@ STYLES = {
 def arms(draw: Any) -> DrawnArm:
     """Draw an arm of 2 to 6 joints, some with fixed plates between, a side branch, or a mimic joint.
 
-    Hypothesis draws the joint types and such options, and the seed of the numbers.
+    Hypothesis draws the joint types, these options, and the seed of the numbers.
     """
     style = STYLES[draw(st.sampled_from(tuple(STYLES)))]
     kinds = draw(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6))

@@ -30,8 +30,8 @@ def compiled(package: Path, folder: Path, *flags: str) -> ctypes.CDLL:
     for source in sorted((package / "src").glob(f"{name}*.c")):
         objects.append(folder / f"{source.stem}.o")
         subprocess.run(["gcc", "-std=c99", *warnings, "-c", source, "-o", objects[-1]], check=True)
-    # In one unit, controller first, the headers are read once, which takes a third less time. A class of an included
-    # file may then not have fields of its anonymous namespace, hence the exception.
+    # The harness includes the controller, so that the headers are compiled once, in a third less time. A class of an
+    # included file has fields with types of its anonymous namespace, about which the compiler would warn.
     sources = [
         "-Wno-subobject-linkage",
         "-include",

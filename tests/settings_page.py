@@ -142,7 +142,10 @@ def rows(path: str, group: type[Group]) -> Iterator[tuple[str, ...]]:
 
 
 def meanings(group: type[Group], name: str, field: FieldInfo) -> dict[tuple[str, str], list[str]]:
-    """Return the objectives to which a training option belongs, by its description and default; none for other keys."""
+    """Return {(description, default) of a key: objectives to which it belongs}, for the rows of the table.
+
+    An option of several objectives has an entry per description and default. The list of a key of no objective is [].
+    """
     if group is not TrainingSettings or name not in OWNERS:
         value = field.get_default(call_default_factory=True)
         if group is TrainingSettings and name in PREPROCESSING:

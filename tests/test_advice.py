@@ -88,7 +88,7 @@ def test_gain_of_torques_in_another_unit(arm, factor):
 
 @pytest.mark.parametrize("arm", ["rpr", "ur10e"], indirect=True)
 def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
-    """The advised line corrects the sense of the torques; if their unit is still wrong, the next message does."""
+    """The advised line corrects the sense of the torques; the next message corrects their unit if it is still wrong."""
     path = logged(arm, recorded(arm, 6), tau=-0.02)
     message = message_of(arm, path)
     assert "of the opposite sense" in message

@@ -579,7 +579,7 @@ class TestReferenceArms:
             assert arm.inertials_complete == (expected["inertials"] is not None)
 
     def test_the_default_chain_is_the_expected_one(self, shared):
-        """The default chain is the stated one for all but three of 189 arms.
+        """The default chain equals the chain in the reference data for all but three of 189 arms.
 
         Two of these robots have two equal arms, and one has a jaw whose name does not distinguish it from a wrist.
         """

@@ -168,7 +168,7 @@ def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     still = "velocity stays constant"
     better = "A constant velocity predicts better 1 s ahead: there, use the model for torques only."
     assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
-    # Torques of which 60 % are explained have no use that could be recommended.
+    # A model that explains 60 % of the torque variance has no use that could be recommended.
     assert "better 1 s ahead. " in f"{verdict(evaluation(0.9, 0.4, **{still: 0.6})).because} "
     held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
     assert "A constant velocity" not in verdict(held).because

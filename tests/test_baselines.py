@@ -89,7 +89,7 @@ def test_damping_far_beyond_an_explicit_step_is_integrated():
 
 
 def test_stiff_friction_with_a_state_is_integrated():
-    # less than the 2 N of friction, so that the slider does not slide
+    # the force of 1 N is below the 2 N of friction, so that the slider does not slide
     stiff, windows = Bristled(1e-3, 5.0), pushed(push=1.0)
     q, qd = roll_out_stiff(stiff, windows, 8)
     held = 1e-3 / 2  # at rest the bristle holds 1 N of 2 N: z / reach = 1 / 2

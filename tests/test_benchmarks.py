@@ -79,7 +79,7 @@ def test_noise_has_its_level_correlation_and_spectrum():
     assert sum(found.power) == pytest.approx(1.0)
     # spectrum of AR(1) noise: a share of 2 / pi arctan(2 pi f time) of its power is below the frequency f
     below = 2 / np.pi * np.arctan(np.pi * np.array(residual_statistics.BANDS[1:-1]))
-    # within the resolution of a periodogram of 4 s
+    # the tolerance is the resolution of a periodogram of 4 s
     np.testing.assert_allclose(np.cumsum(found.power)[:-1], below, atol=0.09)
 
 

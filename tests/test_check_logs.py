@@ -184,7 +184,7 @@ def test_noise_and_encoder_steps_are_estimated(log):
         assert quantisation_step(np.round(log.q[:, 0] / step) * step) == pytest.approx(step, rel=1e-6)
     assert np.isnan(quantisation_step(noisy.q[:, 0]))
     assert np.isnan(quantisation_step(np.ones(100)))
-    # Levels that differ by rounding errors are no levels: millimetres that were converted to metres.
+    # Levels that differ only by rounding errors, as of millimetres that were converted to metres, count as one level.
     rounded = np.tile([1e-3, 1e-3 + 2e-19, 2e-3, 2e-3 + 4e-19, 4e-3, 5e-3], 20)
     assert quantisation_step(rounded) == pytest.approx(1e-3)
     assert np.isnan(statistics(log[::4]).signals["q"][2]).all()
@@ -472,7 +472,7 @@ def test_a_joint_that_never_reverses_is_reported(loaded, log):
     moved = replace(log, q=q, qd=np.column_stack([forward, log.qd[:, 1:]]), tau=np.ones_like(log.tau))
     one_way = [x.where for x in check_logs([moved], loaded).findings if x.code == "one-way"]
     assert one_way == [f"joint {loaded.chain.joint_names[0]!r}"]
-    # it is enough that the joint reverses in another log
+    # a joint that reverses in another log is not reported
     back = replace(log, name="back")
     assert "one-way" not in {x.code for x in check_logs([moved, back], loaded).findings}
 

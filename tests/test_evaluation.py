@@ -402,7 +402,7 @@ def test_torque_errors_by_the_protocol():
 def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
     """Torque errors are pooled over all samples of all logs, once with pauses and once without.
 
-    A short log whose torque hardly varies, with a large nMSE of its own, has a weight by its number of samples.
+    A short log whose torque hardly varies has a large nMSE of its own, but only the weight of its few samples.
     """
     random = np.random.default_rng(0)
     samples = []

@@ -195,7 +195,7 @@ def test_spring_extrapolates_to_positions_without_samples(hybrid):
 
 
 def test_slow_passes_are_few_errors(hybrid):
-    """The errors of a joint that passes its range once are as few independent errors as the range has splines."""
+    """If a joint passes its range once, its samples count as only 1 + range / knot spacing independent errors."""
     from spelgen.fitting.torque.joint_functions import joint_functions
 
     lengths = []
@@ -270,7 +270,7 @@ def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolutio
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_second_of_motion_supports_no_fit(shared, arm):
-    """After 1.5 s of motion a fit warns of too few data, with equally good methods and the seconds of motion needed."""
+    """A fit to 1.5 s of motion warns of too few data: it names methods of similar error, and the seconds to record."""
     _, codes, messages = first_seconds(shared / "logs", arm, 1.5)
     assert "few-data" in codes
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]
@@ -280,7 +280,7 @@ def test_a_second_of_motion_supports_no_fit(shared, arm):
     ("seconds", "advice"), [(5.0, "record about 23 s"), (70.0, "a longer log would not help")]
 )
 def test_a_longer_recording_is_advised_only_if_the_recording_is_short(robots, seconds, advice):
-    """Logs of more than a minute that support no fit are no reason to record a minute.
+    """A fit that the logs do not support advises a longer recording, unless the logs have more than a minute.
 
     The held-out nMSE of both fits is replaced by 2, four times the largest one of a supported fit.
     """

@@ -76,7 +76,7 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
 
 
 def test_a_random_motion_beyond_effort_limits_is_called_so(found):
-    """The comparison with a random motion is no praise of a motion that the drives cannot run."""
+    """If the random motion of the comparison exceeds effort limits, the text says so next to its condition number."""
     assert not found.first_overruns
     assert "beyond effort limits" not in found.text()
     assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
@@ -147,7 +147,8 @@ def test_an_arm_without_limits_gets_modest_ones(tmp_path):
 def test_joints_that_follow_keep_their_limits_too(tmp_path):
     """A mimic joint stays within its own limits: b = 0.5 a - 0.1.
 
-    -0.3 <= b <= 0.2 and |db/dt| <= 0.1 rad/s give -0.4 <= a <= 0.6 and |da/dt| <= 0.2 rad/s, of a's own 1 and 2.
+    The limits -0.3 <= b <= 0.2 and |db/dt| <= 0.1 rad/s of b give -0.4 <= a <= 0.6 and |da/dt| <= 0.2 rad/s, which are
+    narrower than the limits of a.
     """
     path = coupled_urdf(tmp_path / "coupled.urdf")
     limits = 'lower="-1" upper="1" effort="10" velocity="2"/><mimic'

@@ -29,7 +29,7 @@ ENTRIES = (
 
 @pytest.fixture(scope="module", autouse=True)
 def functions_parsed_once():
-    """For each file, torch's exporter parses the source of 500 functions and lists them again, in nearly a second."""
+    """Cache the 500 functions that torch's exporter would parse and list for each file, in nearly a second."""
     parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
     listed = staticmethod(functools.cache(ONNXRegistry.from_torchlib))
     with pytest.MonkeyPatch.context() as patch:

@@ -484,7 +484,7 @@ def test_a_clock_that_goes_back_while_the_motion_continues_is_joined(tmp_path, f
 
 @pytest.mark.parametrize("unit", [60.0, 3600.0, 86400.0])
 def test_times_in_minutes_hours_or_days_are_not_units_of_positions(tmp_path, unit):
-    """Times in a unit that a mapping does not have get the rate that all velocities show, and no unit of positions."""
+    """For times in minutes, hours or days, the error advises the right `sample_rate`, and no unit of the positions."""
     pa.parquet.write_table(pa.table(columns() | {"t": T / unit}), tmp_path / "x.parquet")
     log = read_logs(tmp_path / "x.parquet", JOINTS)
     with pytest.raises(LogError, match="write 'sample_rate: 100'") as caught:

@@ -87,7 +87,7 @@ def columns(arm, friction, q, qd, qdd):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_make_the_torque(robots, robot):
-    """The regressor equals the columns of the base parameters, times the matrix that combines parameters to them."""
+    """The regressor Y of all parameters equals Y[:, columns] @ combination, with both attributes of the result."""
     arm, friction = load_arm(robots / f"{robot}.urdf").chain, FrictionModel(stribeck=True)
     base = base_parameters(arm, friction)
     states = np.random.default_rng(5).uniform(-2, 2, (3, 60, len(arm.coordinates)))
@@ -134,7 +134,10 @@ def test_a_known_arm_is_found_exactly(robots):
 
 
 def test_negative_viscous_friction_is_a_warning(robots):
-    """A coefficient of -3 at joint 2 (-2.9 after the low-pass filter), and of 3 at the other joints."""
+    """The warning about negative viscous friction names joint 2, and no other joint.
+
+    The coefficient is -3 at joint 2 (-2.9 after the low-pass filter), and 3 at the other joints.
+    """
     arm = load_arm(robots / "rpr.urdf")
     log, _ = excited(arm.chain, noise=0.01)
     tau = log.tau - 6.0 * log.qd * [0.0, 1.0, 0.0]

@@ -38,14 +38,14 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 
 # Modules that a file may not import, neither directly nor through others.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
-# allowed everywhere: it computes G from the files, without the exact arithmetic of its folder
+# Module that every file may import: it computes G from the files, without the exact arithmetic of its folder.
 PLAIN = {"spelgen.arm.actuation"}
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
-# the modules of `emission` that make models in memory, and so import torch
+# Modules of `emission` that make models in memory, and therefore import torch.
 MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "scene")}
-# modules that fit least squares as well, whose base parameters are exact
+# Modules that also identify by least squares, for which they import the exact base parameters.
 LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {
@@ -77,7 +77,7 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
 
 
 def test_no_file_imports_from_a_higher_layer():
-    """No file imports a module of NEVER, directly or indirectly: for instance derivation imports no torch."""
+    """No file imports the modules that NEVER lists for it, directly or indirectly: derivation imports no torch."""
     wrong = {}
     for name, never in NEVER.items():
         modules = reached(name) - PLAIN

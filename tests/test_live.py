@@ -216,7 +216,7 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
     ],
 )
 def test_a_change_between_two_states_without_payload_is_not_listed(reports, changes):
-    """The list of another load never contradicts the line that reports no payload."""
+    """A change between two loads that are both reported as no payload is not in the list of changes."""
     states = [
         SimpleNamespace(load_changed=k % 3 == 0 and k > 0, payload=SimpleNamespace(status=report))
         for k, report in enumerate(report for report in reports for _ in range(3))
@@ -357,7 +357,7 @@ def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
         assert intake.accept(log.t[1], log.q[1], log.qd[1], factor * largest) == refusal
     stored = levels.model_dump(mode="json")
     assert len(stored.pop("saturation")) == model.n
-    # runs of earlier versions have no such entry: all their torque limits are used
+    # runs of earlier versions have no entry `saturation`: all their torque limits are used
     assert NoiseLevels.model_validate(stored).saturation.tolist() == [1.0]
 
 
@@ -471,7 +471,7 @@ def test_noise_levels_are_those_of_the_residuals():
 
 
 def test_errors_that_recur_with_the_motion_do_not_become_a_payload(levels):
-    """Ten seconds of motion, repeated for seven minutes, with the same torque errors."""
+    """Torque errors that recur in each repetition of a motion of ten seconds give no payload after seven minutes."""
     random, load, ones = np.random.default_rng(0), LoadFilter(levels.load, levels.effort), np.ones(6)
     blocks = []
     for _ in range(50):

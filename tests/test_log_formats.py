@@ -1009,7 +1009,10 @@ def test_a_path_is_no_code_in_an_advised_command(tmp_path, name):
 
 
 def test_columns_without_numbers_and_dashes_have_a_remedy_that_works(tmp_path):
-    """A cell with a dash has no value; an empty column is to be replaced, since rows with a number remain in none."""
+    """The advice of the error about cells with a dash, which have no value, works.
+
+    For a column of dashes only, it is to name another column: `dropouts: dropped` would remove all rows.
+    """
     lines = text_log().splitlines()
     rows = [line.rpartition(",")[0] for line in lines]
     (tmp_path / "x.csv").write_text("\n".join([lines[0], *(f"{x},-" for x in rows[1:])]))

@@ -284,7 +284,7 @@ def exact_log_and_mistyped_arm(arm, k, factor):
 
 @pytest.mark.parametrize(("arm", "k"), [("ur10e", 3), ("ur10e", 5), ("rpr", 2)], indirect=["arm"])
 def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
-    """Ten times the mass of a link that only other joints carry, or whose own torque is relatively small."""
+    """A wrist link with ten times its mass in the URDF is named, also if its own joint sees little of its weight."""
     log, mistyped, link = exact_log_and_mistyped_arm(arm, k, 10)
     report = check_logs([log], mistyped)
     assert report.errors == ()
@@ -308,7 +308,7 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
-    """Another signal in the torque columns: there is no line that mends it, and none is advised."""
+    """Torque columns that contain another signal are one finding without a line of advice, since none would help."""
     log, rng = recorded(arm, 18), np.random.default_rng(18)
     other = log.tau.std(axis=0) * lfilter([0.2], [1, -0.98], rng.standard_normal(log.tau.shape), axis=0)
     tau = {
@@ -327,7 +327,10 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
 
 
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
-    """Friction before sliding determines the torques: wrong hypotheses would explain them better."""
+    """In a log with too little motion, reversed joints are not searched: a remark states the small motion.
+
+    Friction before sliding determines such torques, and wrong hypotheses would explain them better.
+    """
     log = recorded(arm, 18)
     small = replace(log, q=log.q[0] + 0.002 * (log.q - log.q[0]), qd=0.002 * log.qd)
     for logged in (small, flipped(small, 1, True, False)):
@@ -337,7 +340,10 @@ def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
-    """A controller holds the last joint: its velocities are smaller than their steps in the log."""
+    """A reversed joint is found although a controller holds the last joint.
+
+    The velocities of the last joint are smaller than the resolution of velocities in the log.
+    """
 
     def held(arm, rng):
         t, q = excitation(arm, rng)

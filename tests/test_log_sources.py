@@ -200,7 +200,7 @@ def test_inputs_that_are_close_to_the_positions_are_commands(scara, tmp_path):
 
 @pytest.mark.parametrize("letter", "tu")
 def test_letters_are_no_torques_if_the_log_has_torques(scara, tmp_path, letter):
-    """Columns `t` are then temperatures, for example."""
+    """Columns named by a single letter are not read as torques if the log has torques: t may be temperatures."""
     head = ["time", *(f"{x}{k}" for x in ("q", "qd", "tau", letter) for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU, 30 + TAU])
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])

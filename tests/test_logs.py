@@ -625,7 +625,7 @@ def test_reversed_columns_are_cut_into_windows():
 
 @pytest.mark.parametrize("origin", [0.0, 1.7e9])
 def test_files_that_continue_each_other_are_one_recording(tmp_path, origin):
-    """A logger that starts a new file each second, with times of one clock, and two recordings of their own."""
+    """Five files of one second each, with times of one clock, are joined; two other recordings remain separate."""
     t = np.arange(500) / 100
     whole = Trajectory(t, np.sin(t)[:, None], np.cos(t)[:, None], t[:, None], "whole")
     for k in range(5):

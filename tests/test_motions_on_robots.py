@@ -88,7 +88,7 @@ def test_distances_and_their_gradient_are_those_of_spheres(urdf):
 
 
 def test_motion_and_approach_keep_the_clearance_at_all_times(urdf):
-    """A motion that is planned with a floor and a wall never touches the floor or the wall, between samples either.
+    """A motion that is planned with a floor and a wall never touches them, neither at samples nor between samples.
 
     A motion that is planned without them hits them.
     """

@@ -58,7 +58,7 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     names, combination = base_combinations(model.chain, motors_of(model))
     assert names == tuple(np.array(exact.names)[common])
     np.testing.assert_allclose(combination, exact.combination[common, :count], atol=1e-7)
-    # a name of a parameter means this parameter, without rotors or torque offsets: others end in R
+    # a base parameter that is a single parameter has its name; names of combinations end with R
     single = [exact.identifiability().get(name) == "alone" for name in names]
     assert single == [not name.endswith("R") for name in names]
 

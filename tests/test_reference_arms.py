@@ -106,8 +106,8 @@ def _steady(values: np.ndarray) -> bool:
 
 Check = Callable[[Seen, list[int], list[int]], bool]
 
-# per reason, with # for a joint and ## for several: function of the arm, of the joints in the statement, and of the
-# joints in the reason, which is True if the reason holds; M32 in a statement counts as joints 3 and 2
+# {reason: function that returns True if the reason holds}. In a reason, # is a joint, and ## are several joints. The
+# arguments of a function are the arm, the joints in the statement (3 and 2 for M32), and the joints in the reason.
 CHECKS: dict[str, Check] = {
     "it moves the whole arm as one rigid body": lambda s, about, _: about == [1],
     "gravity does no work in a rotation about an axis parallel to it": lambda s, about, _: (

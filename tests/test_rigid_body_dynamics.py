@@ -131,7 +131,7 @@ def test_bodies_without_inertials_are_all_named():
 
 
 def test_a_negative_mass_is_refused():
-    """Pinocchio returns meaningless numbers for it, and no error."""
+    """A body with a negative mass is an error, since Pinocchio returns meaningless numbers without an error."""
     negative = arm([coordinate()], [body(inertia=(-1, 0, 0, 0, 1, 0, 0, 1, 0, 1))])
     with pytest.raises(ArmError, match=r"joint 'a': got a body of -1 kg, expected mass.*write estimates"):
         pinocchio_model(negative, Settings())

@@ -321,7 +321,10 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 
 def test_noise_is_at_most_the_largest_error():
-    """A joint with a residual of 5 Nm and a largest error of 2 Nm; the other joint has its own residual of 1 Nm."""
+    """The estimated noise is limited by the largest error: 2 Nm instead of a residual of 5 Nm at joint 1.
+
+    Joint 2 has a residual of 1 Nm, below its largest error. Each noise is multiplied by sqrt(correlation length).
+    """
     columns = torch.tensor([[5.0, 5.0], [10.0, 10.0], [2.0, 2.0]]).double()
     estimator = torque_problem.NoiseEstimator(50, *columns)
     noise = estimator.estimate(50 * torch.tensor([25.0, 1.0]).double())

@@ -176,7 +176,7 @@ def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, 
     warning = f"positions within -100..100: right as deg, {UNLESS_NORMALISED}"
     accepted = changed(wrong, accepted=lambda x: ("normalised",), repairs=lambda x: (warning,))
     report = spelgen.check_logs(accepted, arm)
-    # the warning of the file's reader is replaced by the error, and remains without it
+    # if the error is accepted, the warning of the file's reader is reported in its place
     assert not report.errors and any(warning in x.message for x in report.findings)
 
 
@@ -280,7 +280,7 @@ def opposite(log, k):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_position_errors_show_senses_and_order_of_servos(arm, seed):
-    """Torques of servos are proportional to u - q: gravity in it shows a reversed joint and exchanged joints."""
+    """Position errors u - q of servos are proportional to torques: their gravity part shows wrong senses and order."""
     logs = [replace(x, mapping=LogMapping(input="position")) for x in servo_logs(1, 20.0, seed=seed)]
     assert not spelgen.check_logs(logs, arm).errors
     (error,) = map(str, spelgen.check_logs([opposite(x, 1) for x in logs], arm).errors)

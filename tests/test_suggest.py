@@ -69,7 +69,10 @@ def test_numbered_columns_with_set_points_and_without_velocities(scara, tmp_path
 
 @pytest.mark.parametrize("derivative", ["D_Theta_{}", "theta_dot_{}", "dtheta{}"])
 def test_derivatives_of_positions_are_velocities(scara, tmp_path, derivative):
-    """Names of public simulations and of MATLAB; accelerations are not used."""
+    """Columns named as derivatives of positions, as in public simulations and MATLAB, are read as velocities.
+
+    Columns of accelerations are not read.
+    """
     names = ["Theta_{}", derivative, "Torque_{}", "DD_Theta_{}", "theta_ddot_{}"]
     head = ["Time", *(name.format(k) for name in names for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU, -Q, -Q])
@@ -540,7 +543,7 @@ def test_units_of_velocities_are_read_in_each_notation(robots, tmp_path, form, f
 def test_measured_torques_are_preferred_to_computed_ones_and_currents(
     scara, tmp_path, measured, computed, is_first
 ):
-    """The order of the columns does not matter."""
+    """Measured torques are read instead of computed torques or currents, in any order of the columns."""
     torques = [(measured, TAU), (computed, 3 * TAU)]
     torques = torques if is_first else torques[::-1]
     head = ["t", *(name.format(k) for name in ("q{}", "qd{}", *(x for x, _ in torques)) for k in range(4))]
@@ -569,7 +572,7 @@ def test_exponents_of_fortran_are_read(scara, tmp_path):
 
 @pytest.mark.parametrize("text", ["missing", "#DIV/0!", "nan(ind)", "1.#INF"])
 def test_texts_for_no_value_are_gaps(scara, tmp_path, text):
-    """The error states the setting that omits such rows."""
+    """A text for a missing value is an error, which states the setting that omits such rows."""
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU]).tolist()
     rows[5][3] = text

@@ -45,7 +45,7 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
 
 
 def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
-    """Return coefficients by joints, monomial and parameter: a dict of coefficients by entry of M."""
+    """Return {(joints, exponents of a monomial): {index of an entry of M: coefficient of the monomial}}."""
     vectors: dict = {}
     for index, key in enumerate(triangle(n)):
         for exponents, coefficient in poly.mass[key].terms():

@@ -317,7 +317,7 @@ def test_torques_that_no_bodies_have_are_named(emitted, monkeypatch):
 
 
 def test_a_fit_that_the_logs_do_not_support_is_discarded(emitted):
-    """A quarter of a second of torques as noisy as they vary: the model keeps the URDF's values, a warning says so."""
+    """A fit to 0.25 s of torques with 100 % noise is discarded: the model keeps the URDF's values, with a warning."""
     module = emitted["rpr"][0]
     found = drawn(module, seed=2, deviation=0.1)
     before = found.bodies.raw.detach().clone()
@@ -811,7 +811,7 @@ def test_a_spring_that_bodies_could_absorb_is_found(emitted, robots):
 def test_bodies_absorb_no_more_than_a_torque(emitted):
     """The projection of a torque onto the rigid bodies never exceeds this torque.
 
-    With the covariance of a different noise it could.
+    The projection uses the covariance for the current noise; with another covariance it could exceed the torque.
     """
     model = emitted["two_link"][0].Model()
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
@@ -830,7 +830,7 @@ def test_bodies_absorb_no_more_than_a_torque(emitted):
 def test_a_spring_as_strong_as_gravity_does_not_drive_bodies_away(emitted, robots):
     """A spring as strong as gravity does not leave the bodies at wrong values.
 
-    A fit without the spring explains it by the bodies, and masses, which are positive, return only nonlinearly.
+    The initial fit has no spring, and explains its torque by wrong masses. Later fits must correct the masses.
     """
     true = drawn(emitted["two_link"][0], seed=4, deviation=0.3)
     stiffness = recorded(true, 5.0, 0.0).tau[:, 0].std()

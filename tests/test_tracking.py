@@ -187,7 +187,7 @@ def test_the_seed_decides_everything(loaded):
 
 
 def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
-    """With G = diag(20, 0) the logged torque is a twentieth of joint 1's; the passive joint 2 swings freely."""
+    """With G = diag(20, 0) the logged torque is a twentieth of the torque at joint 1; passive joint 2 swings freely."""
     joints = [coordinate(), coordinate("b", continuous=True, passive=True)]
     bodies = [body(name, parent=k - 1, coordinate=k, inertia=point(1, 0.1)) for k, name in enumerate("ab")]
     two = arm(joints, bodies, gravity=(0, -9.81, 0))

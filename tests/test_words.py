@@ -23,7 +23,7 @@ ALLOWED = re.compile(
     r"|zero-order hold"
 )
 CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t)[^\n]*$|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
-# package whose texts are for developers only: the meaning of the numbers of a table
+# packages whose strings are not texts for users
 INTERNAL = ("runtime",)
 
 

@@ -336,7 +336,7 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     scale = np.maximum(together - start, 0).sum(axis=0) / count
     # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
     # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
-    # the joints (James and Stein, 1961). This weight is limited to 1 - 1 / n, so that `peak_count` is at most n `count`,
+    # the joints (James and Stein, 1961). This weight is at most 1 - 1 / n, so that `peak_count` is at most n `count`,
     # the number of peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)

@@ -86,8 +86,8 @@ class LiveTuning:
     # 0.5 times their difference is the error for a lag of torques of 1 / (4 bandwidth) = 12 ms.
     jerk: float = 0.5
     # [s] Time constant of the recent level of the residual (`ContactObserver.level`), and [1] upper limit of its
-    # squares. Example: recordings of an AIRBOT, whose first joint vibrates at 6 Hz in some motions. Of contacts of 10 %
-    # of the effort limit, 73 % are detected within 150 ms, and 60 % without the level, at the same rate of false alarms.
+    # squares. In recordings of an AIRBOT, whose first joint vibrates at 6 Hz in some motions, 73 % of the contacts of
+    # 10 % of the effort limit are detected within 150 ms, and 60 % without the level, at the same rate of false alarms.
     level: float = 0.5
     level_limit: float = 4.0
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
