@@ -41,7 +41,7 @@ class RealErrors:
     encoder_step: float = 0.0  # [rad, m] resolution of positions
     sensor_cutoff: float = np.inf  # [Hz] cutoff of the first-order low-pass of the torque signal
     current_noise: float = 0.0  # [1] noise of the motor current, relative to the torque's standard deviation
-    slow_noise: float = 0.0  # [1] slow torque errors of other causes, relative to the torque's standard deviation
+    slow_noise: float = 0.0  # [1] slow torque errors of other causes, relative to the torque's deviation
     slow_correlation: float = 0.0  # [s] correlation time of `slow_noise`
     gain: float = 0.0  # [1] relative standard deviation of the torque's unit, per joint
     zero: float = 0.0  # [rad, m] standard deviation of the zero of positions, per joint

@@ -172,7 +172,7 @@ class GeometryProblem:
             rows = drive_rows(self._chains[hypothesis.gravity], q, qd, qdd, self.speeds)
             if self._has_hysteresis:
                 # The deflections of the samples were computed with the current mapping. The hypothesis therefore
-                # exchanges their joints and reverses their signs in the same way as those of the motion.
+                # exchanges their joints and reverses their signs, as for the motion.
                 bent = self.samples.bent[:, hypothesis.source[0]] * np.sign(hypothesis.scale[0])[:, None]
                 rows = np.concatenate([rows, bristle_columns(bent, self.speeds)], axis=2)
             rows = rows if self._counted is None else rows * self._counted
