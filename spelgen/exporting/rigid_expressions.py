@@ -131,9 +131,11 @@ class RigidBodies:
         return momentum, gradient
 
     def _accumulate(self, wrenches: list[Wrench]) -> None:
-        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
+        """Add the wrench of each body to the wrench of its parent, from the tip to the base, in place.
 
-        wrenches: one per body, in the frame of the body, parents first.
+        Each result is the sum over a body and all bodies that it carries. wrenches: one per body, in the frame of the
+        body,
+        parents first.
         """
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent

@@ -183,7 +183,7 @@ class Fit:
         return float(np.mean(scores))
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path:
-        """Write the run folder that `spelgen train` writes; return its path.
+        """Write the same run folder as `spelgen train`; return its path.
 
         Raises RunError if there is a run in the folder, unless ``force``.
         """

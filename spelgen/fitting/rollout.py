@@ -112,8 +112,8 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # The number of turns between both positions is constant for the gradient: the derivative of the wrapped difference
-    # with respect to the predicted position is one.
+    # `turns`, the number of turns between both positions, is constant for the gradient, so the derivative of the
+    # wrapped difference with respect to the predicted position is one.
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
