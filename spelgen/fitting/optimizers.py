@@ -102,7 +102,7 @@ class MiniBatchAdamW(WindowOptimizer):
         return mean if math.isfinite(mean) else math.nan
 
     def _step(self, loss: Loss, windows: Windows) -> Tensor | float:
-        """Take a step and return the loss before the step, (); NaN if this loss or the gradient is not finite."""
+        """Take a step on a batch; return the loss before it, (), or NaN if this loss or the gradient is not finite."""
         self._optimizer.zero_grad()
         try:
             value = loss(windows)

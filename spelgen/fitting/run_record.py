@@ -37,7 +37,7 @@ class Record(BaseModel):
     Attributes:
         config: the options that apply to the model; the type depends on the objective.
         joints: names in the order of q.
-        validation_fraction: None if validation logs were given.
+        validation_fraction: fraction of the logs for validation; None if validation logs were given.
         data_digest: SHA-256 of all numbers of the logs.
         training, validation: names of the trajectories.
         fingerprints: name of each recording, and the first numbers of its fingerprint (see `Trajectory`).
@@ -76,7 +76,7 @@ class Record(BaseModel):
     @field_validator("config", mode="before")
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
-        """Return the options of a fit as an object of the configuration class of the fit's objective."""
+        """Return the options of a fit as an object of the class of the fit's objective, for example `TorqueFit`."""
         # `info.data` has no objective if the objective is invalid. pydantic reports the invalid objective, so the
         # options need no check.
         if "objective" not in info.data:

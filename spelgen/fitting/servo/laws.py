@@ -31,7 +31,7 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    # A cost with a dead zone is NaN or infinite if a rollout diverged: no dead zone is then selected. Costs without a
+    # If a rollout with a dead zone diverged, the cost is NaN or infinite, and no dead zone is selected. Costs without a
     # dead zone are finite, since the rollouts at x are finite.
     better = costs_with + TUNING.significance**2 / 2 < costs_without
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
@@ -40,10 +40,11 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters x, in which small dead zones are set to zero and no longer fitted.
+    """Return x with small dead zones set to zero and excluded from the fit.
 
-    A dead zone is small if its parameter, half its width [rad, m], is below `TUNING.min_dead_zone`. The resolution of
-    encoders is similar to this bound, so that smaller dead zones cannot be measured.
+    A dead zone is small if half its width [rad, m], the parameter, is below `TUNING.min_dead_zone`. This bound is about
+    the
+    resolution of encoders: smaller dead zones cannot be measured.
     """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone

@@ -152,8 +152,7 @@ class ServoObjective(Objective):
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        # The first outer iteration uses half the integration steps, which is accurate enough for it; the others use all
-        # of them.
+        # The first outer iteration needs less accuracy and uses half the integration steps; the others use all of them.
         elif self._iterates:
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:

@@ -85,10 +85,11 @@ class ServoSolution:
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
     """Take one Gauss-Newton step from x; return the parameters, their normal equations and their covariance.
 
-    x is the result of a fit with longer integration steps than ``problem`` has. The step is therefore an estimate of
-    the integration error of x, and its outer product is added to the covariance. The normal equations are computed at
-    x, and extrapolated to the end of the step. If the step raises the cost, x is
-    returned.
+    x is the result of a fit with longer integration steps than ``problem`` has. The step s is therefore an estimate of
+    the
+    integration error of x, and s s^T is added to the covariance. The normal equations are computed at x and
+    extrapolated
+    to x + s. The returned parameters are x + s, or x if the step raises the cost.
     """
     # The dead zones of all joints are free parameters here: if they were fixed at zero, the covariance of dry friction
     # would be too small.

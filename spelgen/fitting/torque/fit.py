@@ -49,8 +49,9 @@ class FitComparison(NamedTuple):
     """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
     Attributes:
-        fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
-            joints, of the returned model and of the regression.
+        fit: error of the returned model: mean squared error of held-out blocks divided by the variance of the torque,
+            averaged over joints.
+        regression: the same error of the ridge regression.
         behind: True if the regression is significantly better than the fit.
         replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
             regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
@@ -169,8 +170,9 @@ def _staged_fit(
 ) -> _StagedFit:
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
-    adapt, max_error: purpose of the fit, and upper bound of the root mean square torque error, (n,) [Nm, N] (see
-    `TorqueProblem`). prior: standard deviations of the prior.
+    prior: standard deviations of the prior. adapt: group of parameters to estimate; None: all parameters. max_error:
+    upper
+    bound of the root mean square torque error, (n,) [Nm, N] (see `TorqueProblem`).
     """
     jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
     estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)

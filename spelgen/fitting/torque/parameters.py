@@ -113,7 +113,7 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 
 
 def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> float:
-    """Correct initial values of trained motor gains that are wrong by a large factor; return their prior width.
+    """Correct initial motor gains that are wrong by a large factor; return the prior width of all trained gains.
 
     Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
     measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
