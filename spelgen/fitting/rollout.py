@@ -107,8 +107,7 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
     """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
     For a revolute joint, the magnitude of the wrapped difference is the geodesic distance of the two rotations on
-    SO(3). The loss (eq. 8) of the paper whose model is the preset `spel` uses this distance; here it is computed
-    without matrices.
+    SO(3), which Wang et al. (Sci Rep 15:33179, 2025, eq. 8) use in their loss.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
@@ -185,8 +184,8 @@ def rollout_loss(
     """Return the mean square of `rollout_errors`, a dimensionless scalar.
 
     If the predicted state remains the initial state, the loss is 1. All joints and samples have the same weight, since
-    the errors are divided by ``scales``. The loss (eq. 8) of the paper whose model is the preset `spel` sums the same
-    errors without scales, in rad^2 and rad^2/s^2.
+    the errors are divided by ``scales``. Wang et al. (Sci Rep 15:33179, 2025, eq. 8) sum the same errors without
+    scales, in rad^2 and rad^2/s^2.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 

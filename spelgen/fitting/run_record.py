@@ -40,7 +40,7 @@ class Record(BaseModel):
         validation_fraction: fraction of the logs for validation; None if validation logs were given.
         data_digest: SHA-256 of all numbers of the logs.
         training, validation: names of the trajectories.
-        fingerprints: name of each recording, and the first numbers of its fingerprint (see `Trajectory`).
+        fingerprints: {name of a recording: hashes of its samples}; the hashes show whether a test log was also fitted.
         scales: divisors of the errors in the validation loss.
         mapping: names and units of the columns of the logs.
         servo: parameters of position servos with intervals; None unless a fit of servos has finished.

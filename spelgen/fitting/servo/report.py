@@ -193,12 +193,15 @@ def ratios_with_deviations(
 
 
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
-    """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
+    """Return the record of a servo fit for config.json: delay [s], RMS errors [rad, m], and parameters of each joint.
 
-    The ratios are the keys of `RATIOS`, each with its 95 % interval. The key "determined" of a ratio is True if the
-    upper end of its interval is below `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the
-    logs must also distinguish one from the other (see `identifiable`). x: fitted parameters. steps: number of
-    Levenberg-Marquardt steps of the fit.
+    The parameters of a joint are kp and the quantities of `RATIOS`, such as kd / kp, each with its 95 % interval. The
+    entry
+    "determined" of a quantity is True if the upper end of the interval is below `ServoTuning.max_factor` times its
+    value.
+    Dry friction / kp and dead zone must also be distinguishable from each other (see `identifiable`).
+
+    x: fitted parameters. steps: number of Levenberg-Marquardt steps of the fit.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},

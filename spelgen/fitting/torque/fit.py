@@ -53,10 +53,10 @@ class FitComparison(NamedTuple):
             averaged over joints.
         regression: the same error of the ridge regression.
         behind: True if the regression is significantly better than the fit.
-        replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
-            regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
-        discarded: None if the returned model is a fit. Otherwise the returned model is the model before the fit, since
-            the logs do not support a fit, and `discarded` is the error of the fit, which is not smaller than `fit`.
+        replaced: error of a fit from the URDF that was replaced by a better fit from the result of the regression; None
+            if the returned fit started at the URDF.
+        discarded: error of a fit that was discarded, since the model before the fit has no larger error; this model is
+            then returned. None if a fit is returned.
     """
 
     fit: float
@@ -248,7 +248,7 @@ def _compared_fit(
 def _unfitted(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, blocks: Sequence[TorqueSamples]
 ) -> _StagedFit:
-    """Return the current parameters of a model as an estimate with the covariance of the prior.
+    """Return the model before a fit, as a result to which fits are compared; the covariance is the prior's.
 
     blocks: contiguous blocks of `samples`, for which the squared errors are computed.
     """

@@ -240,11 +240,13 @@ class TorqueJacobian:
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The torque is linear in inertial parameters, armatures and friction coefficients, so a straight line in these
-        quantities is better than one in x. x contains log-Cholesky parameters of bodies, which are moved along such a
-        line (see `step_in_inertial_parameters`), and the logarithms of armatures and friction coefficients c. A step
-        s > 0 of log c changes c to c (1 + s), on such a line, too. A step s < 0 changes c to c exp(s), as x + step
-        does, since c (1 + s) could be negative.
+        The torque is linear in the inertial parameters of the bodies, and in armatures and friction coefficients c, but
+        x
+        contains log-Cholesky parameters and log c. The curve is a straight line in the quantities in which the torque
+        is
+        linear. For the bodies see `step_in_inertial_parameters`. A step s > 0 of log c changes c to c (1 + s). A step s
+        < 0
+        changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

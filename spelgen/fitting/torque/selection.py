@@ -117,16 +117,17 @@ def select_functions(
 
 
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
+    """Return the largest allowed standard deviation of the torque of residual terms, {parameter: (n,) [Nm, N]}.
 
-    The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
-    torque splines is zero for joints without gravity load: the splines represent springs, which are built in to balance
-    a load.
+    The bounds apply to terms that are selected on one or two recordings: a fraction of torque_std for ripple and torque
+    splines, and infinity for friction factors. For splines the bound is zero at joints without gravity load: the
+    splines
+    represent springs, which are built in to balance a load.
 
     Args:
         model: fitted model.
         q: (T, n) positions [rad, m].
-        torque_std: (n,) standard deviation of the torque [Nm, N].
+        torque_std: (n,) standard deviation of the joint torques in the logs [Nm, N].
     """
     with torch.no_grad():
         loaded = model.gravity(q).std(dim=0) > SELECTION.min_load_fraction * torque_std

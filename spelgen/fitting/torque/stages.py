@@ -187,9 +187,11 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return a refit of all parameters without some friction coefficients; indices: their indices in x (K,).
+    """Refit all parameters without some friction coefficients; return the new estimate.
 
-    The initial values and the prior means of these coefficients, which are logarithms, become `NEGLIGIBLE`.
+    indices: indices of these coefficients in x (K,). The coefficients are logarithms. Their initial values and prior
+    means
+    become `NEGLIGIBLE`.
     """
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean of the removed coefficients is changed, too: otherwise the prior would restore the coefficients.
