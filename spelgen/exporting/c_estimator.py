@@ -42,10 +42,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     """Return the two C functions that only the estimator of payload and external torques calls.
 
     ``momentum_balance`` computes the terms of the momentum balance, ``payload_torque`` the joint torques due to a
-    payload.
-    model: the model as NumPy arrays. levels: noise levels; ``levels.point``, the tip in the frame of the last body, is
-    a
-    constant in the C code.
+    payload. model: the model as NumPy arrays. levels: noise levels; ``levels.point``, the tip in the frame of the last
+    body, is a constant in the C code.
     """
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}

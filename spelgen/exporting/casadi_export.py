@@ -49,9 +49,8 @@ def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Functio
     """Return a CasADi function that computes the residual terms of a model and passes them to ``function``.
 
     The result has the inputs of the entry point ``entry``. ``function`` has these inputs, then the residual terms. If
-    it
-    depends on no residual terms, it is returned unchanged: a pure SX function is faster than an MX function that calls
-    it.
+    it depends on no residual terms, it is returned unchanged: a pure SX function is faster than an MX function that
+    calls it.
     """
     needed = residuals_needed(function)
     if not needed:
@@ -93,8 +92,7 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
     """Return the residual terms as expressions in q and qd: {name, such as ``gravity``: expression}.
 
     The names are listed in `model_expressions`. q, qd: symbols, (n, 1) each; qd: None if no term that depends on
-    velocity
-    is needed.
+    velocity is needed.
     """
     residuals = model.residuals
     values = {}

@@ -1,5 +1,4 @@
-"""``Trained``, the argument of every exporter (a model with its arm), and ``TrainedModel``, the model as NumPy arrays.
-"""
+"""``Trained``, the argument of all exporters (model and arm), and ``TrainedModel``, the model as NumPy arrays."""
 
 import copy
 import keyword

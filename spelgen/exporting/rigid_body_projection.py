@@ -97,8 +97,7 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     """Return the approximation of a trained model by rigid bodies with viscous and Coulomb friction.
 
     A rigid-body model keeps its bodies, without its residual terms. For other models, rigid bodies are fitted to M and
-    the
-    gravity torque at random positions. Friction is always fitted, by least squares.
+    the gravity torque at random positions. Friction is always fitted, by least squares.
     """
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)

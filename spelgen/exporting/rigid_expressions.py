@@ -134,8 +134,7 @@ class RigidBodies:
         """Add the wrench of each body to the wrench of its parent, from the tip to the base, in place.
 
         Each result is the sum over a body and all bodies that it carries. wrenches: one per body, in the frame of the
-        body,
-        parents first.
+        body, parents first.
         """
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent

@@ -107,8 +107,8 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
-        # Only warnings about logs and links are recorded. Diagnostics at "run" are about the command and do not describe
-        # the model.
+        # Only warnings about logs and links are recorded. Diagnostics at "run" are about the command and do not
+        # describe the model.
         warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )
     known: Content = {}

@@ -158,8 +158,7 @@ class LBFGS(WindowOptimizer):
         """Minimise a sum of losses plus the penalty of the weight decay; return the sum at the end.
 
         The result does not include the penalty; it is NaN if no evaluation was finite. Only one summand at a time is in
-        memory
-        with its graph of derivatives. steps: maximum number of evaluations of the sum.
+        memory with its graph of derivatives. steps: maximum number of evaluations of the sum.
         """
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps

@@ -163,8 +163,7 @@ class RolloutObjective(MomentumObjective):
         """Return the progress of the fit, 0 to 1.
 
         It is the larger one of two fractions: all optimizer steps that are completed after ``ahead`` more steps,
-        divided by the
-        number of steps of the fit, and the elapsed time divided by the time limit.
+        divided by the number of steps of the fit, and the elapsed time divided by the time limit.
         """
         # The elapsed fraction of the time limit is included, so that the learning-rate schedule also ends with the
         # time limit.

@@ -49,8 +49,9 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # The descent ends at a step below `smallest`. From the unchanged zero, this is `min_offset`: a smaller offset
-        # is only a calibration error. From a multiple of 90 degrees, it is smaller, so that the offset is accurate.
+        # The descent ends at a step below `smallest`. If it starts at the unchanged zero, `smallest` is `min_offset`: a
+        # smaller offset is only a calibration error. If it starts at a multiple of 90 degrees, `smallest` is less, so
+        # that the offset is accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -93,7 +94,7 @@ class ZeroOffset(Fault):
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
+        """Return the code of a warning if all zero offsets are as small as errors of a URDF; else "", for an error."""
         shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
         is_revolute = np.array(correction.arm.joint_types) == "revolute"
         bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
@@ -199,7 +200,7 @@ class Gravity(Compensation):
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if gravity is tilted little, as for an arm mounted slightly askew; else ""."""
+        """Return the code of a warning if gravity is tilted no more than by mounting errors; else "", for an error."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

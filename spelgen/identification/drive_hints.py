@@ -145,7 +145,8 @@ class DriveProblem:
     def with_hysteresis(self) -> DriveProblem:
         """Return the least-squares problem with the deflections of bristles as additional columns of the regressor.
 
-        Its dry friction depends on the past motion. The columns are after the columns of the bodies.
+        The dry friction of this problem depends on the past motion. The new columns are after the columns of the
+        bodies.
         """
         drives = len(FRICTION.effects) * len(self.size) + 1
         bristles = bristle_columns(self.samples.bent, self.speeds)

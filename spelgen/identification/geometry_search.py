@@ -143,10 +143,10 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
 def _corrected(
     problem: GeometryProblem, stateful: GeometryProblem, faults: Sequence[Fault], base: HypothesisFit
 ) -> list[HypothesisFit]:
-    """Return fits of `problem` under the hypotheses with one more corrected fault than the hypothesis of `base`.
+    """Return fits of `problem` under hypotheses that correct one more fault than the hypothesis of `base` does.
 
     stateful: `problem` with a friction model with hysteresis. Continuous quantities of a hypothesis, such as a zero
-    offset, are optimised in `stateful`: without hysteresis the optimum compensates errors of the friction model.
+    offset, are optimised in `stateful`: without hysteresis, the optimum would compensate errors of the friction model.
     """
     fits, start = list[HypothesisFit](), stateful.fit(base.hypothesis)
     for fault in faults:

@@ -26,8 +26,8 @@ from spelgen.logs.dynamics_samples import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-# [samples at 100 Hz] Times around a sample at which signals are kept for it: every 20 ms, which determines signals of
-# the filter's bandwidth.
+# [samples at 100 Hz] Times around a sample at which signals are stored for it: every 20 ms. The signals are low-pass
+# filtered, so that they can be interpolated between these times.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 # [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
 ENDS = 3
@@ -123,10 +123,10 @@ def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
 
 @cache
 def interpolation() -> CubicSpline:
-    """Return a function of the time [s] after a sample, whose results are weights (E,) for cubic interpolation.
+    """Return a function of the time t [s] after a sample; its results are weights (E,) for cubic interpolation.
 
-    The sum of the weights times a signal's values at the E times `OFFSETS` around the sample is the cubic spline
-    through these values, evaluated at this time.
+    The signal at t is the sum of the weights times the signal's values at the E times `OFFSETS` around the sample. It
+    is the value of the cubic spline through these values.
     """
     return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
@@ -134,8 +134,9 @@ def interpolation() -> CubicSpline:
 class DriveLog:
     """Collector of a bounded number of samples from successive trajectories, for the detection of delays and couplings.
 
-    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
-    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
+    Whenever the collector has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there
+    are many trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes
+    minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
@@ -181,7 +182,7 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
-        """Return every k-th of the samples in motion (k = `_every`), with the signals at the times `OFFSETS` around it.
+        """Return every k-th of the samples in motion (k = `_every`), each with its signals at the times `OFFSETS`.
 
         start: time from the start of the recording to the first of `samples` [s].
         """

@@ -42,8 +42,7 @@ class ServoPosterior(Posterior):
         """Name of the joint whose kp divides the base parameters; None if a kp is known.
 
         The ratios, base parameter / kp, have relative standard deviations. This joint is the one with the smallest
-        median of
-        them. If a kp is known, the base parameters themselves are determined and not divided.
+        median of them. If a kp is known, the base parameters themselves are determined and not divided.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 

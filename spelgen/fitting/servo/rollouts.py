@@ -72,10 +72,8 @@ class ServoRollouts:
         """Return measured positions with velocities and accelerations from rollouts at x, at midpoints between samples.
 
         The velocities are derivatives of the predicted positions, plus smoothed derivatives of the difference (measured
-        minus
-        predicted position). The accelerations are computed in the same way. Smoothed derivatives of the measured
-        positions
-        would attenuate fast motion (see `ServoWindows.motion`).
+        minus predicted position). The accelerations are computed in the same way. Smoothed derivatives of the measured
+        positions would attenuate fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

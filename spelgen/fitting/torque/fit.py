@@ -171,8 +171,7 @@ def _staged_fit(
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
     prior: standard deviations of the prior. adapt: group of parameters to estimate; None: all parameters. max_error:
-    upper
-    bound of the root mean square torque error, (n,) [Nm, N] (see `TorqueProblem`).
+    upper bound of the root mean square torque error, (n,) [Nm, N] (see `TorqueProblem`).
     """
     jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
     estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)

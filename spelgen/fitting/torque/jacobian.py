@@ -241,12 +241,9 @@ class TorqueJacobian:
         """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
         The torque is linear in the inertial parameters of the bodies, and in armatures and friction coefficients c, but
-        x
-        contains log-Cholesky parameters and log c. The curve is a straight line in the quantities in which the torque
-        is
-        linear. For the bodies see `step_in_inertial_parameters`. A step s > 0 of log c changes c to c (1 + s). A step s
-        < 0
-        changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
+        x contains log-Cholesky parameters and log c. The curve is a straight line in the quantities in which the torque
+        is linear. For the bodies see `step_in_inertial_parameters`. A step s > 0 of log c changes c to c (1 + s). A
+        step s < 0 changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

@@ -222,10 +222,8 @@ class TorqueProblem:
         """Yield two candidates (K,) for the parameters after a step: x + step, and the end of a curve.
 
         The torque is less nonlinear along the curve than along x + step. The curve has the tangent `step` at x, and is
-        a
-        straight line in the inertial parameters of the bodies (see `TorqueJacobian.curved_step`). step: (k,), step of
-        the k
-        free parameters; the step of fixed parameters is zero.
+        a straight line in the inertial parameters of the bodies (see `TorqueJacobian.curved_step`). step: (k,), step of
+        the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate

@@ -121,8 +121,7 @@ def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> d
 
     The bounds apply to terms that are selected on one or two recordings: a fraction of torque_std for ripple and torque
     splines, and infinity for friction factors. For splines the bound is zero at joints without gravity load: the
-    splines
-    represent springs, which are built in to balance a load.
+    splines represent springs, which are built in to balance a load.
 
     Args:
         model: fitted model.

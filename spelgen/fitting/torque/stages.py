@@ -190,8 +190,7 @@ def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
     """Refit all parameters without some friction coefficients; return the new estimate.
 
     indices: indices of these coefficients in x (K,). The coefficients are logarithms. Their initial values and prior
-    means
-    become `NEGLIGIBLE`.
+    means become `NEGLIGIBLE`.
     """
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean of the removed coefficients is changed, too: otherwise the prior would restore the coefficients.
