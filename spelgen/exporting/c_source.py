@@ -68,7 +68,7 @@ class CFunction:
     Attributes:
         entry: the entry point.
         symbol: name of the C function.
-        shapes: {output: (rows,) or (rows, columns)}.
+        shapes: {output: its shape, (rows,) or (rows, columns)}.
         about: text of the comment above the function.
         signature: C declaration of the function, without a semicolon.
         definition: C definition of the function.

@@ -231,7 +231,7 @@ class Fit:
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:
-    """Return the specification of a model that was loaded from a run folder. Raises RunError if it has none."""
+    """Return the specification of a model, which a run folder must contain. Raises RunError if the model has none."""
     if isinstance(model, ArmModel):
         return model.spec
     raise RunError(

@@ -76,9 +76,10 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: the latest computed normal equations. If the solver ended because no further step was accepted,
-    they are computed at the last iterate. If it ended directly after an accepted step (small decrease of the cost,
-    maximum number of steps), they are computed at the iterate before this step.
+    normal_equations: the latest computed normal equations. They are at the last iterate if the solver ended because no
+    further step was accepted. If it ended directly after an accepted step (small decrease of the cost, maximum number
+    of
+    steps), they are at the iterate before this step.
     """
 
     state: SolverState[Parameters]

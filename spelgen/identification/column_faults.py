@@ -223,9 +223,9 @@ class TorqueSense(WrongScale):
 class TorqueUnit(WrongScale):
     """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
-    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
-    candidate need not lower the cost much, unlike other faults: the fit without it may explain torques that are too
-    small with bodies that are too light.
+    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`).
+    Unlike other faults, another unit is accepted even if it hardly lowers the cost: without it, bodies that are too
+    light may explain torques that are too small.
     """
 
     code = "torque-unit"

@@ -65,8 +65,8 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     stateful = coarse.with_hysteresis()
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # At most three corrections are combined, where any permutation of the columns is one correction: more corrections
-    # could explain any log.
+    # At most three corrections are combined; a permutation of the columns counts as one. More corrections could explain
+    # any log.
     for _ in range(3):
         base = min(fits, key=RANK)
         # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
@@ -76,7 +76,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, stateful, _corrected(coarse, stateful, faults, start), start)
         better = min(tried, key=RANK)
-        # To save time, permutations of all joints and long drifts of delays are searched only if no single correction
+        # Permutations of all joints and long drifts of delays take time. They are searched only if no single correction
         # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
         # wrong signals.
         is_wrong = (
@@ -132,7 +132,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         reduced = [x for x in remaining if x != worst]
         without = errors(reduced)
         usual = np.mean([without[x] for x in reduced], axis=0)
-        # The others must agree with each other: recordings that all have the same fault contradict each other, too.
+        # No recording is reported if the others contradict each other, too: then the fault may be in all recordings.
         is_worse = (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
         if not is_worse.any() or usual.mean() > GEOMETRY.explained:
             break

@@ -28,9 +28,9 @@ class DriveHintTuning:
 
     # [1] Number of blocks of time in the cross-validation; each block is held out once.
     blocks: int = 10
-    # [1] A coupling is accepted if its squared residual is below this fraction of the squared residual without the
-    # coupling and, in each block, below this fraction of the squared torque. For the coupled wrist joints of a Staubli
-    # TX40 these fractions are 0.05 and 0.03.
+    # [1] A coupling is accepted if the squared residual with it is below this fraction of the squared residual without
+    # it and, in each block, below this fraction of the squared torque. For the coupled wrist joints of a Staubli TX40
+    # these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
     # [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
     # delay may be due to friction.
@@ -94,7 +94,8 @@ class LogGeometryTuning:
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.
     load: float = 0.5
-    # [m] Standard deviation of the distance of this load's centre of mass from the origin of the last body.
+    # [m] Standard deviation of the distance of the centre of mass of such a tool or load from the origin of the last
+    # body.
     load_distance: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
@@ -112,7 +113,8 @@ class LogGeometryTuning:
     delay_start: float = 0.06
     # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
-    # [1] Largest relative error of a clock; a larger one explains other errors, such as friction of slow motions.
+    # [1] Largest relative error of a clock's rate. A larger error is rejected, since it would explain other errors of
+    # the model, such as friction of slow motions.
     clock_error: float = 0.05
     # [1] A delay is accepted if the squared residual of a joint with the delay is below this fraction of its value
     # without delay; wrong delays have fractions from 0.78 on, on recordings of seven arms.

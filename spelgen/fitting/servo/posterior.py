@@ -41,8 +41,8 @@ class ServoPosterior(Posterior):
     def scale_joint(self) -> str | None:
         """Name of the joint whose kp divides the base parameters; None if a kp is known.
 
-        The ratios, base parameter / kp, have relative standard deviations. This joint is the one with the smallest
-        median of them. If a kp is known, the base parameters themselves are determined and not divided.
+        Of all joints, the ratios (base parameter / kp) of this joint have the smallest median relative standard
+        deviation. If a kp is known, the base parameters themselves are determined and not divided.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 

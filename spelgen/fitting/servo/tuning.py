@@ -85,17 +85,14 @@ class ServoTuning:
 
     # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
-    # [1] Half the width of the initial dead zone, as a fraction of the static error (dry friction / kp plus half the
-    # width).
+    # [1] Half the width w of the initial dead zone, as a fraction of the static error, dry friction / kp + w / 2.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
     # with a dead zone and the fit without.
     joint_steps: int = 6
-    # [1] Smallest significance z of a selected dead zone, in standard deviations: it lowers the cost by more than z^2 /
-    # 2.
+    # [1] Smallest significance z of a selected dead zone: the dead zone must lower the cost by more than z^2 / 2.
     significance: float = 4.0
-    # [rad, m] Dead zones of a smaller half width are set to zero; for comparison, a 12-bit encoder has steps of 1.5e-3
-    # rad.
+    # [rad, m] Dead zones of a smaller half width are set to zero. The step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
     # Constants of the intervals and the identifiability of the fitted parameters (`servo.report`).

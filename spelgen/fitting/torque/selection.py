@@ -187,9 +187,10 @@ def _best(
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the better one of two candidates of a joint.
+    """Return the better one of two candidates of a joint; `first` is preferred at similar errors.
 
-    This is `other` if its held-out error is clearly smaller (`preference_ratio`), otherwise `first`.
+    The result is `other` if there is no `first`, or if the held-out error of `other` is clearly smaller
+    (`preference_ratio`).
     """
     # Candidates are tested in the order splines, friction factor, ripple. At similar errors splines are preferred to
     # ripple: both fit the torque of a linear spring, but only splines extrapolate it.
