@@ -59,7 +59,10 @@ TORQUE = "Nm, N"
 def entry_point(
     name: str, about: str, inputs: str, reference: Callable[..., Tensor] | None = None, **outputs: str
 ) -> EntryPoint:
-    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result."""
+    """Return an ``EntryPoint`` with the given attributes.
+
+    inputs: names of the arguments, separated by blanks. outputs: unit of each result.
+    """
     return EntryPoint(name, about, tuple(inputs.split()), outputs, reference)
 
 
@@ -207,8 +210,8 @@ def check_parity(
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
     """Return {input of the dynamics, such as q: random values for comparisons}, (states, n) each.
 
-    The friction state z is (states, memory). The seed is fixed, so that exports are reproducible. memory: number of
-    values in the friction state z.
+    The seed is fixed, so that exports are reproducible. coordinates: joints of the arm, whose limits determine the
+    range of positions and velocities. memory: number of values in the friction state z, (states, memory).
     """
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.

@@ -203,7 +203,10 @@ class Validation:
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges."""
+        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges.
+
+        substeps: number of integration steps per sample interval.
+        """
         total = 0.0
         try:
             with torch.no_grad():

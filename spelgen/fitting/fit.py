@@ -238,7 +238,7 @@ def objective_of(request: FitRequest) -> Objective:
 
 
 def default_objective(model: ArmModel, rates: Rates) -> str:
-    """Return the name of the default objective for a model and its logs.
+    """Return the name of the default objective for a model and for the sample rates of its logs.
 
     The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
     for accelerations, and otherwise "rollout".

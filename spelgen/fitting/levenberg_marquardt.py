@@ -123,7 +123,10 @@ def initial_state(
     damping: float = TUNING.initial_damping,
     steps: int = 0,
 ) -> SolverState[Parameters]:
-    """Return the state of the solver at x: the residual and the cost are computed here."""
+    """Return the state of the solver at x: the residual and the cost are computed here.
+
+    damping: damping of the first step. steps: number of steps that were accepted before, for a fit that continues.
+    """
     residual = problem.residual(x)
     return SolverState(x, residual, problem.cost(x, residual), damping, steps)
 

@@ -226,7 +226,10 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges.
+
+    scales, substeps: as in `rollout_errors`.
+    """
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -253,7 +256,8 @@ def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start
     """Return a number of rk4 steps per sample interval that makes the integration error small.
 
     The number is the first of start, 2 start, 4 start, ... with an `integration_error` below
-    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger.
+    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger. windows,
+    scales: training windows on which the error is measured, and divisors of the errors of q and qd.
     """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:

@@ -109,7 +109,8 @@ def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, cou
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:
     """Return the formula of a base parameter, such as ``Izz1 + m2 + 0.1 hx2``.
 
-    row: (K,) coefficients of the parameters. first: index of the first term, whose coefficient is 1.
+    row: (K,) coefficients of the parameters. first: index of the first term, whose coefficient is 1. names: (K,) names
+    of the parameters.
     """
     text = names[first]
     for k in np.flatnonzero(row):

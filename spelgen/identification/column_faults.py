@@ -279,6 +279,7 @@ class TorqueUnit(WrongScale):
         masses of the URDF their common factor. Such factors also compensate wrong masses in the URDF, which lowers the
         cost a little. The factors are therefore accepted only if (1) the cost falls significantly, with a penalty
         (`rarity`) for each factor, (2) each factor is determined, and (3) the relative residual of each joint is small.
+        lowest: fit of lowest cost so far. has_gravity: True if the gravity in the torques shows another unit.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau

@@ -254,7 +254,10 @@ class GeometryProblem:
         return solution(matrix, vector), inverse(matrix)
 
     def _linearized(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`."""
+        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`.
+
+        columns: (S, n, D) derivative of the torque residual with respect to the D quantities.
+        """
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))

@@ -41,7 +41,8 @@ class ServoTuning:
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
     body_directions: int = 6
-    # [1] Smallest effect of a fitted direction of the body parameters on gravity, relative to the largest effect.
+    # [1] A direction of the body parameters is fitted only if its effect on gravity is at least this fraction of the
+    # largest effect.
     min_effect: float = 1e-3
     # [1] Prior standard deviation of a parameter that is not fitted. The deviation is practically zero, so the
     # parameter is constant.

@@ -81,7 +81,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
 
 
 def _products(jacobian: TorqueJacobian, x: torch.Tensor) -> torch.Tensor:
-    """Return the Gram matrix of the columns [J, residual] of each joint, (n, K + 1, K + 1), at parameters x (K,).
+    """Return the Gram matrix of the columns of [J, residual] for each joint, (n, K + 1, K + 1), at parameters x (K,).
 
     J (T, K) is the Jacobian of the modelled torque with respect to theta, which is x with inertial parameters in place
     of log-Cholesky parameters (see `TorqueJacobian.joint_rows`). residual: torque residual (T,) of the joint.

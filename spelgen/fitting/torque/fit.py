@@ -192,7 +192,7 @@ def _compared_fit(
     third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
     returned. If its nMSE (error divided by the variance of the torque) is above `TUNING.unsupported`, and its error is
     not below the error of the model before the fit, the model before the fit is returned. The returned parameters are
-    written to the model.
+    written to the model. prior: initial standard deviations of the prior.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
