@@ -155,8 +155,8 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M, (n, n), and potential energy, (1, 1) [J], of rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # `base` is chosen such that angles of mimic joints are integer multiples of q / `base`: their cosines and sines
-        # are then polynomials in cos(q / `base`) and sin(q / `base`).
+        # All angles of mimic joints are integer multiples of q / `base`: their cosines and sines are polynomials in
+        # cos(q / `base`) and sin(q / `base`).
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)

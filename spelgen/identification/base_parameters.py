@@ -2,8 +2,8 @@
 
 The combinations of inertial parameters are computed exactly by `structure.base_parameters`, so that their names and
 order are the same in every command. The combinations with friction and drives are computed numerically from the
-regressor at random states: a column in the span of the preceding columns is regrouped into these (Gautier and Khalil,
-IEEE T-RA 6:368, 1990).
+regressor at random states: a column in the span of the preceding columns is regrouped into the preceding columns
+(Gautier and Khalil, IEEE T-RA 6:368, 1990).
 """
 
 from dataclasses import dataclass

@@ -238,7 +238,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return the coupling `start` with the ratio of minimum cost, between half and twice its ratio.
+    """Return the coupling `start` with the ratio of minimum cost, between half and twice the ratio of `start`.
 
     A fraction of small integers near the minimum is preferred if its cost is at most 2 % higher.
     """

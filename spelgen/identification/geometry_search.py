@@ -166,11 +166,11 @@ def _weighed(
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
     Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
-    and b the decrease in fits with hysteresis. For right hypotheses b shows the whole decrease, but for wrong ones it
-    is larger, too: on recorded arms they have b up to 32 and a up to 17. A wrong hypothesis may also have a large a and
-    a small b, since it explains the friction that the model without hysteresis lacks. The decrease is therefore a,
-    limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a, b):
-    hysteresis resembles a delay, so such a hypothesis must lower both costs.
+    and b the decrease in fits with hysteresis. For a right hypothesis, b is the whole decrease. For a wrong hypothesis,
+    b may also be larger than a: on recorded arms, b is up to 32 and a up to 17. A wrong hypothesis may also have a
+    large a and a small b, since it explains the friction that the model without hysteresis lacks. The decrease is
+    therefore a, limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a,
+    b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.

@@ -1,7 +1,7 @@
 """Hypotheses about a log: joint, scale, zero and delay of its columns, the direction of gravity, and kinds of faults.
 
-A subclass of `Fault` holds all that concerns a kind of fault: the hypotheses to test, the sentence about the fault, and
-the settings that correct it. `kinds_of_faults` in `spelgen.identification.geometry_search` lists all kinds.
+A subclass of `Fault` defines a kind of fault: the hypotheses to test, the sentence about the fault, and the settings
+that correct it. `kinds_of_faults` in `spelgen.identification.geometry_search` lists all kinds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Posterior of a fit to positions under position servos, which determine damping, friction, ... only relative to kp."""
+"""Posterior of a fit to positions under position servos: damping, friction, ... are determined only relative to kp."""
 
 from collections.abc import Callable
 from functools import cached_property

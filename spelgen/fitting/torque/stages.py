@@ -86,9 +86,9 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     - The torque of the regression line exceeds a fraction of the measured torque (`TUNING.min_compensation`): a delay
       of some milliseconds between torque and motion causes a smaller negative slope.
 
-    The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
-    standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
-    a part of the compensation.
+    The drives of an arm are similar. If one of them is known to compensate friction, the others probably do, too, and
+    their parameters may have absorbed a part of the compensation. For the others, a negative slope of more than one
+    standard deviation suffices, without the regression on position.
     """
     samples = problem.jacobian.residual_samples(x)
     residual, qd, estimator = samples.torque_residual, samples.qd, problem.noise_estimator
