@@ -514,7 +514,7 @@ def test_few_windows_are_taken_all_at_once():
 
 
 def test_the_line_search_turns_back_from_numbers_that_blow_up():
-    """The line search of L-BFGS shortens a step to a point at which the loss is NaN.
+    """L-BFGS shortens a step that ends where the loss is NaN, until the loss is finite.
 
     The loss is finite below x = 2, and the first step would reach x = 4.
     """
