@@ -51,7 +51,7 @@ class _RegressorBlock(NamedTuple):
 class ResidualSamples(NamedTuple):
     """T samples with the torque residual of the model and the friction torque of its drives, all (T, n).
 
-    q, qd, qdd: positions, velocities, accelerations [rad, m, s]. torque_residual: measured minus modelled joint torque
+    q, qd, qdd: positions [rad, m], velocities and accelerations (per s and s^2). torque_residual: measured minus modelled joint torque
     [Nm, N]. friction: friction torque of the drives [Nm, N].
     """
 
