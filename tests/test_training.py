@@ -359,9 +359,9 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end until a signal stops it, and write its status to the file `told` next to the folder.
+    """Train until a signal stops the training; write the status of the run to the file `told` next to the run folder.
 
-    It is run in a process of its own.
+    The function is the target of a child process.
     """
     # the tests may run with SIGINT ignored, which the process inherits
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -102,7 +102,7 @@ class TorqueJacobian:
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
+        """Return, per joint, the sum of the squared torque residuals at the parameters x (K,): (n,) [Nm^2, N^2].
 
         For a joint with eliminated terms, the sum includes the penalty of their weights. If motor gains are trained,
         the residual is scaled to the initial gains (see `logged_scale`): otherwise gains near zero would make it small.
