@@ -59,9 +59,9 @@ TORQUE = "Nm, N"
 def entry_point(
     name: str, about: str, inputs: str, reference: Callable[..., Tensor] | None = None, **outputs: str
 ) -> EntryPoint:
-    """Return an ``EntryPoint`` with the given attributes.
+    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result.
 
-    inputs: names of the arguments, separated by blanks. outputs: unit of each result.
+    The other arguments are fields of the class.
     """
     return EntryPoint(name, about, tuple(inputs.split()), outputs, reference)
 

@@ -241,7 +241,7 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
     """Return the name of the default objective for a model and for the sample rates of its logs.
 
     The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
-    for accelerations, and otherwise "rollout".
+    for accelerations, and otherwise "rollout". rates: function that returns the sample rates of the logs.
     """
     if model.input_quantity == "position":
         return "servo"

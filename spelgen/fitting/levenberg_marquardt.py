@@ -123,9 +123,9 @@ def initial_state(
     damping: float = TUNING.initial_damping,
     steps: int = 0,
 ) -> SolverState[Parameters]:
-    """Return the state of the solver at x: the residual and the cost are computed here.
+    """Return the state of the solver at x, with the residual and the cost at x.
 
-    damping: damping of the first step. steps: number of steps that were accepted before, for a fit that continues.
+    damping: damping of the next step. steps: number of accepted steps so far, including earlier calls of the solver.
     """
     residual = problem.residual(x)
     return SolverState(x, residual, problem.cost(x, residual), damping, steps)

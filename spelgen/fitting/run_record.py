@@ -189,7 +189,7 @@ class Epoch(BaseModel):
 def require(schema: type[Schema], content: object, file: Path, line: int | None = None) -> Schema:
     """Return the content of a file as an object of the schema.
 
-    Raises RunError if a key is absent or has another type. file, line: origin of the content, for the message.
+    line: line of the content in the file, for the error. Raises RunError if a key is absent or has another type.
     """
     try:
         return schema.model_validate(content)

@@ -15,7 +15,7 @@ class FittingTuning:
     # [1] Smallest damping: steps with a smaller damping equal Gauss-Newton steps to nine digits.
     min_damping: float = 1e-9
     # [1] The damping is divided by this number after a step that decreases the cost, otherwise multiplied by it
-    # (Marquardt: 10).
+    # (Marquardt: 10), or by half of it in the few steps of the fits of single servos.
     damping_factor: float = 10.0
     # [1] Largest number of dampings tried for one step. If the first is the smallest damping, the last is 1e5, with
     # which steps are negligible.

@@ -94,8 +94,8 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
 def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
     """Return the regressor (E, count) of all parameters at random states of the arm: E equations of torques.
 
-    There are more than twice as many equations as parameters. count: number of parameters. motors: (n, n) matrix from
-    joint speeds to drive speeds; None: identity.
+    There are more than twice as many equations as parameters. friction: the friction model, whose columns are last.
+    motors: (n, n) matrix from joint speeds to drive speeds; None: identity. count: number of parameters.
     """
     n = len(arm.coordinates)
     # `shape`: random states for at least twice as many equations as parameters

@@ -39,7 +39,10 @@ class WrongOrder(Fault):
         self._rows, self._starts = rows, starts
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques with the columns of two joints exchanged, for all pairs."""
+        """Yield, for each pair of joints, the least-squares fit of the log's torques with their columns exchanged.
+
+        The other corrections in `base` remain.
+        """
         return map(problem.fit, self._swapped(base.hypothesis))
 
     def _swapped(self, base: Hypothesis) -> Iterator[Hypothesis]:
@@ -246,7 +249,8 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints.
+        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints. The
+        other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -275,11 +279,14 @@ class TorqueUnit(WrongScale):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and the
-        masses of the URDF their common factor. Such factors also compensate wrong masses in the URDF, which lowers the
-        cost a little. The factors are therefore accepted only if (1) the cost falls significantly, with a penalty
-        (`rarity`) for each factor, (2) each factor is determined, and (3) the relative residual of each joint is small.
-        lowest: fit of lowest cost so far. has_gravity: True if the gravity in the torques shows another unit.
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
+        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
+        joint is small.
+
+        lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
+        factors. has_gravity: True if gravity torques in the log gave a candidate.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau

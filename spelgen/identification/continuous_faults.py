@@ -38,7 +38,7 @@ class ZeroOffset(Fault):
         """Yield the least-squares fit with the best zero offset of a joint, if it lowers the torque residual enough.
 
         Offsets as small as calibration errors are omitted. A multiple of 90 degrees is preferred to the offset of
-        minimum cost if its cost is about equal.
+        minimum cost if its cost is about equal. The other corrections in `base` remain.
         """
         reading, unit = base.hypothesis, np.eye(len(base.hypothesis.offset))[joint]
         min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift

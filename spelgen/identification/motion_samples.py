@@ -57,7 +57,10 @@ class MotionSamples(NamedTuple):
     def of(
         cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
     ) -> MotionSamples:
-        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples."""
+        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples.
+
+        recording: index of the recording that contains the samples.
+        """
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         numbers = np.full(len(q), recording)
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)), numbers)

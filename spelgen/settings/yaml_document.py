@@ -201,7 +201,7 @@ def unknown_name(
 ) -> SettingsError:
     """Return the error for a name that is not among `names`; it suggests the most similar known name.
 
-    noun: "key" or "joint", for the message.
+    location: keys and indices that lead to the name in the document. noun: "key" or "joint", for the message.
     """
     error = _error_at(location, document, f"unknown {noun} {name!r}")
     error.element, error.do = dotted(location[:-1]), suggestion(name, names)

@@ -150,7 +150,10 @@ def coefficients(
 
 
 def _joint_transforms(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
-    """Return the transform of each body in its joint's frame due to ``positions``: rotation about z or translation."""
+    """Return the transform of each body in its joint's frame due to ``positions``: rotation about z or translation.
+
+    number: function that converts an exact constant to a number of the computation.
+    """
     bases = base_denominators(arm)
     transforms = []
     for body in arm.bodies:

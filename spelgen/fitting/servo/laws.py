@@ -1,7 +1,7 @@
 """Selection of the joints that have a dead zone: fits with and without a dead zone are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
-joint's negative log posterior by more than significance^2 / 2. Load, delay and the weights of the errors are fixed at
+joint's negative log posterior by more than significance^2 / 2. Load, delay and the scale of the errors are fixed at
 the preceding fit in both fits, so that the joints are independent.
 
 A single linearized fit does not suffice at joints without gravity load. There, a dead zone and dry friction both cause
@@ -72,9 +72,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`, or after a step
-        # with a damping of at least 1 that does not lower it: with more damping, the decrease would be negligible.
-        active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
+        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`.
+        active &= ~better | (costs - candidate_costs >= TUNING.min_decrease)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
         costs = torch.where(better, candidate_costs, costs)

@@ -128,7 +128,10 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Take a last Gauss-Newton step, with half the integration step length; set `results` and the checkpoint."""
+        """Take a last Gauss-Newton step from x, with half the integration step length.
+
+        Its result is written to `results` and to the checkpoint.
+        """
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)

@@ -51,8 +51,8 @@ class _RegressorBlock(NamedTuple):
 class ResidualSamples(NamedTuple):
     """T samples with the torque residual of the model and the friction torque of its drives, all (T, n).
 
-    q, qd, qdd: positions, velocities, accelerations [rad, m, s]. torque_residual: measured minus modelled joint torque
-    [Nm, N]. friction: friction torque of the drives [Nm, N].
+    q, qd, qdd: positions [rad, m], velocities and accelerations (per s and s^2). torque_residual: measured minus
+    modelled joint torque [Nm, N]. friction: friction torque of the drives [Nm, N].
     """
 
     q: torch.Tensor
@@ -102,7 +102,7 @@ class TorqueJacobian:
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
+        """Return, per joint, the sum of the squared torque residuals at the parameters x (K,): (n,) [Nm^2, N^2].
 
         For a joint with eliminated terms, the sum includes the penalty of their weights. If motor gains are trained,
         the residual is scaled to the initial gains (see `logged_scale`): otherwise gains near zero would make it small.

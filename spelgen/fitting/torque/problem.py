@@ -210,9 +210,8 @@ class TorqueProblem:
         residual: squared residual per joint, (n,) [Nm^2, N^2], which is not used: the residual of each sample is
         computed here.
         """
-        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters.
-        # Therefore the Hessian of all parameters is computed first, and the rows and columns of the free ones are
-        # selected afterwards.
+        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters: the
+        # gradient of the free ones depends on the deviations of the fixed ones from their prior mean.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]

@@ -53,7 +53,10 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice."""
+    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice.
+
+    correlation_length: number of samples per independent error.
+    """
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 

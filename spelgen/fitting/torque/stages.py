@@ -177,7 +177,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     evidence = log_likelihood_ratio(estimate, unsaturated) - penalty
     if evidence.clamp(-limit, limit).sum() < 0:
         estimate = unsaturated
-    # effects: (n, effects), indices of the coefficients in x
+    # `effects`: row k contains the indices in x of the coefficients of joint k, one per effect.
     effects = torch.stack([index[name] for name in rigid.names("effects", "load_dependence")], dim=-1)
     plain = _without(estimate, effects.flatten())
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - penalty)
