@@ -78,8 +78,7 @@ class SolverResult(Generic[Parameters]):
 
     normal_equations: the latest computed normal equations. They are at the last iterate if the solver ended because no
     further step was accepted. If it ended directly after an accepted step (small decrease of the cost, maximum number
-    of
-    steps), they are at the iterate before this step.
+    of steps), they are at the iterate before this step.
     """
 
     state: SolverState[Parameters]
