@@ -69,7 +69,7 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
-        # Most origins have no rotation: for the result None, callers omit a product of exact matrices.
+        # Most origins have no rotation. None then indicates that a slow product of exact matrices can be omitted.
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
@@ -108,7 +108,7 @@ class AngleRounding:
 
     def position(self, vector: np.ndarray) -> np.ndarray:
         """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
-        # [m] Bound of the rounding errors that composed rotations cause in positions.
+        # [m] Smaller components are rounding errors, which composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
@@ -257,11 +257,11 @@ class Placement:
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the rotation (3, 3) of a frame relative to a body as fractions, approximated from float64.
 
-        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. Such zeros may
-        occur relative to each body of the segment: the bodies since the last revolute joint, or since the root. A
-        rational approximation of the rotation relative to one body preserves the zeros relative to this body only. The
-        rotation is therefore approximated once per body of the segment. The approximation that preserves most zeros is
-        converted to the frame of ``body`` and returned.
+        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. The rotation of
+        the frame may have zeros relative to each body of the segment (the bodies since the last revolute joint, or
+        since the root). A rational approximation preserves only the zeros of the rotation that is approximated. The
+        rotation is therefore approximated relative to each body of the segment. The approximation that preserves most
+        zeros is converted to the frame of ``body`` and returned.
 
         Args:
             body: index of the body, -1 for the root link.

@@ -96,8 +96,8 @@ class _Sentences:
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
                 # A reason names one joint of an entry and has a placeholder for the other joint (see `zero_reason`,
-                # `balance_reason`): the other joint is the joint of the column or, if the joint of the column is
-                # prismatic, the joint of the row.
+                # `balance_reason`). The placeholder is replaced by the joint of the column if it is revolute, otherwise
+                # by the joint of the row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))

@@ -34,7 +34,7 @@ class Inspection:
         arm: the arm.
         structure: structure of the mass matrix M and the potential energy V.
         actuation: entries of the input matrix G.
-        diagnostics: remarks of the reading of the URDF, such as rounded angles.
+        diagnostics: remarks about the URDF and the arm, such as rounded angles.
         input: "torque", or "position" for an arm with position servos.
     """
 

@@ -128,8 +128,8 @@ def _message(error: BaseException, debug: bool) -> str:
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     """Context manager that shows a progress bar on stderr if stderr is a terminal.
 
-    It yields a function with the arguments number of finished steps, number of all steps, and optionally title of the
-    current step.
+    It yields a function f(done, total, title) that updates the bar: number of finished steps, number of all steps, and
+    (optional) title of the current step.
     """
     from rich.console import Console
     from rich.progress import Progress

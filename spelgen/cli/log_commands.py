@@ -152,7 +152,7 @@ def logs(
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.read import read_bounded_logs
 
-    # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
+    # The mapping is loaded after the arm, because the names in the mapping are checked against the joints of the URDF.
     arm = options.ArmOptions(robot, joints, tip, angle_tolerance).load()
     # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:

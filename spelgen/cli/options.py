@@ -63,7 +63,7 @@ def flag(name: str, text: str) -> Declared:
 
 
 def argument(metavar: str, text: str, default: object = ...) -> Declared:
-    """Return the declaration of a positional argument, `metavar` in the help; without a default it is required."""
+    """Return the declaration of a positional argument; `metavar` is its name in the help; it is required by default."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 
