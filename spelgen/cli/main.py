@@ -40,7 +40,7 @@ class Command(TyperCommand):
         return super().get_help(ctx)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the texts of the arguments in the usage line: without braces, optional arguments in brackets."""
+        """Return the arguments of the usage line as texts: optional arguments in brackets, braces of typer removed."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 

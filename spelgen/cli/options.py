@@ -32,7 +32,7 @@ class UsageError(typer.BadParameter):
     """Usage error about an option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
-        """Return the message without the prefix that typer adds, which names a parameter."""
+        """Return the message without typer's prefix "Invalid value for ...": the message names the option."""
         return self.message
 
 

@@ -267,7 +267,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
     key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # The option --objective sets it: no key of --set.
+    keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by --objective, not by --set.
     # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
@@ -342,8 +342,8 @@ def fit_options(
         # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # No objective is given: the logs determine the objective after this point, and some objectives have no time
-        # limit. Among `options`, a time limit would then be an error; among `settings`, which are only default values,
-        # it is ignored.
+        # Without --objective, the objective is chosen later from the logs, and may be one without a time limit. An
+        # entry of `options` that does not apply is an error, an entry of `settings` (default values) is ignored: the
+        # time limit is therefore moved to `settings`.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

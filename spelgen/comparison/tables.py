@@ -124,14 +124,14 @@ def _medians(runs: Runs, measure: str) -> Numbers:
 
 
 def _by_error(medians: Numbers) -> Numbers:
-    """Return the same errors in ascending order; errors that are not finite are last."""
+    """Return {model or baseline: median error} in ascending order of the error; None (not finite) is last."""
     return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 
 def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFigures]) -> Listing:
     """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
     rows, presets = dict(medians), next(iter(medians.values()))
-    # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
+    # Published figures are added as further rows. The cell of a preset that the publication does not evaluate is empty.
     records = {name: published[name].model_dump(exclude_none=True) for name in presets if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
@@ -155,6 +155,7 @@ def _sizes(runs: Runs) -> Listing:
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
     """Return combine(values), in which None is replaced by infinity; None if the result is not finite."""
-    # None is not omitted: otherwise a model that diverges with one of two seeds would be ranked by the other seed.
+    # None, the error of a diverged run, counts as infinite: if it were omitted, a model that diverges with one of two
+    # seeds would be ranked by the other seed only.
     combined = combine([math.inf if value is None else value for value in values])
     return combined if math.isfinite(combined) else None

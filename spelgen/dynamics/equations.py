@@ -127,9 +127,9 @@ def runge_kutta(
 def unbounded(mass: Tensor) -> Tensor:
     """Return the factor t = 1, (...), for mass matrices M, (..., n, n): M is not corrected.
 
-    ``DerivedMass`` replaces M by C + t (M - C), with a constant C; ``DerivedMass.fraction`` returns t < 1 for an
-    indefinite M, so that the result is positive definite. ``mass_as_learned`` puts this function in place of that
-    method.
+    ``DerivedMass`` replaces M by C + t (M - C), with a constant matrix C. The method ``DerivedMass.fraction`` returns t
+    < 1 for an indefinite M, so that the result is positive definite. ``mass_as_learned`` replaces this method by this
+    function, with t = 1 for every M.
     """
     return mass.new_ones(mass.shape[:-2])
 
