@@ -106,7 +106,7 @@ def tip_kinematics(
         joints: names of the coordinates, if ``arm`` is a path.
 
     Raises:
-        ValueError: a joint does not move the link, or no joints are named.
+        ValueError: a joint does not move the link, or ``arm`` is a path and ``joints`` is None.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())

@@ -46,7 +46,7 @@ class ArmModel(PortHamiltonian):
         return PreparedModel(self, tip)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        # pickle does not find the model's class by name, since a function makes the class: pickle calls the function.
+        # pickle cannot find the model's class by name, because a function makes it: the function is called again.
         return (_without_state, (base_class(self.spec),), *super().__reduce_ex__(protocol)[2:])
 
     def __repr__(self) -> str:

@@ -184,8 +184,8 @@ def _joint(
         sizes: typical magnitudes of M, potential energy V and torques.
         index: index of the coordinate, from 0.
         drive: settings of the joint's drive.
-        min_armature: armature if the rotor inertia and at least one of the limits of effort and speed are unknown [kg
-            m^2, kg].
+        min_armature: armature [kg m^2, kg] of a drive with unknown rotor inertia, if its effort limit or its speed
+            limit is unknown, too.
     """
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
@@ -232,8 +232,8 @@ def _entries(weights: Weights) -> Entries:
 def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
     """Return a ``LinkSpec`` for each body of ``arm``, with inertial parameters that are physically consistent.
 
-    inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint frame, (10,) each. They
-    are changed if they are not physically consistent.
+    inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint frame, (10,) each.
+    Inconsistent parameters are corrected by `_consistent`.
     """
     specs = []
     for body, ten in zip(arm.bodies, inertias, strict=True):

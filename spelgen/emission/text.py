@@ -44,7 +44,7 @@ _EXAMPLE = """\
 # [bytes] Largest file that is read as a module: ten times the size of the largest module that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
-# The statement of a module with its specification. JSON has no three quotes in a row.
+# The statement of a module with its specification, as JSON. It ends at the first """, which cannot occur in JSON.
 _SPEC = re.compile(r'^SPEC = r"""(.*)"""', re.MULTILINE)
 
 
