@@ -174,7 +174,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
-    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: one assignment each, after comments on its units."""
+    """Return the source of the tables ``JOINTS``, ``LINKS``, ...; comments with the units precede each table."""
     statements = []
     terms: dict[str, Sequence[OutputSpec | ConstantSpec]] = {
         "FUNCTIONS": spec.outputs,

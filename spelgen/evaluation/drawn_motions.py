@@ -99,7 +99,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return every k-th sample of a motion for a chart, with the smallest k that gives at most `max_samples`."""
+    """Return every k-th sample of a motion, for a chart; k is the smallest stride that gives at most `max_samples`."""
     # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
@@ -154,10 +154,7 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques along `samples` that charts show: of all predictors, and the terms of the model.
-
-    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`.
-    """
+    """Return the torques along `samples` for a chart: measured, predicted by each predictor, and terms of the model."""
     model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():
