@@ -154,7 +154,11 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques along `samples` for a chart: measured, predicted by each predictor, and terms of the model."""
+    """Return the torques along `samples` for a chart: measured, predicted by each predictor, and terms of the model.
+
+    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`. Its torque is also
+    returned as a sum of four terms: inertia, Coriolis, gravity and friction torque.
+    """
     model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
     with torch.no_grad():

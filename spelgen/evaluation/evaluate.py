@@ -233,7 +233,7 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of model and baselines for torque logs: of inverse dynamics, and of motion under these torques.
+    """Return the errors of model and baselines on torque logs: of predicted torques, and of predicted motion.
 
     Args:
         tested: the model with the data of its fit.

@@ -40,7 +40,7 @@ class TorqueErrors:
 
     @property
     def worst_nmse(self) -> float | None:
-        """Largest nMSE (squared error / variance of the torque) of all joints; None if all torques are constant."""
+        """Largest nMSE of all joints (mean squared error / torque variance); None if all torques are constant."""
         return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
 
 

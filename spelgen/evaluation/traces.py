@@ -185,7 +185,10 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the 10, 50 and 90 % quantiles over W windows, (T,) each, of errors (W, T) at T times; NaN is infinity."""
+    """Return the 10, 50 and 90 % quantiles of the errors of W windows, (T,) each; NaN counts as infinite.
+
+    values: errors (W, T) at T times.
+    """
     errors = values.nan_to_num(nan=torch.inf).numpy()
     return Quantiles(*np.quantile(errors, (0.1, 0.5, 0.9), axis=0, method="nearest"))
 

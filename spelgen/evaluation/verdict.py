@@ -172,7 +172,9 @@ def _relative(errors: StateErrors | None) -> float:
 def _better_baselines(results: Results, good_torques: bool) -> list[str]:
     """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
 
-    good_torques: whether the torques of the model are accurate enough for a use, which is then recommended.
+    Constant velocity has a sentence of its own: at the horizons at which it predicts better than the model, the model
+    is recommended for torques only, if ``good_torques`` is True (torque errors small enough for a use). A second
+    sentence lists all other baselines with the horizons, or "in torque".
     """
     times = []
     better: dict[str, list[str]] = {}
@@ -219,8 +221,8 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     The relative error is the RMS error divided by the RMS change over the horizon.
     """
     for last in results.horizons[-1:]:
-        # q and qd are averaged as in the error of all joints, so that the worst joint is not better than their mean.
-        # An unknown error (None) becomes NaN.
+        # The errors of q and qd of a joint are averaged, as in `mean_relative_rms`: the largest value is then at least
+        # the mean over joints. An unknown error (None) becomes NaN.
         of_model = last.errors[MODEL]
         errors = np.mean(np.array([of_model.q_relative_rms, of_model.qd_relative_rms], dtype=float), axis=0)
         if np.isfinite(errors).all():

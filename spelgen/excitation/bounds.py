@@ -86,7 +86,7 @@ def motion_bounds(
 
 
 def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:
-    """Return the error about a joint without a range to move in; limits: [rad, m], None if there are none."""
+    """Return the error for a joint whose limits are absent or not increasing; limits: [rad, m], None if absent."""
     got = "no position limits"
     do = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
     if limits is not None:

@@ -188,7 +188,8 @@ def _start(
     """
     if start is None:
         middle = (limits.low + limits.high) / 2
-        # The default start position is zero if possible, since the controllers of most arms start there.
+        # By default, the approach starts at zero if the limits allow it: most arms are at zero when their controller
+        # starts.
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle
