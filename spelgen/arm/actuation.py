@@ -156,8 +156,8 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 def _reduced(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
     """Yield a remark if the URDF states reductions of driven joints, and the settings do not state a `torque`.
 
-    The remark asks the user whether the logged torques are joint torques, as assumed, or motor torques. driven: names
-    of the joints that are not passive in the settings.
+    Text of the remark: the logged torques are assumed to be joint torques; motor torques must be declared in the
+    settings. driven: names of the joints that are not passive in the settings.
     """
     transmissions = [x for x in robot.transmissions if not x.errors and set(x.joint_names) <= set(driven)]
     reductions = {

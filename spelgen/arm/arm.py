@@ -326,8 +326,9 @@ def _dependent_remarks(
 ) -> Iterator[Diagnostic]:
     """Yield a warning for each locked joint that may be part of a parallelogram linkage of the arm.
 
-    URDF has no closed loops, so a linkage is opened at a joint. Two revolute joints then have the same parent body and
-    parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links in their bodies.
+    URDF has no closed loops, so the closed loop of a linkage is cut at a joint. Two revolute joints then have the same
+    parent body and parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links
+    in their bodies.
     """
     roots: dict[str, str] = {}  # {link: first link of its branch}, to group joints by branch
     branches: dict[str, list[UrdfJoint]] = {}

@@ -81,9 +81,10 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, plus `disturbance` as a force (see `_stepper`).
+        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, including the disturbance of `_stepper`.
 
-        pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
+        A disturbance that is an acceleration is multiplied by M. pose: mass matrix and forces at the positions q. qd,
+        tau: (W, n). z: friction state.
         """
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added

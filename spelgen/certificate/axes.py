@@ -86,8 +86,8 @@ class Axes:
     def same_twist(self, a: int, b: int) -> bool:
         """Return True if joints ``a`` and ``b`` have equal or opposite twists.
 
-        Two revolute joints then are coaxial, and two prismatic joints are parallel. A body that both joints carry then
-        has equal or opposite velocities for unit velocities of the two joints.
+        This is true for coaxial revolute joints, and for parallel prismatic joints. A unit velocity of ``a`` and a unit
+        velocity of ``b`` give equal or opposite velocities to a body that both joints carry.
         """
         return _are_parallel(self._twists[:, a], self._twists[:, b])
 

@@ -267,7 +267,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
     key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # The objective is set by --objective, not by --set.
+    keys = Assignments.model_fields.keys() - {"objective"}  # --objective sets the objective: no key of --set.
     # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:

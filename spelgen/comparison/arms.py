@@ -138,8 +138,9 @@ class ArmInputs(ComparedArm):
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:
         """Return the training and test trajectories of split `number` of `splits`. Raises LogError.
 
-        A single split tests on the logs test.*, or on a quarter of all trajectories. Several splits are the folds of a
-        cross-validation. The seed of the choice is fixed, so all models are tested on the same trajectories.
+        For ``splits`` = 1, the test trajectories are the logs test.* or, without such logs, a random quarter of all
+        trajectories. Otherwise they are fold ``number`` of a cross-validation with random folds. The seed is fixed: all
+        models are tested on the same trajectories.
         """
         # A job contains only the paths of the URDF and the logs: each worker process loads the files itself.
         arm = self.load()

@@ -94,7 +94,7 @@ class Job(Group):
 
     @cached_property
     def folder(self) -> Path:
-        """Run folder, whose name ends with a hash of all inputs of the run, so that other inputs have another folder.
+        """Run folder. Its name ends with a hash of all inputs of the run: other inputs give another folder.
 
         The inputs are logs, URDF, settings, design, options and version of spelgen. Paths of files do not affect the
         hash.

@@ -110,11 +110,11 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies at q, (..., n) [rad, m], and the derivatives of their momenta.
+        """Return the configuration cache at q, (..., n) [rad, m], and the d momenta / d qd of the bodies.
 
-        The momentum of a body is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and the time
-        derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of the
-        momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
+        The momentum of each of the B bodies is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and
+        the time derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of
+        the momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
         """
         # The kinetic energy of a body is 1/2 tr(T' J T'^T), with T' = dT/dt. The pseudo-inertia J itself is used,
         # without its Cholesky factors, so J may be physically inconsistent. `chain.forward` returns the transforms T

@@ -1,7 +1,7 @@
 """Conversion of a ``ModelSpec`` to the source of a module, and back. Equal specifications give equal bytes.
 
-Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. The specification of
-a module is found in its text, which is not executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module is not
+executed to read its specification: its text is searched for the specification.
 """
 
 import ast

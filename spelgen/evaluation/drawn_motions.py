@@ -111,7 +111,7 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int) 
     """Return the measured and the predicted motion of window k, for a chart.
 
     trajectory: name of the log. windows: measured motion of W windows. states: predicted q and qd of the windows after
-    their first sample, (W, T-1, n) each. The first sample of the prediction is the measured one.
+    their first sample, (W, T-1, n) each. The first sample of the predicted motion is the measured initial state.
     """
     predicted_q, predicted_qd = states
     return PredictedMotion(

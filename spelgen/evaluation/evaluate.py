@@ -95,9 +95,9 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the URDF of the fit, for the baselines that were fitted to the training logs; None without them.
+        """Arm in the URDF of the fit, whose kinematics the baselines of least_squares.json use; None without them.
 
-        The baselines use its kinematics. Raises UrdfError, ArmError or SettingsError.
+        Raises UrdfError, ArmError or SettingsError.
         """
         if self.fitted_urdf is None or not self.baselines:
             return None

@@ -20,8 +20,8 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 class ReplayErrors:
     """RMS errors of the positions that one predictor gives under the commands of test logs [rad, m].
 
-    trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
-    and all logs, (n,).
+    trajectories: {log: RMS over time and joints}. mean: mean of the errors of all logs. joints: RMS of each joint over
+    all logs, (n,).
     """
 
     trajectories: dict[str, float]
@@ -135,7 +135,8 @@ def _replay(
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
     """Return the RMS position errors of one predictor per log and per joint.
 
-    names: name of the log of each segment. errors: position errors of each segment, (K, n) [rad, m] for K + 1 samples.
+    names: name of the log of each segment. errors: position errors of each segment of K + 1 samples, (K, n) [rad, m];
+    the first sample, the initial state, has no error.
     """
     by_name: dict[str, list[np.ndarray]] = {}
     # A log with gaps consists of several segments with the same name: their errors are joined.

@@ -49,7 +49,7 @@ class Criterion:
         self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd for parameters (size,) at the T times of the criterion, (3, T, n)."""
+        """Return q, qd and qdd, (3, T, n), of the motion with the given parameters (size,), at T equidistant times."""
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:

@@ -132,10 +132,11 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
+    """Return ``bounds`` with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
 
-    The approach is the motion to the first position of the exciting motion. Without an acceleration limit, the approach
-    reaches its largest speed in one second. arm: for the number and the names of the joints.
+    ``acceleration`` limits the exciting motion and the approach, which is the motion to its first position. None: the
+    bounds are unchanged, and the approach reaches its largest speed in one second. arm: for the number and the names of
+    the joints.
     """
     if acceleration is None:
         return bounds, bounds.speed
@@ -144,7 +145,7 @@ def _accelerated(
 
 
 def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:
-    """Return an argument of `excite` as one number per joint, (n,). Raises SettingsError if it is invalid."""
+    """Return the argument ``name`` of `excite` as one number per joint, (n,). Raises SettingsError if it is invalid."""
     count = len(arm.coordinates)
     array = np.atleast_1d(np.array(values, dtype=float))
     if positive and array.shape == (1,):
