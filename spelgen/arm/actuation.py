@@ -24,8 +24,8 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 class InputEntry:
     """A nonzero entry of the input matrix G, joint torques per logged torque; row and column are 0-based.
 
-    ``kind``: ``fixed`` for the known gear of a motor of one joint; ``coupled`` for a known entry of a motor that moves
-    several joints; ``gain`` for an entry that is trained, with the initial value ``value``.
+    ``kind``: ``fixed``: known gear of a motor that moves one joint; ``coupled``: known entry of a motor that moves
+    several joints; ``gain``: trained entry, with the initial value ``value``.
     """
 
     row: int
@@ -178,8 +178,8 @@ def _reduced(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterato
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
     """Return the entry of the input matrix G of a motor that moves only the joint ``name``, with the index ``index``.
 
-    Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
-    gain with the initial value 1.
+    Its value is the gear in the settings, otherwise the reduction in the URDF. If both are absent, the entry is a
+    trained gain with the initial value 1.
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)

@@ -366,10 +366,10 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of revolute joints in ``moved`` that are on the same body and parallel to ``axis``.
+    """Return the names of revolute joints in ``moved`` that are parallel to ``axis`` and have a given parent body.
 
-    frame: frame of a link of this body. The body is the parent of the joints; for the root link the result is []. axis:
-    direction (3,) in the frame of the body.
+    frame: frame of a link of the parent body; for the root link the result is []. axis: direction (3,) in the frame of
+    the body.
     """
     # Column 2 of `rotation` is the z axis of the joint's frame, which is the axis of the joint, in the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]

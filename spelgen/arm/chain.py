@@ -29,7 +29,7 @@ class ChainChoice(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; it is no mimic joint itself."""
+    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; the leader has no <mimic>."""
 
     leader: UrdfJoint
     multiplier: Fraction
@@ -190,8 +190,8 @@ def _possible_gripper(robot: Robot, last: UrdfJoint, is_mimicked: bool) -> tuple
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
     The joint may open a gripper in three cases: it is prismatic and moves by at most 0.1 m; other jaws or finger joints
-    follow it (``is_mimicked``); or its child link has the name of a gripper. Names of links are used only if no joint
-    of the robot has the name of a gripper: joints with such names are excluded from the chain already. A joint with a
+    follow it (``is_mimicked``); or its child link has the name of a gripper. The last criterion is used only if no
+    joint of the robot has the name of a gripper, since such joints are excluded from the chain already. A joint with a
     range of more than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
     """
     lower, upper = last.limits or (0.0, 0.0)

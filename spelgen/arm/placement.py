@@ -139,8 +139,8 @@ class Frame(NamedTuple):
         body: index of the body of the link, -1 for the root link.
         rotation, position: rotation (3, 3) and position (3,) [m] of the link in the frame of this body, as fractions.
         composed: float64 rotation (3, 3) of the link relative to the start of its segment, from which `rotation` is
-            approximated. A segment starts at the root or at a body with a revolute joint. Bodies with prismatic joints
-            continue the segment, so that all rotations within it are constant.
+            approximated. A segment starts at the root or at a body with a revolute joint. A prismatic joint does not
+            rotate: its body continues the segment. All rotations within a segment are therefore constant.
     """
 
     body: int

@@ -90,8 +90,8 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     """Return a rotation R (3, 3) with R z = ``axis``, a unit vector (3,).
 
     For an axis along +-x, +-y or +-z, R is a signed permutation. For any other axis, R is the signed permutation for
-    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``: if a component of
-    ``axis`` is zero, four elements of R are zero.
+    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``: in this way, four
+    elements of R are zero if a component of ``axis`` is zero.
     """
     index = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[index] > 0 else -1.0

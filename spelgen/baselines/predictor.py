@@ -93,8 +93,8 @@ def _stepper(
         """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`); step: (W, 1) [s].
 
         The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
-        friction / d qd. If friction has a state z, K is its derivative with respect to q, on which z depends; otherwise
-        K = 0.
+        friction / d qd. If friction has a state z, which depends on q, K is the derivative of friction with respect to
+        q; otherwise K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -139,7 +139,7 @@ def _friction_slopes(
     """Return the derivatives of joint friction with respect to velocity (damping) and to position (stiffness).
 
     Damping [Nm s/rad, N s/m] and stiffness [Nm/rad, N/m] are (W, n) for W windows, the diagonals of Jacobian matrices:
-    the friction of a joint depends only on the motion of the joint, and on its position through the bristles.
+    the friction of a joint depends only on the motion of this joint. Bristles add the dependence on position.
 
     Args:
         dynamics: dynamics of the arm.
@@ -249,7 +249,7 @@ A predictor returns q and qd of W windows of K samples, (W, K-1, n) each, at all
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands."""
+    """Interface of predictors of joint positions under position commands."""
 
     def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment at the end of each sample interval.

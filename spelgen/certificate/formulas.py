@@ -43,8 +43,8 @@ class Formula:
 
     Attributes:
         entry: (row, column) counted from 1, or "V".
-        terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
-            expansion would exceed the permitted number of multiplications (`Expansion.budget`).
+        terms: number of products of a base parameter and a monomial in cosines, sines and positions of prismatic
+            joints; None if the expansion would exceed the permitted number of multiplications (`Expansion.budget`).
         expression: SymPy expression; None if the entry is too long.
     """
 
@@ -59,7 +59,7 @@ class Formula:
 
     @property
     def omission(self) -> str:
-        """Text with the reason why the entry has no expression, for users."""
+        """Text for users: reason why the entry has no expression."""
         if self.terms is None:
             return "too many terms to be expanded"
         return f"{self.terms} terms, omitted"

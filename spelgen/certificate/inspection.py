@@ -233,7 +233,7 @@ class Inspection:
 
 
 def _driven_joints(entries: Iterable[InputEntry]) -> str:
-    """Return the joints that entries of the input matrix G drive (their rows), as text such as ``joints 2-4``."""
+    """Return the joints of ``entries`` of the input matrix G (their rows) as text, such as ``joints 2-4``."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 

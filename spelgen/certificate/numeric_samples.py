@@ -121,7 +121,7 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tuple[float, float]]:
-    """Return {quantity, such as "masses and inertias": two largest relative differences of readings of the URDF}.
+    """Return {quantity, such as "masses and inertias": two relative differences between readings of the URDF}.
 
     The quantities are "axes of the joints" and "masses and inertias", compared at random configurations. The first
     number is the largest difference between Pinocchio and spelgen without rounding of angles, such as 1.5708 to pi/2.

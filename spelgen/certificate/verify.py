@@ -203,7 +203,8 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield two facts about the entries of M: the zero entries, if any, and the joints on which each entry depends.
 
-    The first fact is tested by the entries in `samples`, and the second by their changes if only one joint moves.
+    The first fact is tested by the sampled entries of M, the second by the changes of the entries if only one joint
+    moves.
     """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
@@ -286,7 +287,7 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
     """Return the fact that the potential energy V depends only on the joints `structure.potential`, and its test.
 
-    The test uses the gravity torques dV/dq in `samples`: zero at all other joints, nonzero at these joints.
+    The test uses the gravity torques dV/dq in `samples`: they must be nonzero at these joints and zero at all others.
     """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):

@@ -182,7 +182,10 @@ def logs(
 
 
 def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
-    """Write a mapping that fits the columns of the first log; return its path. Exit with 1 if columns are absent."""
+    """Write a mapping for the columns of the first log to ``file``; return ``file``.
+
+    Exits with 1 if a needed quantity, such as the position of a joint, has no matching column.
+    """
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping

@@ -47,7 +47,7 @@ class OwnEquations(Protocol):
 def equations_of(dynamics: object) -> EquationsAt:
     """Return a function of positions q, (W, n), that returns the equations of motion of W rollouts at q.
 
-    The function uses the parameter cache of ``dynamics``: it is valid until a parameter changes.
+    The returned function uses a parameter cache of ``dynamics``: do not use the function after a parameter has changed.
     """
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())

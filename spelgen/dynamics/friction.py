@@ -106,7 +106,7 @@ class FrictionModel:
         stribeck: True: add dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
         polynomial: True: add the effects qd |qd| and qd^3.
         memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), and each
-            bristle is an effect with its own coefficient. False: it depends on the tanh of the velocity.
+            bristle is an effect with its own coefficient. False: Coulomb friction depends on the tanh of the velocity.
     """
 
     coulomb_smoothing_velocity: float = 0.01

@@ -195,7 +195,7 @@ class PreparedModel:
         return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Return the Jacobian of the tip in root axes, (..., 6, n), linear velocity first.
+        """Return the Jacobian of the tip, (..., 6, n), in root axes: three rows of linear, three of angular velocity.
 
         Raises ValueError without a tip.
         """

@@ -40,7 +40,7 @@ class RigidDynamics(Protocol):
         """Return h, (..., n): Coriolis, centrifugal and gravity torque, without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N], with the sign of qd: it is subtracted from the inputs."""
+        """Return the friction torque, (..., n) [Nm, N]: term on the left side of the equation, with the sign of qd."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau."""

@@ -110,7 +110,7 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache at q, (..., n) [rad, m], and the d momenta / d qd of the bodies.
+        """Return the configuration cache at q, (..., n) [rad, m], and d momenta / d qd of the bodies.
 
         The momentum of each of the B bodies is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and
         the time derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of

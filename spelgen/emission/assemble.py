@@ -106,7 +106,7 @@ def spec_of(model: object) -> ModelSpec | None:
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
     """Return the mass matrix M, (..., n, n), from its functions of q and its constants (the terms).
 
-    The function ``mass_entries`` of an emitted module computes the same.
+    The function ``mass_entries`` of an emitted module computes the same matrix.
 
     Args:
         rows: for each row of the lower triangle of M, a list of the entries as linear combinations of the terms.

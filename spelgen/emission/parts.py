@@ -34,7 +34,7 @@ class Call:
 
 
 def call(callee: str, *positional: object, **named: object) -> Call:
-    """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
+    """Return a ``Call`` of ``callee`` with the given positional and keyword arguments."""
     arguments = [(None, value) for value in positional]
     return Call(callee, (*arguments, *named.items()))
 
@@ -208,7 +208,7 @@ def _friction_laws(spec: ModelSpec) -> Call:
 def _networks(spec: ModelSpec) -> dict[str, object]:
     """Return the keyword arguments of the constructor of a network model, except for ``joints`` and ``inputs``.
 
-    Their order determines the initial weights, since all networks use one random generator.
+    The order of the arguments determines the initial weights, since all networks use one random generator.
     """
     n = len(spec.joints)
     ones = (1.0,) * n

@@ -259,8 +259,8 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     """Return the inertial parameters ``ten`` of a body, (10,), made physically consistent if necessary.
 
-    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`), as are principal second
-    moments of mass below `min_second_moment` times the largest.
+    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`). Principal second
+    moments of mass below `min_second_moment` times the largest are raised, too.
     """
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T

@@ -308,7 +308,7 @@ def _results(
 ) -> Results:
     """Return results that contain the names of the arm, joints and logs, the notes and the curves, but no errors yet.
 
-    The errors are None or empty. They are computed separately and added by `replace`.
+    The fields of errors are empty until `replace` sets them.
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,

@@ -25,7 +25,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of sample intervals before a prediction from which a momentum observer estimates a disturbance.
+    """Return the number of sample intervals, before a prediction starts, that a momentum observer uses.
 
     rate: sample rate [Hz].
     """

@@ -141,7 +141,8 @@ def motion_traces(
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
     """Return the curves of the evaluation of an arm under position servos, from the replayed logs.
 
-    The logs of median and of largest error are shown. errors: position errors of the model along each replayed log.
+    Charts show the log of median error and the log of largest error. errors: position errors of the model along each
+    replayed log.
     """
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))

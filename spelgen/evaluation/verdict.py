@@ -115,7 +115,7 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 
 
 def _worst_torque(results: Results) -> tuple[str, float]:
-    """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
+    """Return the joint with the largest nMSE of the model, and the nMSE; coarsely quantised torques are omitted."""
     torque = results.torque.get(MODEL)
     errors = {} if torque is None else dict(zip(results.joints, torque.joint_nmse, strict=False))
     nmse = {x: error for x, error in errors.items() if error is not None and x not in results.torque_steps}
@@ -203,8 +203,8 @@ def _better_baselines(results: Results, good_torques: bool) -> list[str]:
 def _worst_joint(results: Results) -> tuple[str, str]:
     """Return the name of the worst joint, "" if no error is known, and a sentence about its motion error.
 
-    The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
-    joint of the largest motion error.
+    The worst joint is the joint with the largest torque error. If all torque errors are small and the motion error is
+    not, it is the joint with the largest motion error.
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
@@ -216,9 +216,9 @@ def _worst_joint(results: Results) -> tuple[str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest relative error at the longest horizon, and this error, averaged over q and qd.
+    """Return the joint with the largest motion error at the longest horizon, and this error.
 
-    The relative error is the RMS error divided by the RMS change over the horizon.
+    The error is relative: RMS error divided by RMS change over the horizon, averaged over q and qd.
     """
     for last in results.horizons[-1:]:
         # The errors of q and qd of a joint are averaged, as in `mean_relative_rms`: the largest value is then at least

@@ -52,8 +52,8 @@ def motion_bounds(
         arm: The arm.
         range_fraction: Fraction of each position range; the middle of the range is unchanged.
         speed_fraction: Fraction of each velocity limit.
-        joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits, and to
-            the soft limits of <safety_controller>. None: limits of mimic joints and soft limits are ignored.
+        joints: {name: joint of the URDF}. The bounds are then reduced to the soft limits of <safety_controller>, and so
+            that <mimic> joints keep their limits, too. None: limits of mimic joints and soft limits are ignored.
         ranges: {name of a joint: position range}, in place of the limits in the URDF. A continuous joint without a
             range has the range -pi to pi.
 

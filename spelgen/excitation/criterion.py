@@ -72,7 +72,7 @@ class Criterion:
         return float(self._value(torch.from_numpy(parameters)))
 
     def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,) for parameters (size,). The criterion must be finite."""
+        """Return the criterion and its gradient (size,) for parameters (size,). It must be finite there."""
         variables = torch.from_numpy(parameters).requires_grad_()
         value = self._value(variables)
         (gradient,) = torch.autograd.grad(value, variables)
