@@ -106,7 +106,7 @@ class Subject:
     def assessed(self, results: Results) -> Results:
         """Return the results of an evaluation of this model, with an added assessment in words.
 
-        The assessment compares the test logs with the motion in the training logs and with the joint limits.
+        Its recommendations of further motions depend on the motion in the training logs and on the joint limits.
         """
         limits: Limits = ()
         independent: list[str] = []
