@@ -185,8 +185,8 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # `following` is the number of mimic joints of the chain: each is a separate body in the derivation. The joints of
-    # the chain are subtracted, because `leaders` contains them as their own leaders.
+    # `following` is the number of mimic joints of the chain, which are separate bodies in the derivation: the number of
+    # joints with a leader in the chain, minus the joints of the chain, which are their own leaders.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"

@@ -47,8 +47,8 @@ class AngleRounding:
     @property
     def rotation_error(self) -> float:
         """Largest permitted error of the rational approximation of a rotation [rad]."""
-        # If rounding is disabled, the rational approximation must not round either: with a permitted error of 1e-11,
-        # the rotation by 1.57079632679 would become a quarter turn, since this angle differs from pi/2 by 5e-12.
+        # If rounding is disabled, the rational approximation must not round either. For example, 1.57079632679 differs
+        # from pi/2 by 5e-12: with a permitted error of 1e-11, the rotation would become a quarter turn.
         return TUNING.rotation_error if self.tolerance else 1e-15
 
     def origin(
@@ -249,8 +249,8 @@ class Placement:
                 already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components of the joint's position are set to 0 in the joint's frame and in the body's frame: a rounding
-        # error in either would make a zero entry of M nonzero.
+        # Tiny components are set to 0 in the joint's frame (above) and in the body's frame: a rounding error in either
+        # frame would make a zero entry of M nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 

@@ -30,7 +30,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
 
     preprocessing: resampling and filters of the logs, as in the fit of the model, with all default values resolved.
     """
-    # The identification is imported here, since an evaluation, which imports this file, only reads fitted baselines.
+    # The identification is imported here: an evaluation imports this file, too, and needs no identification.
     from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify_by
 

@@ -242,8 +242,8 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # The first inertial parameter of a base parameter occurs in no other base parameter, so its coefficient in
-            # M or V is the coefficient of the base parameter.
+            # Each base parameter contains an inertial parameter, its first one, that occurs in no other base parameter.
+            # The coefficient of this inertial parameter in M or V is the coefficient of the base parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":

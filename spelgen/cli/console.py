@@ -40,7 +40,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """
     groups: dict[str, type] = {}
     options: list[inspect.Parameter] = []
-    # `eval_str` turns annotations into types: `from __future__ import annotations` makes them strings.
+    # With `from __future__ import annotations`, annotations are strings: `eval_str` converts them to types.
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
             groups[name] = parameter.annotation

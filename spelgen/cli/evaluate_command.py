@@ -51,7 +51,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
-    # The run is loaded after the logs are read, since errors in logs are more frequent.
+    # The logs are read before the run is loaded: errors in logs are frequent, and are reported without delay.
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -225,7 +225,7 @@ def compare(
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")
-    # The exit code for failed runs is set only after the page is written, which lists these runs.
+    # The page lists the failed runs, so it is written before the command exits with an error.
     if study.failures:
         raise typer.Exit(FAILED)
 

@@ -51,7 +51,7 @@ def arm_results(
     medians = {measure: _medians(runs, measure) for measure in results[0].errors}
     measure, errors = next(iter(medians.items()))
     ranked = _by_error(errors)
-    # The errors include baselines, which have no runs.
+    # `ranked` also contains baselines, which are not trained: the best model is the first one with runs.
     best = next(model for model in ranked if model in runs)
     # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
     tables = (_losses(medians, published), _sizes(runs)) if results[0].sizes else (_ranking(medians, runs),)

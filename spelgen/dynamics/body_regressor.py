@@ -132,8 +132,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     order += range(inertial, inertial + 2 * n)
     # The random states give twice as many equations as parameters, so that they do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
-    # The last digit of a result of torch depends on the alignment of its memory, which varies for NumPy arrays. The
-    # random states are therefore copied to memory of torch.
+    # In torch, the last digit of a result depends on the memory alignment of the arguments, which varies for NumPy
+    # arrays. The random states are therefore copied to memory of torch.
     motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion)
     columns = torch.cat([columns, motors.mT.expand(len(columns), n, n)], dim=-1).flatten(0, 1)

@@ -138,8 +138,8 @@ def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `typical_range` is (center, half range). `runtime.rows.Joint` computes the same two numbers from the limits,
-        # with the same rounding: the row of a joint omits `typical_range` if it is equal to the computed numbers.
+        # `typical_range` is (center, half range). By default, `runtime.rows.Joint` computes it from the limits, with
+        # the rounding used here: the row of a joint omits `typical_range` if it has its default value.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}

@@ -148,7 +148,7 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
 
 
 def _assess_replays(results: Results, uses: _Uses) -> None:
-    # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
+    # Only the replay of whole logs, the first one, is assessed: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
         if error == min(errors.mean for errors in replay.errors.values()):
