@@ -83,8 +83,8 @@ class Actuation:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
         # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds need the
-        # couplings: in `torques`, a copy of G, the rows of coupled joints are replaced by joint torques per motor
-        # torque.
+        # couplings: in `torques`, a copy of G, the rows of coupled joints are replaced by the couplings (joint torques
+        # per motor torque).
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:

@@ -156,7 +156,7 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
         structure: structure that is derived from the chain.
         seed: seed of the random configurations and inertial parameters.
     """
-    # A derived rank is at most the number of entries of M: as many samples are enough to confirm it. Six more samples
+    # A derived rank is at most the number of entries of M: this number of samples confirms it. Six more samples
     # are drawn to detect a true rank that is larger.
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
