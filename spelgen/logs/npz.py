@@ -148,7 +148,8 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     for name in arrays.names:
         try:
             shapes[name] = arrays[name].shape
-        # Other arrays, such as a dict with the settings of the recorder, are not needed.
+        # Arrays that are no numbers, such as a dict with the settings of the recorder, contain no signals and are
+        # skipped.
         except LogError as fault:
             faults.append(fault)
     collect([] if shapes else faults)
@@ -157,7 +158,9 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
     chosen = [x for x in columns if samples == (arrays[x].size if x in vectors else len(arrays[x]))]
     for name, shape in sorted(shapes.items(), key=lambda item: -len(item[1])):
-        # An array of images has a row per time, and is not needed. Simulations may have a state more than inputs.
+        # Other arrays with a row per time, such as images, are no signals. But a dimension of `samples` elsewhere is a
+        # transposed signal, and a dimension of `samples` +- 1 is a signal of other times: a simulation may have one
+        # state more than inputs.
         if name not in chosen and shape[:1] != (samples,) and any(abs(x - samples) < 2 for x in shape):
             do = (
                 "transpose it: rows are times"
