@@ -23,7 +23,7 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times its size
+MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times the bag's size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of records in an MCAP file

@@ -264,7 +264,7 @@ def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, r
     letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
     forms = []
     for form in (words, distinct, letters):
-        # A shortened name must contain a letter. A number alone does not identify a joint, since the columns may be
+        # A shortened name must contain a letter. A bare number does not identify a joint, since the columns may be
         # numbered in another order than the joints.
         if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
             parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}

@@ -89,7 +89,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
     # The unit advised for q also applies to commands. But if the range of the commands is less than a third of the
-    # range of q, the commands are in SI units, and this unit is advised for them, too.
+    # range of q, the commands are already in SI units, and the SI unit is advised for the commands.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
     # Positions beyond two turns may be in degrees, or be measured at a motor before a gear. Only a ratio of dq/dt to qd
