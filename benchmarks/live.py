@@ -274,9 +274,9 @@ def linear_bound(case: Case, before: float = 0.3, after: float = 0.15) -> None:
     """Print the share of steps of 10 % of effort that a matched filter with the known waveform finds, per alarm rate.
 
     The filter of a joint is the generalised least-squares estimate of a step of torque `after` [s] ago, from the
-    residuals of the momentum balance since the step and during `before` [s] before the step. Its covariance and its threshold are
-    estimated from the test logs themselves: no linear detector of one joint with a constant threshold and this delay
-    finds more. The alarm rate is divided equally among the joints.
+    residuals of the momentum balance since the step and during `before` [s] before the step. Its covariance and its
+    threshold are estimated from the test logs themselves: no linear detector of one joint with a constant threshold
+    and this delay finds more. The alarm rate is divided equally among the joints.
     """
     model, effort, outputs = torque_model(case.fit), case.levels.effort, []
     for log in case.tests:

@@ -307,7 +307,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
     """A model in memory is evaluated on arrays and compared with other dynamics, without a run folder or files.
 
-    The given `preprocessing`, here without low-pass filter, applies to the torque errors too.
+    The low-pass cutoff of `preprocessing` affects the torque errors too.
     """
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
