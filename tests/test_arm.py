@@ -88,7 +88,7 @@ class TestChain:
         assert names(make_arm(robot(joint("a", "0", "1"), *jaws))) == ["a"]
 
     def test_a_last_joint_that_may_open_a_gripper_is_stated_with_the_tip_that_leaves_it_out(self, robot):
-        """If only the last link has a gripper's name, the remark `ambiguous-chain` advises --tip LINK before it."""
+        """The remark `ambiguous-chain` on a last link named like a gripper advises the link before it for --tip."""
         arm = robot(joint("a", "0", "1"), joint("b", "1", "gripper_moving_part"))
         assert names(make_arm(arm)) == ["a", "b"]
         (remark,) = [x for x in make_arm(arm).diagnostics if x.code == "ambiguous-chain"]
@@ -112,7 +112,7 @@ class TestChain:
         assert "ambiguous-chain" in codes(arm)
 
     def test_a_last_joint_that_fingers_elsewhere_follow_is_stated(self, robot):
-        """A last joint that other joints mimic may drive a gripper: the remark advises --tip, the link before it."""
+        """A last joint that other joints mimic may drive a gripper: the remark advises the link before it for --tip."""
         drive = joint("drive", "palm", "l").replace('lower="-1" upper="2"', 'lower="0" upper="0.8"')
         followers = [joint("m1", "palm", "r", inside='<mimic joint="drive" multiplier="-1"/>')]
         followers += [joint("m2", "l", "t", inside='<mimic joint="drive"/>')]

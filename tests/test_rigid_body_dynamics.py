@@ -186,7 +186,7 @@ def same_dynamics(one, other, joints, tolerance):
 
 
 def test_mimic_and_locked_joints_are_the_arms(tmp_path):
-    """Dynamics of an arm with mimic and locked joints equal Pinocchio's dynamics of the file, so constrained."""
+    """Dynamics of an arm with mimic and locked joints equal Pinocchio's dynamics with the same constraints."""
     path = tmp_path / "lift.urdf"
     path.write_text(LIFT)
     lift = make_arm(read_urdf(path), joints=["low", "swing"])

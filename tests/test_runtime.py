@@ -312,7 +312,8 @@ def weights_of_first_stage(bodies):
 def rotation_inputs(joint_types, axes):
     """Return (joint, index, sign, constant) per input of the first release's networks.
 
-    The input equals sign * (current input `index`) + constant. The first release had nine inputs per rotation.
+    The input equals sign * (current input `index`) + constant, and depends on `joint`. The first release had nine
+    inputs per rotation.
     """
     n, inputs = len(joint_types), []
     for joint, kind in enumerate(joint_types):
