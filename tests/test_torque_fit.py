@@ -742,7 +742,7 @@ def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
     fit_torque(model, dynamics_samples([long[: int(np.searchsorted(long.t, long.t[0] + 2.0))]]))
     tests = ("19_12_23_free", "20_02_06_20sec_5harm")
     samples = dynamics_samples([read_logs([folder / f"{x}.parquet"], names)[0] for x in tests], pauses=True)
-    # for comparison: least squares with its best simple prior has an nMSE of 0.057, averaged over nine recordings
+    # for comparison: the best simple prior has an nMSE of 0.057, averaged over nine recordings
     assert np.mean([nmse(model, sample) for sample in samples]) < 0.03
 
 
