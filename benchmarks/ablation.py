@@ -65,14 +65,14 @@ OWN_BRISTLES = {kind: shared for kind, shared in torque_prior.SHARED.items() if 
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A mechanism of the torque fit, and its switches: (module, attribute, value) to replace to disable it."""
+    """A mechanism of the torque fit; switches: (module, attribute, value), where the value disables the mechanism."""
 
     name: str
     switches: tuple[tuple[Any, str, Any], ...]
 
 
 def tuned(table: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
-    """Return switches (module, attribute, value) that change fields of a table of constants in all its importers."""
+    """Return switches (module, attribute, value) that change constants of `table` in all modules that import it."""
     changed = replace(table, **changes)
     readers = [x for name, x in sys.modules.items() if name.startswith("spelgen.")]
     return tuple(

@@ -62,7 +62,7 @@ def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = Tr
 def parity() -> None:
     """Print per export the largest difference from the torch module at `STATES` states, relative to the largest value.
 
-    Models are the ones of `trained`.
+    The models have random parameters (`trained`).
     """
     names = list(ENTRIES)
     print(f"{'':24s}{'C double':>12s}{'C float':>12s}{'CasADi':>12s}{'ONNX':>12s}{'MuJoCo':>12s}")
@@ -93,8 +93,8 @@ def parity() -> None:
 
 
 def _largest(found: Parity) -> float:
-    """Return the largest relative difference over all entry points except the ones of the tip."""
-    # tip poses are omitted: the forward kinematics that they are compared with have single precision
+    """Return the largest relative difference over all entry points, except entry points of the tip."""
+    # tip poses are omitted: they are compared with forward kinematics in single precision
     return max(value for name, value in found.differences.items() if not name.startswith("tip_"))
 
 

@@ -1,4 +1,4 @@
-"""Identify an arm with figaroh, a toolbox of the field, where it is installed (`pip install figaroh`).
+"""Identify an arm with figaroh, a toolbox for identification, if it is installed (`pip install figaroh`).
 
     python benchmarks/figaroh_identification.py ARM.urdf LOGS...
 
@@ -54,20 +54,20 @@ OURS = [
 
 @dataclass(frozen=True, eq=False)
 class FigarohDynamics:
-    """Dynamics of the constants that figaroh identifies, (14 n,): ten per body, then `EXTRAS` of each joint."""
+    """Dynamics by the constants that figaroh identified, (14 n,): ten per body, then n per name in `EXTRAS`."""
 
     builder: Any
     constants: np.ndarray
     n: int
 
     def _torque(self, columns: Sequence[str], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
-        """Return the torque (T, n) [Nm] of the regressor columns named: "bodies", and names of `EXTRAS`."""
+        """Return the torque (T, n) [Nm] of some groups of regressor columns: "bodies" or names of `EXTRAS`."""
         rows = self.builder.build_basic_regressor(q, qd, qdd, {"act_idxv": range(self.n)})
         groups = np.repeat(("bodies", *EXTRAS), [10 * self.n, *[self.n] * len(EXTRAS)])
         return (rows @ (self.constants * np.isin(groups, columns))).reshape(self.n, -1).T
 
     def mass_matrix(self, q: torch.Tensor) -> np.ndarray:
-        """Return the joint-space inertia M at positions (T, n), (T, n, n), with armatures."""
+        """Return M (T, n, n), armatures included, at positions q (T, n)."""
         still = np.zeros(q.shape)
         inertial = ("bodies", "ia")
         bias = self._torque(inertial, q.numpy(), still, still)
@@ -75,21 +75,21 @@ class FigarohDynamics:
         return np.stack(columns, axis=-1)
 
     def gravity(self, q: torch.Tensor) -> np.ndarray:
-        """Return the gravity torque dV/dq at positions (T, n), (T, n) [Nm]."""
+        """Return the gravity torque dV/dq, (T, n) [Nm], at positions q (T, n)."""
         still = np.zeros(q.shape)
         return self._torque(("bodies",), q.numpy(), still, still)
 
     def friction_torque(self, q: torch.Tensor, qd: torch.Tensor) -> np.ndarray:
-        """Return viscous and Coulomb friction at positions and velocities (T, n), (T, n) [Nm]."""
+        """Return viscous plus Coulomb friction, (T, n) [Nm], at positions and velocities (T, n)."""
         return self._torque(("fv", "fs"), q.numpy(), qd.numpy(), np.zeros(q.shape))
 
     def inverse_dynamics(self, q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor) -> np.ndarray:
-        """Return the torque of a motion (T, n), with friction, armatures and offsets, (T, n) [Nm]."""
+        """Return the torque, (T, n) [Nm], with friction, armatures and offsets, of a motion q, qd, qdd (T, n)."""
         return self._torque(("bodies", *EXTRAS), q.numpy(), qd.numpy(), qdd.numpy())
 
     @property
     def inertial_parameters(self) -> np.ndarray:
-        """Return m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz per body, joint frame, (n, 10): zeros but for base parameters."""
+        """Return m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz per body in the joint frame, (n, 10); 0 if no base parameter."""
         return self.constants[: 10 * self.n].reshape(-1, 10)[:, OURS]
 
     @property

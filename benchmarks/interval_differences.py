@@ -67,7 +67,7 @@ def main() -> None:
 def groups(
     logs: Sequence[spelgen.Trajectory], parts: int, halvings: int
 ) -> Iterator[list[list[spelgen.Trajectory]]]:
-    """Yield groups of disjoint sets of recordings, whose fits are compared: all parts, or two halves per halving."""
+    """Yield groups of recordings, to fit and compare: one group of all parts, or per halving a group of two halves."""
     if not halvings:
         yield [[part] for part in parts_of(logs, parts)]
     for number in range(halvings):
@@ -99,7 +99,7 @@ def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, n
 
 
 def estimates(fit: spelgen.Fit) -> Estimates:
-    """Return values and half 95 % intervals of a fit, (k,) each, by quantity: base, drives, M and g, or of servos."""
+    """Return {quantity: (values, half 95 % intervals)}, (k,) each: base, drives, M and g, or `servo_estimates`."""
     if fit.record.servo is not None:
         return servo_estimates(fit.record.servo)
     posterior, result = fit.posterior, {}

@@ -21,7 +21,7 @@ NEGLIGIBLE = 1e-6
 class SteadySliding:
     """Positions and speeds at which the friction of a fitted arm is compared with the true friction.
 
-    The friction of a speed is half the difference of the torques in both directions, long after a reversal.
+    Friction at a speed is half the difference of the torques in both directions, long after a reversal.
 
     q: (T, n) positions over which friction is averaged. speeds: (speeds, n) [rad/s, m/s].
     """
@@ -50,7 +50,7 @@ def interval_ratios(
 ) -> dict[str, list[float]]:
     """Return the errors divided by the half width of the 95 % interval, per quantity of `QUANTITIES`.
 
-    Values whose truth is zero with an error of zero (joints that gravity does not load) are omitted.
+    Omitted: values that are zero in truth and in the fit, such as g of joints that gravity does not load.
 
     Args:
         posterior: of the fitted model.

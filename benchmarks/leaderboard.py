@@ -95,7 +95,7 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return the training durations [s]: the ones of `SECONDS` that the recordings exceed, and infinity for all."""
+        """Return the training durations [s]: each of `SECONDS` that the recordings exceed, and infinity for all."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
@@ -193,7 +193,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
 
 def by_least_squares(*, memory: bool) -> Method:
-    """Return the method least squares, as `identify` has it, with Coulomb friction or (`memory`) with bristle states.
+    """Return the method "least squares of `identify`", with Coulomb friction or, if `memory`, with bristle states.
 
     Joints are weighted by the range of their torque.
     """
@@ -261,7 +261,7 @@ def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
 
 
 def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield the documented splits of an arm's recordings; Shanghai has one split per recording, which is its test."""
+    """Yield the documented splits of an arm's recordings; `shanghai` has a split per recording, which is its test."""
 
     def chosen(names: Iterable[str]) -> tuple[Trajectory, ...]:
         return tuple(logs[x] for x in names)

@@ -91,7 +91,7 @@ def changes(
     now: Mapping[Cell, Mapping[str, float]],
     methods: Iterable[str],
 ) -> list[str]:
-    """Return a line per method on the ratios of its errors now to its errors before, over the cells of both."""
+    """Return a line per method: the ratios of errors now to errors before, over cells that `before` and `now` have."""
     lines = []
     for name in methods:
         ratios = {

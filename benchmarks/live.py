@@ -54,7 +54,7 @@ PAYLOAD = 2
 class Case:
     """An arm: its fit, the noise levels of its estimator, and logs that are not in the training.
 
-    tests: logs without a load, of which figures are means. others: logs of other conditions, for example with a load.
+    tests: logs without a load; figures are means over these logs. others: other conditions, for example with a load.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Case:
         return found[0] if found and len(found[0].q) > 50 else None
 
     def load(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """Return the torque of a payload along a motion (T, n), (T, n) [Nm]; theta: (10,) in the last joint's frame."""
+        """Return the torque of a payload, (T, n) [Nm], along a motion (T, n); theta: (10,), last joint's frame."""
         # the payload moves with the last body, whose ten columns are the last of the regressor
         return chain_regressor(torque_model(self.fit).chain, q, qd, qdd)[..., -10:] @ theta
 
@@ -223,7 +223,7 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the times of filtered samples of a log, (T,) [s]: the time is filtered in place of the torques."""
+    """Return the time of each filtered sample of a log, (T,) [s]: filtered like a torque, to get the same rows."""
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)
@@ -273,10 +273,10 @@ def contacts(case: Case, theta: np.ndarray | None = None) -> None:
 def linear_bound(case: Case, before: float = 0.3, after: float = 0.15) -> None:
     """Print the share of steps of 10 % of effort that a matched filter with the known waveform finds, per alarm rate.
 
-    The filter of a joint is the generalised least-squares estimate of a step `after` [s] ago, from the torque residuals
-    of the momentum balance of this time and the time `before` [s] before it. Its covariance and its threshold are
-    estimated from the test logs themselves: no linear detector of one joint with a constant threshold and this delay
-    finds more. The alarm rate is divided equally among the joints.
+    The filter of a joint is the generalised least-squares estimate of a step of torque `after` [s] ago, from the
+    residuals of the momentum balance since the step and during `before` [s] before the step. Its covariance and its
+    threshold are estimated from the test logs themselves: no linear detector of one joint with a constant threshold
+    and this delay finds more. The alarm rate is divided equally among the joints.
     """
     model, effort, outputs = torque_model(case.fit), case.levels.effort, []
     for log in case.tests:
@@ -313,7 +313,7 @@ def linear_bound(case: Case, before: float = 0.3, after: float = 0.15) -> None:
 
 
 def changes(case: Case) -> None:
-    """Print how fast a payload that appears or disappears in mid-log is found, and contacts mistaken for a payload."""
+    """Print the delay to find a payload that appears or disappears in mid-log, and contacts mistaken for a payload."""
     random, delays, taken, trials = np.random.default_rng(1), [], 0, 0
     effort = case.levels.effort
     for log in case.tests:

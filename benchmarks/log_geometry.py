@@ -4,7 +4,7 @@
                                       [--out runs/log_geometry.jsonl]
 
 Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of five kinds, noise of 0.5 to 5 % of the
-torques, and 20 s of excitation or pick-and-place. The log is compared unchanged, and with single random faults:
+torques, and 20 s of excitation or pick-and-place. The log is checked unchanged, and with single random faults:
 the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
 90 degrees, or any), another gravity than the settings state, angles in revolutions or degrees, and the motion, the
 torque or all signals of a joint logged 40 to 140 ms late or early, and a joint's clock that runs 0.4 to 1.4 % fast or

@@ -1,6 +1,6 @@
 """Errors that real arms and their sensors have, at random levels, for the simulated arms of `truth.py`.
 
-Levels are chosen so that torque residuals resemble the ones of recordings, see `residual_statistics.py`.
+Levels are chosen so that torque residuals resemble residuals of recordings, see `residual_statistics.py`.
 """
 
 from __future__ import annotations
@@ -90,29 +90,29 @@ class ErrorProcess:
         self._breakaway = np.exp(rng.uniform(*np.log(CABLE_BREAKAWAY), n))
 
     def friction_factor(self, q: np.ndarray) -> np.ndarray:
-        """Return the factor on dry friction at positions (T, n) [rad, m], (T, n): one plus waves along the range."""
+        """Return the factor on dry friction, (T, n), at positions q (T, n) [rad, m]: one plus waves along the range."""
         wave = 0.6 * np.sin(q + self._phase) + 0.4 * np.sin(self._waves * q + self._second_phase)
         return 1 + self.errors.friction_position * wave
 
     def temperature_factor(self, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return the factor on friction at times t (T,) [s] of a recording, (T, n): warm-up and a random drift."""
+        """Return the factor on friction, (T, n), at times t (T,) [s] of a recording: warm-up and a random drift."""
         drift = np.exp(self.errors.friction_drift * rng.normal(size=len(self.gain)))
         warm = np.exp(-t / self.errors.warm_up_time)
         return (1 + self.errors.warm_up * (warm - warm.mean()))[:, None] * drift
 
     def ripple(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque ripple of the gears at positions (T, n) [rad, m], (T, n) [Nm, N]."""
+        """Return the torque ripple of the gears, (T, n) [Nm, N], at positions q (T, n) [rad, m]."""
         return np.asarray(self._ripple * np.sin(self._periods * q + self._ripple_phase))
 
     def hysteresis(self, q: np.ndarray) -> np.ndarray:
-        """Return the friction of cables along positions (T, n) [rad, m], (T, n) [Nm, N].
+        """Return the friction of cables, (T, n) [Nm, N], along positions q (T, n) [rad, m].
 
         Long after a reversal its magnitude is `cable`, (n,).
         """
         return self.cable * play(q, self._breakaway) if self.cable.any() else np.zeros_like(q)
 
     def deflection(self, torque: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-        """Return the positions of the motor less the ones of the link, (T, n) [rad, m].
+        """Return the motor position minus the link position, (T, n) [rad, m].
 
         Args:
             torque: (T, n) [Nm, N] that deflects the elastic joint.
@@ -125,7 +125,7 @@ class ErrorProcess:
         return twist
 
     def sensed(self, torque: np.ndarray, rate: float, rng: np.random.Generator) -> np.ndarray:
-        """Return a torque (T, n) [Nm, N] as its sensor shows it: low-passed, with correlated noise, (T, n).
+        """Return the sensor's signal of a torque, both (T, n) [Nm, N]: low-passed, with correlated noise.
 
         rate: of the samples [Hz].
         """

@@ -233,7 +233,7 @@ RECONSTRUCT = np.zeros(0).__reduce__()[0]
 
 
 class Arrays(pickle.Unpickler):
-    """Reader of pickles of NumPy arrays that rejects all functions but the ones of arrays, so that no code runs."""
+    """Reader of pickled NumPy arrays; it rejects any function that is not needed for arrays, so that no code runs."""
 
     allowed: ClassVar[dict[tuple[str, str], object]] = {
         ("numpy", "ndarray"): np.ndarray,
@@ -262,7 +262,7 @@ def delan_characters(read: Read, folder: Path) -> None:
 class Link:
     """A link and the joint that moves it: origin (xyz [m], roll [rad]), centre of mass [m], mass [kg], effort [Nm].
 
-    Kinematics are the ones that the authors publish; masses are invented, and inertias are of spheres of radius 6 cm.
+    Kinematics are as published by the authors; masses are invented, and inertias are of spheres of radius 6 cm.
     """
 
     xyz: str

@@ -30,7 +30,7 @@ Torque = Callable[[DynamicsSamples], np.ndarray]
 
 
 class Prediction(NamedTuple):
-    """Functions of samples of a fitted method: the torque, (T, n) [Nm, N], and its standard deviation or None."""
+    """A fitted method as functions of samples: torque, (T, n) [Nm, N], and its standard deviation (None: unknown)."""
 
     torque: Torque
     std: Torque | None = None
@@ -313,13 +313,13 @@ class DeepLagrangian(nn.Module):
         self.viscous, self.coulomb = (nn.Parameter(torch.zeros(joints).double()) for _ in range(2))
 
     def mass(self, q: Tensor) -> Tensor:
-        """Return the mass matrix at q (..., n), (..., n, n)."""
+        """Return the mass matrix, (..., n, n), at q (..., n)."""
         entries = self.factor(torch.cat([q.cos(), q.sin()], dim=-1))
         lower = torch.tensordot(entries, self.entries, dims=1)
         return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
 
     def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the scaled torque of a motion q, qd, qdd (..., n), (..., n)."""
+        """Return the scaled torque, (..., n), of a motion q, qd, qdd (..., n)."""
 
         def lagrangian(x: Tensor) -> Tensor:
             """Return the Lagrangian T - V at positions x (..., n) and velocities qd, summed over the batch."""
@@ -354,7 +354,7 @@ def best_of(
     training: Sequence[DynamicsSamples],
     torques: Sequence[np.ndarray],
 ) -> Torque:
-    """Fit a network with each of `SETTINGS`; return the torque of the one with the smallest held-out error.
+    """Fit a network with each of `SETTINGS`; return the torque of the network with the smallest held-out error.
 
     Args:
         make: returns a new network with given settings, and its function of q, qd and qdd.

@@ -2,11 +2,14 @@
 
     python benchmarks/scaling.py [--device cuda]
 
-Two tables, of chains of turning joints whose axes alternate, one thread. First fits of closed-form models to torques
-at 100 Hz: processor time and peak memory of a process of its own, for 10,000 and 1,000,000 samples and for 8 and 16
-joints. Then steps on windows of 5 samples, rk4 with one step from sample to sample, forward and backward in double
-precision: windows per second, memory of the gradient's graph, and the exponent with which the time per window grows
-from an arm with half the joints. Times are medians.
+The arms are chains of turning joints with alternating axes; one thread is used.
+
+First table: fits of closed-form models to torques at 100 Hz, each in its own process: processor time and peak memory,
+for 10,000 and 1,000,000 samples and for 8 and 16 joints.
+
+Second table: training steps on windows of 5 samples, rk4 with one step from sample to sample, forward and backward in
+double precision: windows per second, memory of the gradient's graph, and the exponent with which the time per window
+grows from an arm with half the joints. Times are medians.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
 
 
 def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
-    """Return the joint and its largest measured and predicted displacement [rad] of each hold of a log.
+    """Return (joint, largest measured displacement, largest predicted displacement) [rad] for each hold of a log.
 
     Holds with a measured displacement of more than an encoder step are omitted.
 

@@ -44,7 +44,7 @@ STEP = 5e-4  # [s] integration step of the simulated robot
 HARD = [2e-3, 1.0]
 # joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
 SHARE, DAMPING = 0.02, 2e-4
-# [s] largest integration step of fitted actuators; twice it is the time constant of frictionloss
+# [s] largest integration step of fitted actuators; the time constant of frictionloss is twice this step
 FIT_STEP = 5e-3
 # number of windows and of solver steps of the fit of actuators, which takes half a minute
 WINDOWS, ITERATIONS = 60, 8
@@ -186,7 +186,7 @@ class PositionActuators:
                 range=coordinate.limits or (0, 0),
                 armature=armature,
                 frictionloss=frictionloss,
-                # with the joint's inertia, these determine the stiffness of the constraint of frictionloss
+                # solref, solimp and joint inertia determine the stiffness of dry friction, a constraint in MuJoCo
                 solref_friction=(2 * FIT_STEP, 1),
                 solimp_friction=EXPORT_TUNING.friction_impedance,
             )
@@ -232,14 +232,14 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
     def actuators(x: np.ndarray) -> PositionActuators:
-        """Return the actuators of unknowns (5 n + 1,): logarithms of 4 n drives, n command offsets, and the delay."""
+        """Return the actuators for unknowns x (5 n + 1,): logarithms of 4 n drives, n command offsets, the delay."""
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
         return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        """Return the position errors of unknowns x (5 n + 1,) after the burn-in of each window, (samples n,)."""
+        """Return the position errors, (samples n,), after the burn-in of each window, for unknowns x (5 n + 1,)."""
         candidate = actuators(x)
         model = candidate.model()
         model.opt.timestep = 1 / windows.rate / steps
@@ -248,13 +248,13 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Return the position errors (samples n, C) of C vectors of unknowns, the columns of x (5 n + 1, C)."""
+        """Return the position errors, (samples n, C), for C vectors of unknowns, the columns of x (5 n + 1, C)."""
         return np.stack([errors(column) for column in x.T], axis=1)
 
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Return the derivative of the position errors by finite differences, (samples n, 5 n + 1).
 
-        An unknown is changed at all joints at once and its effect at other joints neglected, which is small.
+        An unknown such as kp is changed at all joints at once: its effect on other joints is small and neglected.
         """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):

@@ -15,14 +15,14 @@ error of a diagonal entry; g error: root mean square error divided by the root m
 parameters: likewise, each parameter multiplied by its root mean square torque along the test motion; friction error:
 likewise, without offsets; torque nMSE on another motion without noise, unfiltered and after a low-pass of 8 Hz.
 
-Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are the ones of
-the logged torques at the logged positions, and the true base parameters are the least-squares solution for the rigid
+Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are in units of
+the logged torques, at the logged positions, and the true base parameters are the least-squares solution for the rigid
 torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982). The
-motion is the one of the links, with the zeros of the sensors: motors with backlash have peaks of acceleration, and a
+motion is the motion of the links, with the zeros of the sensors: motors with backlash have peaks of acceleration, and a
 regression on these peaks has a bias that no fit to filtered logs has.
 
 Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
-the ones of recordings if their folder is given.
+the residuals of recordings if their folder is given.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ ARMS = (
     Path(__file__).parents[2] / "shared" / "arms"
 )  # folder of URDFs next to the checkout; without it all arms are random chains
 FRICTIONS = ("none", "coulomb", "stribeck", "bristles", "load", "asymmetric")
-FINE = 1000.0  # [Hz] rate of the simulation, of whose samples logs are a subset
+FINE = 1000.0  # [Hz] rate of the simulation; logs are a subset of its samples
 POSITION_NOISE = 1e-5  # [rad, m] standard deviation of encoder noise, as of an encoder with 18 bits
 SHARE = (0.03, 0.15)  # [1] Coulomb friction relative to the rigid torque's standard deviation, log-uniform
 TINY = 1e-9
@@ -266,7 +266,7 @@ class Truth:
 
 
 def _limit(value: float | None, default: float) -> float:
-    """Return a limit of a joint's simulated motion: the URDF's, within +-2.5, or the default if it has none."""
+    """Return a position limit of the simulated motion: the URDF's limit, clipped to +-2.5; default if it has none."""
     return default if value is None else float(np.clip(value, -2.5, 2.5))
 
 

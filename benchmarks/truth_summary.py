@@ -59,7 +59,7 @@ def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
 
 
 def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield lines on the default's error divided by the better least squares' error: all cases, then per cause."""
+    """Yield lines on the error of `hybrid` divided by the smaller error of least squares: all cases, then per cause."""
     for key, goal in (("mass", 1.2), ("nmse", 1.02)):
         ratio = np.array([by_better_least_squares(row, key) for row in rows])
         limits = sorted({1.0, 1.02, 1.2, 2.0})

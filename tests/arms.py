@@ -23,7 +23,10 @@ STRAIGHT = tuple(tuple(Fraction(int(i == j)) for j in range(3)) for i in range(3
 def chain(
     links: Sequence[tuple[str, Rows, Sequence[float]]], gravity: Sequence[float] = (0, 0, -9.81)
 ) -> Chain:
-    """Return a serial arm without inertials, from each joint's type, and rotation and translation in its parent."""
+    """Return a serial arm without inertials.
+
+    links: per joint, its type, and its frame's rotation (3, 3) and translation (3,) [m] in the parent's frame.
+    """
     bodies = tuple(
         Body(
             f"j{i + 1}",
@@ -54,7 +57,7 @@ def planar(joints: int) -> Chain:
 
 
 def random_arm(joints: int, seed: int) -> Chain:
-    """Return an arm of turning joints with random poses of rational numbers, which has no special geometry."""
+    """Return an arm of turning joints with random rational rotations and offsets: no axes are parallel or intersect."""
     rng = np.random.default_rng(seed)
     return chain(
         [

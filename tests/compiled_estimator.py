@@ -211,15 +211,15 @@ class CompiledEstimator:
         return state
 
     def restore(self, state: ctypes.Array[ctypes.c_char]) -> bool:
-        """Load a state that `saved` returned; return False if the estimator refuses its bytes."""
+        """Load a state that `saved` returned; return False if the C function refuses the bytes."""
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
     def compensate_external(self, wanted: bool) -> None:
-        """Set the option, which is after the rate of alarms and the torque limits."""
+        """Set whether `torque` compensates external torques: an int of the C struct, behind 1 + n doubles."""
         ctypes.c_int.from_buffer(self.state, 8 * (1 + self.n)).value = wanted
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:
-        """Return the joint torques (n,) of the model at a state, for the acceleration qdd (n,)."""
+        """Return the torques (n,) predicted for q, qd and qdd (n,), `ahead` seconds after the last sample."""
         tau = np.zeros(self.n, self.dtype)
         arrays = [np.ascontiguousarray(x, self.dtype) for x in (q, qd, qdd)]
         q_, qd_, qdd_, tau_ = (x.ctypes.data_as(ctypes.c_void_p) for x in (*arrays, tau))

@@ -125,7 +125,7 @@ def coarse_validation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def short_torque_fits(monkeypatch: pytest.MonkeyPatch, coarse_validation: None) -> None:
-    """Limit torque fits to a few outer iterations of two steps, for tests of files, commands and messages."""
+    """Limit torque fits to a few outer iterations of two solver steps, for tests of files, commands and messages."""
     from spelgen.fitting.torque.tuning import TorqueTuning
 
     tuning = TorqueTuning(iterations=1, initial_steps=2, iteration_steps=2)

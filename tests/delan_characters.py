@@ -6,7 +6,7 @@ import numpy as np
 
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
-# the data determine a gravity of 3 m/s^2 for links of 1 m, and nothing else: masses and inertias are assumed
+# for links of 1 m, the data determine a gravity of 3 m/s^2; they do not determine masses and inertias: assumed here
 URDF = """<robot name="planar">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
@@ -29,7 +29,7 @@ def write_arm(folder: Path) -> Path:
 
 
 def read_characters(folder: Path) -> tuple[list[DynamicsSamples], list[np.ndarray]]:
-    """Return the torque samples of each character, named by its label, and its Coriolis torques, (T, 2)."""
+    """Return the samples (q, qd, qdd, tau) of each character, named by its label, and its Coriolis torques, (T, 2)."""
     data = np.load(folder / "character_data.npz", allow_pickle=True)
     labels = [str(x) for x in data["labels"]]
     samples = [

@@ -1,5 +1,6 @@
-"""Emitted modules for tests: built from a URDF, imported by path, and filled with exact functions or random
-weights.
+"""Emitted modules for tests: built from a URDF and imported by path.
+
+Their parameters are random, or exact polynomials replace their networks.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def import_source(source: str, path: Path) -> ModuleType:
 
 
 def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleType, Chain]]:
-    """Return the emitted closed-form module and the arm, by name, of the robots and of the arm `FOLLOWED`."""
+    """Return {name: (emitted closed-form module, arm)} for the named robots and for the arm `FOLLOWED`."""
     urdf = folder / "followed.urdf"
     urdf.write_text(FOLLOWED, encoding="utf-8")
     made = {}
@@ -137,7 +138,7 @@ def random_model(
 
 
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
-    """Set every parameter to normal numbers with this standard deviation; None: scales at which all terms matter."""
+    """Set parameters to normal random numbers of this deviation; None: deviations for which no term is negligible."""
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
@@ -148,7 +149,7 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
         elif "residuals.raw" in name:
             parameter.data = 0.3 * draw
         elif "network" in name or "potential." in name or "residuals.mass." in name:
-            # a Kolmogorov-Arnold network has a grid of parameters per input: both count as inputs in the scale
+            # scale 1 / sqrt(inputs); a Kolmogorov-Arnold layer has a grid of parameters per input, all of them count
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
 
@@ -161,7 +162,7 @@ def network_inputs(model: nn.Module, q: torch.Tensor) -> torch.Tensor:
 
 
 def outputs_alone(network: nn.Module, encoded: torch.Tensor) -> torch.Tensor:
-    """Return a network's outputs, (..., outputs), without the scales and sums that the model applies to them."""
+    """Return the raw outputs of a network, (..., outputs): no scales, means or sums of the model are applied."""
     count = len(network.biases[-1])
     layers = network.prepare(torch.eye(count, dtype=encoded.dtype), encoded.new_zeros(count))
     y: torch.Tensor = network(encoded, layers)[0]

@@ -38,7 +38,7 @@ joints: {shoulder: {gear: 50}, slide: {gear: 20, gain: trained}, wrist: {actuate
 
 
 def moved_model(robot, preset, size=0.2):
-    """Return a model of one of the project's robots, with normal numbers of this deviation added to its parameters."""
+    """Return a model of one of the project's robots whose parameters have random changes (deviation `size`)."""
     model = build(ROBOTS / f"{robot}.urdf", preset)
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -48,12 +48,15 @@ def moved_model(robot, preset, size=0.2):
 
 
 def arm_of(robot):
-    """Return one of the project's robots as an arm."""
+    """Load the arm of one of the project's robots, by name."""
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
 def readme_results(files, folder: Path):
-    """Run the Python example of an exported README with inputs of one instead of zero; return its variables by name."""
+    """Run the Python example of an exported README with all inputs set to one; return {name of a variable: value}.
+
+    files: {name: content} of the export.
+    """
     for name, content in files.items():
         (folder / name).write_bytes(content)
     (code,) = re.findall(r"```python\n(.*?)```", files["README.md"].decode(), re.DOTALL)
@@ -66,7 +69,7 @@ def readme_results(files, folder: Path):
 
 
 def saved_run(model, urdf, folder: Path) -> RunFolder:
-    """Write the run folder of a model, with the files of `spelgen train` but no training."""
+    """Write a run folder with all files of `spelgen train` for a model that was not trained. urdf: path of its URDF."""
     record = {"robot": urdf.stem, "objective": "torque", "config": {}, "preprocessing": {}, "mapping": {}}
     record |= {"joints": [], "validation_fraction": 0.25, "seed": 0, "data_digest": ""}
     record |= {"training": [], "validation": []}

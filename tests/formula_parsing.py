@@ -1,4 +1,4 @@
-"""Parsers of written closed forms (text), and their comparison with Pinocchio."""
+"""Parser of closed forms of M and V in text, and comparison of the closed forms with Pinocchio."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def assert_equal_to_pinocchio(arm: Chain, rows: dict[str, str], tolerance: float
     """Check that each closed form, M_ij and V, equals Pinocchio at random positions.
 
     Args:
-        arm: with the values of the base parameters that occur in the expressions.
+        arm: gives the values of the base parameters in the expressions.
         rows: Python expressions by name (M11, ..., V).
         tolerance: largest error, relative to the diagonal of M, or to V.
     """
@@ -53,7 +53,7 @@ def assert_close(found, true) -> None:
 
 
 def read_back(told: str) -> dict[str, str]:
-    """Return the expressions of a text of closed forms by name (M11, ..., V); indented lines continue an expression."""
+    """Parse a text of closed forms to {M11, ..., or V: expression}; an indented line continues an expression."""
     found: dict[str, str] = {}
     for line in told.partition("\nBase parameters")[0].splitlines():
         name, is_row, expression = line.partition(" = ")

@@ -1,7 +1,7 @@
-"""Random files for tests: the same FEW in each run of `make test`, new ones until the time is up in `make fuzz`.
+"""Random files for tests: `make test` uses the same FEW files in each run, `make fuzz` new files until time is up.
 
-Each example must end within SECONDS (of the reference in time_bounds.py) with a result or with a SpelgenError.
-`make fuzz` also bounds the memory that all examples took.
+Each example must end within SECONDS (times the slowness of the machine, see time_bounds.py) with a result or with a
+SpelgenError. `make fuzz` also checks that the examples of a test increase the memory by less than MEMORY.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MINUTES = float(
 TESTS = 7  # number of fuzz tests, which share MINUTES equally
 FEW = 12  # largest number of examples per test in `make test`
 SECONDS = 10
-MEMORY = 1_000_000  # [kB] by which the examples of a test may increase the memory of this process
+MEMORY = 1_000_000  # [kB] limit of the memory that the examples of a test add to this process
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:

@@ -18,7 +18,7 @@ class Page(HTMLParser):
         self.links, self.scripts = [], []
         self.feed(text)
         assert not self.open
-        # scripts are the package's own, so that no other code runs; embedded JSON data are no scripts
+        # only the package's own scripts run; <script> elements of JSON data are not in `scripts`
         assert set(self.scripts) <= OWN
 
     def handle_starttag(self, tag, attrs):

@@ -15,7 +15,7 @@ import torch
 def to_group(joint_types: Sequence[str], q: torch.Tensor) -> list[torch.Tensor]:
     """Convert q (..., n) to positions on the group, one per joint.
 
-    They are R in SO(3), (..., 3, 3), for a turning joint, and r in R^3, (..., 3) [m], for a sliding one.
+    Positions of turning joints are R in SO(3), (..., 3, 3), positions of sliding joints r in R^3, (..., 3) [m].
     """
     zero, one = torch.zeros_like(q), torch.ones_like(q)
     rows = [q.cos(), -q.sin(), zero, q.sin(), q.cos(), zero, zero, zero, one]
@@ -40,7 +40,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """Methods of an emitted module that the equations on SO(3)^k x R^3^l use; its docstrings state the shapes."""
+    """Methods of an emitted module that the equations on SO(3)^k x R^3^l use; shapes: docstrings of emitted modules."""
 
     joint_types: tuple[str, ...]
 
@@ -80,8 +80,8 @@ def group_rates(
         r_j' = r_j x dH/dp,  p' = p x dH/dp + sum_j r_j x dH/dr_j - D dH/dp + G u
         r' = dH/dp,          p' = -dH/dr - D dH/dp + G u
 
-    H is differentiated automatically, in all numbers of R and r. A joint moves along its z axis: its bearing
-    holds the others, so H, D and G act on z alone.
+    dH/dR and dH/dr are automatic derivatives with respect to all entries of R and r. A joint moves about or along
+    its z axis only, since its bearing blocks the x and y axes: H, D and G act only on the z components.
     """
     with torch.enable_grad():
         places = [part.detach().requires_grad_() for part in parts]

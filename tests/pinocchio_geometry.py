@@ -68,7 +68,7 @@ class Seen:
         for q in self.configurations:
             moved = q + 0.7 * np.eye(self.n)[mover - 1]
             before, after = self._places(q), self._places(moved)
-            # displacement of all bodies after the moved joint, which is rigid
+            # rigid displacement of all bodies after the joint `mover`, relative to the base
             step = after[-1] * before[-1].inverse()
             for other in others:
                 place = before[other - 1]
@@ -79,9 +79,10 @@ class Seen:
         return True
 
     def carried(self, joint: int, turner: int) -> np.ndarray:
-        """Return the distance of the mass moved by the sliding ``joint`` from a plane, per configuration.
+        """Return the offset of a centre of mass from a plane, (configurations,), times the sine of two axes' angle [m].
 
-        The plane contains the axis of joint ``turner`` and the direction of the slide.
+        The mass is moved by the sliding ``joint``. The plane contains the axis of joint ``turner`` and is parallel to
+        the axis of ``joint``.
         """
         found = []
         for q, axes, points in zip(self.configurations, self.axes, self.points, strict=True):

@@ -102,7 +102,7 @@ class Model(PortHamiltonian):
 
 
 def true_model() -> Model:
-    """Return the model of the arm that makes the logs, whose parameters differ from the initial ones."""
+    """Return the model that simulates the logs; its parameters differ from the initial parameters of `Model`."""
     model = Model()
     with torch.no_grad():
         model.inertia.copy_(torch.tensor([0.4, -0.5, -1.0]))

@@ -1,7 +1,7 @@
 """Exact polynomials of M(q) and V(q) in cosines and sines of angles and in sliding distances.
 
 The recursion over bodies is the package's, evaluated in polynomials with rational coefficients. The derivation of
-structure does not use polynomials (``structure`` evaluates M and V at points only), so they prove it independently.
+structure does not use polynomials (``structure`` evaluates M and V at points only), so the two are independent.
 Closed forms are expanded one parameter at a time (``expansion``).
 """
 
@@ -23,9 +23,9 @@ from spelgen.structure.recursion import Position, energies
 class Polynomials:
     """The lower triangle of M(q), by (row, column), and V(q), as polynomials over the variables ``names``.
 
-    c1, s1 are the cosine and sine of coordinate 1, q1 its value if it slides; if a mimic joint turns by a fraction of
-    coordinate 1, c1 and s1 belong to the angle of which both are multiples. m1, hx1, ... Izz1 are the inertial
-    parameters of body 1 about its joint, if inertial parameters are variables.
+    c1, s1 are the cosine and sine of coordinate 1, q1 its value if it slides. If a mimic joint turns by a fraction of
+    coordinate 1, c1 and s1 belong to an angle such as q1 / 2, of which both joint angles are integer multiples.
+    m1, hx1, ... Izz1 are the inertial parameters of body 1 about its joint, if inertial parameters are variables.
     """
 
     names: tuple[str, ...]
@@ -33,7 +33,7 @@ class Polynomials:
     potential: fmpq_mpoly
 
     def combination(self, weights: Weights) -> fmpq_mpoly:
-        """Return the sum of entries of M, weighted by (row, column, weight)."""
+        """Return a weighted sum of entries of M; weights: (row, column, weight) per entry."""
         total = 0 * self.potential
         for row, column, value in weights:
             total += _rational(value) * self.mass[row, column]

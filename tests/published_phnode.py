@@ -1,4 +1,4 @@
-"""PHNODE in the formulation of its published code, for comparison only: the benchmark's slowest column.
+"""PHNODE as in its published code, for comparison in `benchmarks/training_step.py` only.
 
 Duong, Altawaitan, Stanley, Atanasov, Port-Hamiltonian Neural ODE Networks on Lie Groups (IEEE T-RO 40:3695,
 2024), carried over to a chain of n joints as Wang, Chen, Ding (Sci Rep 15:33179, 2025) do for their baseline.
@@ -41,7 +41,7 @@ class _Cholesky(nn.Module):
 
 
 class Published(nn.Module):
-    """Rates of the states (R, zeta), (..., 12 n), of n turning joints by PHNODE: eq. 18 of the paper, over all axes.
+    """Rates of the states (R, zeta), (..., 12 n), of n turning joints by PHNODE: eq. 18 of the paper, three axes each.
 
     R: rotation matrix, zeta: twist. Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry
     at a time.
@@ -87,7 +87,7 @@ class Published(nn.Module):
 
 
 class ByJvp(Published):
-    """PHNODE with one change by a user who knows torch: dM^-1/dt is one derivative along the motion."""
+    """PHNODE with one change: dM^-1/dt is one derivative along the motion (torch.func.jvp), not one per entry."""
 
     def _rate(self, inverse: Tensor, rotation: Tensor, rotation_rate: Tensor) -> Tensor:
         rate: Tensor = jvp(self.inverse_mass, (rotation,), (rotation_rate,))[1]

@@ -44,8 +44,8 @@ class DrawnArm:
 class _Style:
     """Choice of numbers for the URDF of one arm: angles, offsets and axes of joints.
 
-    The style "right angles" has prismatic joints along x, y or z only. Two skew axes may have an angle such as 60
-    degrees, which no rational rotation has, so that spelgen represents it with an error of 1e-11.
+    The style "right angles" has prismatic joints along x, y or z only. Skew axes may enclose an angle such as
+    60 degrees, for which there is no rational rotation matrix: spelgen represents it with an error of 1e-11.
     """
 
     angles: tuple[str, ...]

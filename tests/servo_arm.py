@@ -23,7 +23,7 @@ class Servos:
     """True servos of both joints of the simulated arm.
 
     kp [Nm/rad], kd [Nm s/rad], armature [kg m^2], Coulomb friction [Nm]; stribeck [Nm]: additional friction at rest,
-    which falls as exp(-qd^2 / STRIBECK_VELOCITY^2); dead_zone: half of it [rad]; delay of the commands [s].
+    which falls as exp(-qd^2 / STRIBECK_VELOCITY^2); dead_zone: half its width [rad]; delay of the commands [s].
     """
 
     kp: tuple[float, float] = (14.0, 9.0)
@@ -105,7 +105,7 @@ def _simulated(t: np.ndarray, u: np.ndarray, servos: Servos) -> np.ndarray:
         most2 = STEP * (dry2 + slow2 * exp(-((v2 / STRIBECK_VELOCITY) ** 2)))
         force1 = kp1 * wrong1 - kd1 * v1 - weight1 * sin(q1) - both + sway * (2 * v1 * v2 + v2 * v2)
         force2 = kp2 * wrong2 - kd2 * v2 - both - sway * v1 * v1
-        # damping acts on the mean velocity of a step: half of it is implicit, in M
+        # damping acts on the mean of old and new velocity: the half of the new velocity, STEP / 2 * kd, is added to M
         m11, m12, m22 = base1 + 2 * c + STEP / 2 * kd1, own2 + c, base2 + STEP / 2 * kd2
         determinant = m11 * m22 - m12 * m12
         i11, i12, i22 = m22 / determinant, -m12 / determinant, m11 / determinant

@@ -38,7 +38,7 @@ NAMES = {"number": "number", "integer": "integer", "string": "text", "boolean": 
 
 
 def attributes(group: type) -> dict[str, str]:
-    """Return the description of each key of a settings class, from its docstring and the ones of its bases."""
+    """Return {key: description} of a settings class, from the docstrings of the class and of its bases."""
     texts: dict[str, str] = {}
     for base in reversed(group.__mro__):
         _, _, section = inspect.cleandoc(vars(base).get("__doc__") or "").partition("Attributes:\n")
@@ -59,7 +59,7 @@ def subgroup(annotation: object) -> type[Group] | None:
 
 
 def sections(group: type[Group], path: str = "") -> Iterator[tuple[str, type[Group]]]:
-    """Yield the path of each group of keys within a group, itself first, and the group's class."""
+    """Yield (path, class) of a group of settings keys, then of each group inside it, recursively."""
     yield path, group
     for name, field in group.model_fields.items():
         inner = subgroup(field.annotation)
@@ -90,7 +90,7 @@ def values(schema: Mapping[str, Any]) -> str:
 
 
 def bounds(parts: Iterable[object]) -> Iterator[str]:
-    """Yield the bounds of a number in the annotations of its field, as text such as "> 0".
+    """Yield the bounds that the annotations of a numeric field state, as text such as "> 0".
 
     The JSON schema lacks the bounds of numbers that a validator converts.
     """
@@ -113,12 +113,12 @@ def default(value: object) -> str:
 
 
 def page_of(path: str) -> Path:
-    """Return the file of the page that describes the key at a path, by its first part."""
+    """Return the file of the page that describes a key; the first part of the key's path selects the page."""
     return PAGES[path.split(".")[0] in OF_TRAINING]
 
 
 def link(path: str, target: str) -> str:
-    """Return the Markdown link from the section of one group of keys to the section of another."""
+    """Return the Markdown link from the section of the group at `path` to the section of the group at `target`."""
     name = "" if page_of(path) == page_of(target) else page_of(target).name
     return f"{name}#{target.lower().replace('.', '')}"
 
@@ -142,9 +142,10 @@ def rows(path: str, group: type[Group]) -> Iterator[tuple[str, ...]]:
 
 
 def meanings(group: type[Group], name: str, field: FieldInfo) -> dict[tuple[str, str], list[str]]:
-    """Return {(description, default) of a key: objectives to which it belongs}, for the rows of the table.
+    """Return {(description, default): objectives} of a key, one entry per row of the table.
 
-    An option of several objectives has an entry per description and default. The list of a key of no objective is [].
+    Objectives with different descriptions or defaults of an option have separate entries. The list of objectives is
+    empty for a key that does not depend on the objective.
     """
     if group is not TrainingSettings or name not in OWNERS:
         value = field.get_default(call_default_factory=True)

@@ -59,7 +59,7 @@ def urdf(folder, *transmissions, sidecar=""):
 
 
 def inputs(path):
-    """Return the entries of G that are not always zero, by (row, column): kind and value."""
+    """Return {(row, column): (kind, value)} of the entries of G that are not always zero."""
     found = inspect(path).to_dict()["input_matrix"]["entries"]
     assert len(found) == 9
     return {(x["row"], x["col"]): (x["kind"], x["value"]) for x in found if x["kind"] != "zero"}

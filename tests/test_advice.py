@@ -1,4 +1,4 @@
-"""A log with a fault is right after the lines that the message about it advises are written into the settings.
+"""Messages about faults of logs advise lines of settings; with these lines in the settings the fault is corrected.
 
 Lines for jumps, dropouts, held samples, geometry, clipped torques, couplings, calibrations and times in another unit
 are applied in the tests of these checks.

@@ -40,7 +40,7 @@ def joint(name, parent, child, kind="revolute", xyz="0 0 0.3", rpy="0 0 0", axis
 
 @pytest.fixture
 def robot(tmp_path):
-    """Return a function that makes a robot from joint elements; it adds their links, without inertials if in `bare`."""
+    """Return a function that makes a robot from joint elements, and their links; links in `bare` have no inertials."""
 
     def make(*joints, bare=()):
         text = "".join(joints)
@@ -88,7 +88,7 @@ class TestChain:
         assert names(make_arm(robot(joint("a", "0", "1"), *jaws))) == ["a"]
 
     def test_a_last_joint_that_may_open_a_gripper_is_stated_with_the_tip_that_leaves_it_out(self, robot):
-        """If only the last link is named as a gripper, the remark `ambiguous-chain` states the --tip before it."""
+        """The remark `ambiguous-chain` on a last link named like a gripper advises the link before it for --tip."""
         arm = robot(joint("a", "0", "1"), joint("b", "1", "gripper_moving_part"))
         assert names(make_arm(arm)) == ["a", "b"]
         (remark,) = [x for x in make_arm(arm).diagnostics if x.code == "ambiguous-chain"]
@@ -112,7 +112,7 @@ class TestChain:
         assert "ambiguous-chain" in codes(arm)
 
     def test_a_last_joint_that_fingers_elsewhere_follow_is_stated(self, robot):
-        """One drive with mimic joints on other links is typical of adaptive grippers: it may be no joint of the arm."""
+        """A last joint that other joints mimic may drive a gripper: the remark advises the link before it for --tip."""
         drive = joint("drive", "palm", "l").replace('lower="-1" upper="2"', 'lower="0" upper="0.8"')
         followers = [joint("m1", "palm", "r", inside='<mimic joint="drive" multiplier="-1"/>')]
         followers += [joint("m2", "l", "t", inside='<mimic joint="drive"/>')]
@@ -438,7 +438,7 @@ class TestAgainstPinocchio:
             try:
                 theirs = Theirs(path, arm)
             except ValueError:
-                continue  # Pinocchio rejects a few files, for limits without effort or negative friction
+                continue  # Pinocchio rejects a few files: a limit has no effort, or friction is negative
             ours = Ours(arm)
             for _ in range(3):
                 q = rng.uniform(-2, 2, len(arm.coordinates))

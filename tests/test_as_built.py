@@ -85,7 +85,7 @@ def test_logs_are_the_inverse_dynamics_of_the_truth(robots, tmp_path):
     model = pin.buildModelFromUrdf(str(tmp_path / "as_built.urdf"))
     model.armature = np.array([true.settings.joint(name).armature for name in true.chain.joint_names])
     data, qdd = model.createData(), np.gradient(log.qd, log.t, axis=0)
-    # the ends of the log are omitted, at which the low-pass filter and differences are inaccurate
+    # the ends of the log are omitted: the low-pass filter and differences are inaccurate there
     rows = range(50, len(log) - 50)
     tau = np.array([pin.rnea(model, data, log.q[k], log.qd[k], qdd[k]) for k in rows])
     np.testing.assert_allclose(log.tau[50:-50], tau, atol=2e-3 * np.abs(tau).max())

@@ -26,7 +26,7 @@ def spec_of(robot: str, preset: str) -> ModelSpec:
 
 @each_case
 def test_three_forms_of_a_model_are_equal_to_the_bit(robot, preset, tmp_path):
-    """Initial parameters are equal, and so are inverse and forward dynamics with random parameters."""
+    """The three forms have equal initial parameters; with equal random parameters, their dynamics are bitwise equal."""
     spec = spec_of(robot, preset)
     models = {"assembled": assemble(spec, seed=3)}
     for standalone in (False, True):
@@ -71,7 +71,7 @@ def test_the_seed_draws_the_weights_of_networks():
 
 
 def test_a_specification_of_no_model_is_refused():
-    """A specification whose numbers no arm can have, such as a negative mass, is refused by one line of error."""
+    """A specification of an arm that cannot exist, such as one with a negative mass, is refused by a one-line error."""
     spec = spec_of("rpr", "closed-form")
     link = spec.links[1]
     for change in ({"mass": -1.0}, {"inertia": (1.0, 0.0, 0.0, 1.0, 0.0, 3.0)}):

@@ -95,7 +95,7 @@ def test_stiff_friction_with_a_state_is_integrated():
     held = 1e-3 / 2  # at rest the bristle holds 1 N of 2 N: z / reach = 1 / 2
     torch.testing.assert_close(q[0, -1], torch.tensor([held], dtype=torch.float64), atol=1e-7, rtol=0)
     assert qd[0, -1].abs() < 1e-5
-    fast = pushed(push=6.0)  # 6 N of force less 2 N of friction, against 5 N s/m of damping
+    fast = pushed(push=6.0)  # steady velocity: (6 N of force - 2 N of friction) / (5 N s/m of damping)
     assert (roll_out_stiff(stiff, fast, 8)[1][:2, -1] - 0.8).abs().max() < 1e-6
 
 

@@ -116,7 +116,7 @@ def test_elastic_joints_resonate_and_teeth_change_flanks():
 
 
 def test_play_sticks_and_slips():
-    """Along a triangle of positions the state saturates at +-1; it reverses within two break-away displacements."""
+    """If the position rises and falls, the state of `play` is 1, then -1 within two break-away displacements."""
     q = np.concatenate([np.arange(0, 101), np.arange(99, -1, -1)])[:, None] * 0.01
     z = real_errors.play(q, np.array([0.1]))[:, 0]
     np.testing.assert_allclose(z[:11], np.linspace(0, 1, 11), atol=1e-9)

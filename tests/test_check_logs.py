@@ -97,7 +97,7 @@ def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
 
 @pytest.fixture(scope="module")
 def loaded_joint(loaded, log) -> int:
-    """Return the index of the joint whose gravity torque varies most, relative to the variation of its torque."""
+    """Return the index of the joint with the largest gravity torques; one check of the log serves all tests."""
     joints = check_logs([log], loaded).joints
     return max(range(3), key=lambda k: joints[k].gravity.relative_deviation or 0)
 
@@ -113,7 +113,7 @@ def test_torques_without_gravity_or_of_another_scale_are_found(loaded, loaded_jo
         "torque-scale": tau[:, joint] / 8,
     }[code]
     findings = check_logs([replace(log, tau=tau)], loaded).findings
-    # A wrong link of the URDF explains a wrong scale of one torque as well.
+    # `urdf-inertials` is ignored: wrong inertials of a link would explain a wrong scale of one torque as well.
     found = [(x.severity, x.code, x.where) for x in findings if x.code != "urdf-inertials"]
     assert found == [("warning", code, f"joint {arm.coordinates[joint].name!r}")]
 
@@ -147,7 +147,7 @@ def test_torques_of_another_sense_or_unit_are_errors_before_anything_is_fitted(
 
 
 def test_torques_beyond_all_drives_are_errors(loaded, arm, log):
-    """Torques of noise far beyond the effort limits are an error, although they contain no gravity torque."""
+    """Torques far beyond the effort limits are an error even if they are noise, without any gravity torque."""
     random = np.random.default_rng(0)
     coordinates = tuple(each._replace(effort=10.0) for each in arm.coordinates)
     weak = replace(loaded, chain=replace(arm, coordinates=coordinates))
@@ -283,7 +283,7 @@ def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
 
 
 def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, log, tmp_path):
-    """Velocities of the opposite sense are an error with the line that corrects them.
+    """The error about velocities of the opposite sense advises the settings line that corrects them.
 
     A velocity that is only too large gets no line, since its unit or the times may be wrong.
     """
@@ -307,7 +307,7 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_constant_torque_is_reported(loaded, log, constant):
-    """A constant torque is reported, also if it is 0.1, whose mean differs from it by rounding."""
+    """A constant torque is reported, also the value 0.1, although rounding makes its mean differ from the samples."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
     assert [x.gravity.explained for x in report.joints] == [None] * 3
@@ -360,7 +360,7 @@ def test_a_log_too_short_for_a_fit_is_named(loaded, log, samples):
 def test_a_few_samples_give_no_figures_of_gravity(loaded, arm, log):
     result = check_logs([log[:20]], loaded)
     assert [x.gravity.explained for x in result.joints] == [None] * 3
-    # within a fifth of a second no joint reverses
+    # one-way: within the log's fifth of a second no joint reverses
     assert {x.code for x in result.findings} == {"no-accelerations", "one-way"}
 
 
@@ -422,7 +422,7 @@ def test_negated_torques_of_an_arm_without_gravity_are_refused(robots, rate):
     torque = regressor(flat.chain, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(flat.chain)
     right = Trajectory(t, q, qd, torque + 0.3 * qd, "motion")
     assert check_logs([right], flat).errors == ()
-    # drives that compensate more than their friction give torques that fall with velocity, which is no opposite sense
+    # if drives compensate more than their friction, torques fall with velocity: not mistaken for negated torques
     assert check_logs([replace(right, tau=torque - 0.3 * qd)], flat).errors == ()
     refused = check_logs([replace(right, tau=-right.tau)], flat)
     assert ("too slow for fits to torques" in refused.text()) == (rate < 24)
@@ -498,9 +498,9 @@ def test_no_coupling_is_found_by_chance(loaded, log):
 
 
 def test_only_an_even_part_of_many_trajectories_is_filtered(monkeypatch):
-    """Of a log with many trajectories, an even part is filtered for each delay, to bound the time.
+    """If a log has many trajectories, only evenly spaced ones are filtered for each delay, to bound the time.
 
-    A long log is read in many chunks: filtering all of them for each delay took minutes for 10^7 samples.
+    A long log is read in many chunks: filtering all chunks for each delay would take minutes for 10^7 samples.
     """
     filtered = []
 
@@ -536,7 +536,7 @@ def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
 def test_seconds_of_recorded_logs_show_a_coupling(shared):
     """The coupling of the TX40's wrist is found in the first 5.4 s of its log.
 
-    A coupling lowers the residual of one of ten blocks by a factor of a thousand, of others by three.
+    The coupling lowers the residual by a factor of a thousand in one of ten blocks, by three in the other blocks.
     """
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)

@@ -9,12 +9,15 @@ from benchmarks.truth import Case, Truth, record_log, wrong_urdf
 from spelgen.arm.configured_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 
-# Findings about the amount of motion, and about links of the URDF, whose inertials are wrong in these logs.
+# Findings that are correct for these logs: they are about the amount of motion, and the URDF's inertials are wrong.
 TRUE = {"one-way", "joint-at-rest", "beyond-effort-limit", "beyond-velocity-limit", "urdf-inertials"}
 
 
 def recorded(robot: Path, seed: int, folder: Path, **properties):
-    """Return an arm with wrong inertials, and logs of the true arm in pick-and-place motions of 10 s in all."""
+    """Return an arm with wrong inertials, and logs of the true arm: 10 s of pick-and-place motions.
+
+    properties: fields of `Case` that replace the defaults.
+    """
     rng = np.random.default_rng([7, seed])
     (folder / "arm.urdf").write_bytes(wrong_urdf(robot, 0.3, rng))
     known = {"friction": "coulomb", "armature": True, "sample_rate": 200.0, "noise": 0.01}
@@ -28,7 +31,7 @@ def recorded(robot: Path, seed: int, folder: Path, **properties):
 
 @pytest.mark.parametrize(("robot", "seed"), [("ur10e", 0), ("panda", 2), ("ur10e", 5)])
 def test_synchronous_joints_with_dry_friction_get_no_advice(robots, tmp_path, robot, seed):
-    """Friction after reversals is no coupling of motors, and friction of a joint that moves one way is no stop."""
+    """Friction after reversals is not reported as a motor coupling, and friction of one-way motion not as a stop."""
     arm, logs = recorded(robots / f"{robot}.urdf", seed, tmp_path)
     report = check_logs(logs, arm)
     assert not report.errors

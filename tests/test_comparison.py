@@ -53,14 +53,14 @@ def robot(tmp_path_factory, robots):
     settings = yaml.safe_load((robots / "two_link.yaml").read_text())
     settings["simulation"]["trajectories"] = 8
     settings["comparison"] |= {"first": 0.25, "steps": 20, "momentum_steps": 5, "seeds": 1, "width": 8}
-    # settings of fits to recorded logs, which the comparison does not simulate
+    # these settings apply if logs are recorded; fits to simulated logs use the section `comparison`
     settings["training"] |= {"epochs": 2, "momentum_steps": 0}
     urdf.with_suffix(".yaml").write_text(yaml.safe_dump(settings))
     return urdf
 
 
 def simulated(robot, **changes):
-    """Return a comparison of PRESETS on one robot whose logs are simulated."""
+    """Return a comparison of PRESETS on one robot with simulated logs; changes: other fields of `Comparison`."""
     return Comparison(arms={"arm": ComparedArm(urdf=robot)}, **{"presets": PRESETS, **changes})
 
 
@@ -88,7 +88,7 @@ def losses_of(result):
 
 
 def cells(tables):
-    """Return {label of a row: {column: text}} of tables, without the stars."""
+    """Return {label of a row: {column: text}} of tables; the stars that mark cells are removed."""
     rows = {}
     for table in tables:
         names = [name.strip() for name in table.head[1:]]
@@ -154,7 +154,7 @@ def test_figures_of_a_run_agree_with_one_another(results):
 
 
 def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
-    """Losses, recomputed from the logs, are squared errors summed over joints, means over samples and windows."""
+    """Losses equal squared errors from the logs, summed over joints and averaged over samples and windows."""
     job = next(job for job in study.jobs if job.preset == "hybrid")
     model, losses = trained(job), losses_of(results["hybrid"])
     for key, role, samples in (
@@ -243,7 +243,7 @@ def test_the_sentence_has_the_best_model_and_the_ratios_of_the_others(study, res
 
 
 def test_the_true_mass_matrix_is_pinocchios_with_the_rotors(robots):
-    """The true M of the simulated arm equals Pinocchio's of the URDF, plus rotor inertia times gear squared."""
+    """M of the simulated arm equals Pinocchio's M of the URDF plus, per joint, rotor inertia times gear squared."""
     urdf = robots / "ur10e.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
     q = torch.from_numpy(np.random.default_rng(0).uniform(-3, 3, (5, 6)))
@@ -280,9 +280,9 @@ def test_a_run_that_is_not_finite_counts_as_infinitely_bad(results):
 
 
 def test_decimated_windows_start_at_a_multiple_of_the_decimation():
-    """Decimated windows start at multiples of the decimation, as torques that a controller holds do.
+    """Windows with decimation 4 start at a multiple of 4 samples.
 
-    The torque is constant over four samples, so each decimated window contains the complete input.
+    If a controller changes its torque every 4 samples, each torque of a decimated window is the input of its interval.
     """
     count = 200
     # positions are the numbers of the samples

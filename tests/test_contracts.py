@@ -86,7 +86,7 @@ def assert_near(found: Tensor, expected: Tensor, bound: float = 1e-10) -> None:
 
 
 def friction_state(variant: str, model: nn.Module, qd: Tensor) -> list[Tensor]:
-    """Return the friction state z of joints that slide at qd, (..., n, elements), if the variant has one."""
+    """Return [z], the friction state (..., n, elements) of steady sliding at qd; [] for variants without this state."""
     return [model.memory(qd)] if variant in WITH_FRICTION_STATE else []
 
 
@@ -132,7 +132,7 @@ def test_explicit_derivatives_equal_automatic_ones(variant, robot, random_model)
 @each_case
 def test_forward_and_inverse_dynamics_are_inverses(variant, robot, random_model):
     model = random_model(variant, robot, 3, DEVIATIONS.get(variant, (None,))[0])
-    # the input network of phnode is constant, as its random gains may be almost zero and not invertible
+    # phnode gets a constant input matrix: a random one may be almost singular, and is inverted here
     if variant.startswith("phnode"):
         torch.nn.init.zeros_(model.input_network.weights[-1])
     q, qd, _, tau = states(model.n, 25)
@@ -203,7 +203,8 @@ def test_backpropagation_reaches_every_parameter(variant, dtype, random_model):
 def test_transforms_of_torch_func_apply(variant, robot, random_model):
     """Models have no branches that depend on data: vmap, jacrev, jacfwd and hessian of torch.func apply.
 
-    Jacobians of a batch equal Jacobians of its states, except in forward mode through a solution of linear equations.
+    Jacobians of a batch (vmap) equal Jacobians of its states. Forward dynamics are tested in reverse mode only,
+    since vmap of jacfwd through torch.linalg.solve is wrong in torch 2.13 (see the next test).
     """
     model = random_model(variant, robot, 1).requires_grad_(False)
     q, qd, tau = states(model.n, 5, count=3)
@@ -234,7 +235,7 @@ def test_torch_differentiates_a_solution_in_forward_mode_under_vmap():
 def test_a_model_is_one_graph(variant, random_model):
     """A model is exported by torch.export in strict mode for batches of any size, and compiled without graph breaks.
 
-    Variants all of whose parts occur in others are omitted, as each takes 7 s.
+    Two variants are omitted, since other variants contain all of their parts, and each takes 7 s.
     """
     model = random_model(variant, "rpr", 1).requires_grad_(False)
     q, qd, tau = states(3, 5, count=3)

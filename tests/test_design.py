@@ -40,7 +40,7 @@ def test_a_refused_combination_names_the_two_options():
             second = rest.partition(";")[0]
             named = dict(part.split(": ") for part in (first, second))
             assert len(named) == 2 and named.items() <= values.items()
-    # accepted: 96 combinations of networks only, and rigid bodies with or without friction state and networks
+    # accepted: 96 designs of networks only; 4 of rigid bodies, with or without friction state, with or without networks
     assert len(COMBINATIONS) - len(refused) == 96 + 2 * 2
 
 

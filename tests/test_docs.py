@@ -87,7 +87,7 @@ def tree(folder: Path) -> dict[Path, bytes]:
 
 
 def cell(text: str, block: str, output: str = "") -> str:
-    """Return a block of code with its output: the one in the text, if the text has this block, else the actual one."""
+    """Return a block of code and its output, as in `text` if the text contains the block, else with `output`."""
     for match in CELL.finditer(text):
         if match[1] == block:
             return match[0]
@@ -139,7 +139,7 @@ def run_commands(block: str, folder: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, which MkDocs and GitHub make in the same way of plain words."""
+    """Return the anchors of a page's headings; for headings of plain words, MkDocs and GitHub make the same anchors."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
 
@@ -180,7 +180,7 @@ CODE_ARGUMENTS = {"Diagnostic": 1, "warn": 1, "Check": 0, "_warning": 0, "_note"
 
 
 def codes_of_messages() -> set[str]:
-    """Return the codes of all remarks, warnings and accepted errors that the source text of the package contains."""
+    """Return the codes of remarks, warnings and errors that --accept can allow, collected from the package's source."""
     constants: dict[str, ast.expr] = {}
     codes = set(get_args(Accepted))
     for path in sorted((ROOT / "spelgen").rglob("*.py")):

@@ -22,7 +22,7 @@ GOLDEN = Path(__file__).parent / "golden"
 PRESETS = get_args(Preset)
 FORMS = pytest.mark.parametrize("standalone", [False, True], ids=["thin", "standalone"])
 
-# mypy follows only the part of torch that emitted modules use: all of torch would take many times as long
+# mypy follows only those imports from torch that emitted modules use: all of torch would take far longer
 MYPY = """[mypy]
 strict = True
 [mypy-torch.*,numpy.*,sympy.*]

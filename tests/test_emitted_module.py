@@ -124,7 +124,7 @@ def test_energy_is_conserved_without_input_and_dissipation(robot, tmp_path):
     """Without input and dissipation, H drifts by less than 1e-8 in 2 s, by a method of order 8."""
     model = frictionless(random_model(robot, tmp_path, seed=0))
     for weight in model.residuals.parameters(recurse=False):
-        # torque ripple of 66 periods per revolution is removed, as it would need shorter steps
+        # torque ripple of 66 periods per revolution is set to zero: the integrator would need shorter steps
         weight.data.zero_()
     at, qd, _, _ = (0.25 * x for x in states(model.n, 4))
     with torch.no_grad():
@@ -164,7 +164,7 @@ def test_the_input_is_added_to_the_rate_of_momentum(tmp_path):
 
 
 def test_arm_with_a_constant_mass_matrix(tmp_path):
-    """A turning and a sliding joint on one axis have a constant M: no network output, two constants, a whole model."""
+    """For a turning and a sliding joint on one axis, M is constant, and inverse dynamics invert forward dynamics."""
     urdf = tmp_path / "rp.urdf"
     link = (
         '<link name="{}"><inertial><mass value="1"/>'

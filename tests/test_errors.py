@@ -94,6 +94,6 @@ def test_an_error_of_several_files_is_reported_once():
     ids=lambda error: type(error).__name__,
 )
 def test_a_copy_of_an_error_is_the_same_error(error):
-    """A pickled and unpickled error has the same type and text, as Ray copies the errors of its workers."""
+    """An error has the same type and text after pickling, by which Ray copies the errors of its workers."""
     copied = pickle.loads(pickle.dumps(error))
     assert (type(copied), str(copied)) == (type(error), str(error))

@@ -307,7 +307,7 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
     """A model in memory is evaluated on arrays and compared with other dynamics, without a run folder or files.
 
-    The low-pass filter of the evaluation applies to torques too.
+    The low-pass cutoff of `preprocessing` affects the torque errors too.
     """
     arm = load_arm(cart)
     model, dynamics = build(arm, preset="closed-form"), urdf_dynamics(cart, ["slide", "swing"])
@@ -402,7 +402,7 @@ def test_torque_errors_by_the_protocol():
 def test_torque_errors_are_pooled_over_samples_with_pauses_and_without():
     """Torque errors are pooled over all samples of all logs, once with pauses and once without.
 
-    A short log whose torque hardly varies has a large nMSE of its own, but only the weight of its few samples.
+    A short log whose torque hardly varies has a large nMSE by itself, but its few samples change the total only little.
     """
     random = np.random.default_rng(0)
     samples = []

@@ -58,7 +58,7 @@ def test_the_correlation_of_the_noise_is_restored(coefficient):
     """
     rng, count, joints = np.random.default_rng(0), 1000, 8
     noise = lfilter([1.0], [1.0, -coefficient], rng.normal(size=(count, joints)), axis=0)
-    # regressor columns that vary slowly, as the ones of an arm do
+    # regressor columns that vary slowly, like an arm's
     smooth = [lfilter([1.0], [1.0, -0.97], rng.normal(size=(count, 60)), axis=0) for _ in range(joints)]
     jacobian = tuple(map(torch.from_numpy, smooth))
     gain = tuple(torch.linalg.inv(x.mT @ x) for x in jacobian)
@@ -89,7 +89,7 @@ def test_the_fit_finds_whether_errors_are_correlated(robots):
 
 
 def test_estimated_prior_widths_are_bounded(robots):
-    """Bodies that are wrong by a factor of e^40, as of torques in another unit, widen the prior only to its bound."""
+    """If bodies differ from the prior mean by a factor of e^40 (torques in a wrong unit), prior widths are bounded."""
     rigid = ParameterVector(build(robots / "two_link.urdf", "closed-form"))
     widths = GaussianPrior()
     prior = ParameterPrior.of(rigid, widths)
@@ -210,7 +210,7 @@ def test_slow_passes_are_few_errors(hybrid):
 
 
 def test_held_out_errors_are_those_of_fits_without_the_block(robots):
-    """Held-out errors by the jackknife equal the errors of refits without each half second.
+    """The jackknife's error of each half second equals the error of a refit to all other samples.
 
     The refits solve the linearized problem.
     """
@@ -235,7 +235,7 @@ def test_held_out_errors_are_those_of_fits_without_the_block(robots):
         weighted = rows[:, kept] / noise[:, None, None] ** 2
         curvature = torch.einsum("jtk,jtl->kl", weighted, rows[:, kept]) + precision
         gradient = torch.einsum("jtk,jt->k", weighted, residual[:, kept]) - precision @ offset
-        # the step of the whole problem is subtracted, since the estimate is stationary only to the solver's tolerance
+        # the gradient of the whole problem is not exactly zero (solver tolerance) and is subtracted
         whole = torch.einsum("jtk,jt->k", rows / noise[:, None, None] ** 2, residual) - precision @ offset
         step = torch.linalg.solve(curvature, gradient - whole)
         expected.append((residual[:, ~kept] - rows[:, ~kept] @ step).square().sum(dim=1))
@@ -282,7 +282,7 @@ def test_a_second_of_motion_supports_no_fit(shared, arm):
 def test_a_longer_recording_is_advised_only_if_the_recording_is_short(robots, seconds, advice):
     """A fit that the logs do not support advises a longer recording, unless the logs have more than a minute.
 
-    The held-out nMSE of both fits is replaced by 2, four times the largest one of a supported fit.
+    The held-out nMSE is set to 2, four times the largest value at which a fit counts as supported by its logs.
     """
     model = build(robots / "two_link.urdf", "closed-form")
     samples = TorqueSamples.of([recording(model, "x", seconds, 0)], TUNING.decimation)

@@ -70,20 +70,20 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
     assert found.condition < found.first / 3
     assert (
         found.parameters == 36 + 6 * 4 - 2
-    )  # 36 base parameters, and 4 of friction and rotor per joint, of which two are no independent parameters
+    )  # 36 base parameters and 4 per joint (friction, rotor), less 2 that depend on the others
     assert (found.efforts < 1).all()
     assert excite(loaded, **CHOICE, trials=1).first == found.first
 
 
 def test_a_random_motion_beyond_effort_limits_is_called_so(found):
-    """If the random motion of the comparison exceeds effort limits, the text says so next to its condition number."""
+    """The text marks the condition number of the first random motion if this motion exceeds effort limits."""
     assert not found.first_overruns
     assert "beyond effort limits" not in found.text()
     assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
 
 
 def test_the_condition_number_is_that_of_the_regressor(arm, found):
-    """Without friction and rotors, the condition number is the one of Pinocchio's regressor of the rigid bodies.
+    """Without friction and rotors, the condition number equals that computed from Pinocchio's rigid-body regressor.
 
     The rank is determined numerically.
     """
@@ -219,7 +219,7 @@ def test_the_command(robots, tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert "of the first motion at random" in shown.stdout
-    # `inspect` states 6 base inertial parameters of this arm: the sum with friction and drives is named as such.
+    # `inspect` states only 6 base inertial parameters, so the text names the groups of the 13.
     assert "of the regressor of 13 parameters: base parameters, friction and armature" in shown.stdout
     with open("x.csv", newline="") as file:
         head, *rows = csv.reader(file)

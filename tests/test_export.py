@@ -20,7 +20,7 @@ pytest.importorskip("pinocchio")
 
 
 def run_of(robot, folder, preset, change=lambda model: None):
-    """Return a run folder with the files of `spelgen train`, and its model, with parameters modified by ``change``."""
+    """Build a model, modify its parameters by ``change``, write its run folder; return run folder and model."""
     urdf = ROBOTS / f"{robot}.urdf"
     model = build(urdf, preset)
     with torch.no_grad():
@@ -42,7 +42,7 @@ def heavier(model):
 
 
 def differences(model, loaded):
-    """Return the largest differences of M and of gravity torques between a model and Pinocchio's of an exported arm."""
+    """Compare a model with Pinocchio on an exported arm: return the largest differences of M and of gravity torques."""
     engine = arm_dynamics(loaded.chain, loaded.settings)
     q = torch.randn(20, model.n, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():

@@ -126,7 +126,7 @@ def test_names_for_code():
 
 @needs_gcc
 def test_the_longest_name_is_a_name(tmp_path):
-    """A robot name of the largest length compiles, although the first line of a function exceeds the line length."""
+    """C of a robot with the longest name (40 characters) compiles; its function heads exceed the line length."""
     described = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(described, name=identifier("gen3" * 20))
     assert len(model.name) == 40

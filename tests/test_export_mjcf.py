@@ -29,7 +29,7 @@ from spelgen.exporting.rigid_body_projection import rigid_body_projection
 def test_closed_form_bodies_go_to_mujoco_exactly(robot):
     """Rigid bodies and tip of closed-form models are exact in MuJoCo.
 
-    The comparison does not use the export's own check, which compares 200 states to 1e-9.
+    The test compares them itself, independently of the check of the export (200 states, to 1e-9).
     """
     model, arm = moved_model(robot, "closed-form"), arm_of(robot)
     found = export(model, "mjcf", arm=arm)
@@ -52,7 +52,7 @@ def test_closed_form_bodies_go_to_mujoco_exactly(robot):
 
 
 def test_a_joint_that_friction_holds_does_not_creep():
-    """A joint under half of its friction torque is at rest after a second; with MuJoCo's default it would creep."""
+    """A joint under half of its friction torque is at rest after 1 s; with MuJoCo's default solimp it would creep."""
     found = export(moved_model("rpr", "closed-form"), "mjcf", arm=arm_of("rpr"))
     text = found.files[".xml"].decode()
     assert 'solimpfriction="0.9999 0.9999 0.001 0.5 2"' in text
@@ -101,7 +101,7 @@ def test_followers_motors_and_passive_joints_go_along(tmp_path):
 
 @pytest.mark.parametrize("torque", ["motor", "joint"])
 def test_coupled_motors_turn_by_several_joints(torque, tmp_path):
-    """Rotors of coupled motors couple M: as armature of tendons in MJCF, as couplings in the settings of a URDF."""
+    """Off-diagonal rotor inertia of coupled motors is exported: as tendon armature (MJCF), as couplings (URDF)."""
     urdf = tmp_path / "wrist.urdf"
     shutil.copy(ROBOTS / "six_dof.urdf", urdf)
     names = [each.name for each in load_arm(urdf).chain.coordinates]
@@ -185,7 +185,7 @@ def test_all_targets_agree_on_the_tip(tmp_path):
 
 
 def test_shapes_and_effort_limits_go_along(tmp_path):
-    """Shapes are at the URDF's places without mass, missing meshes are named, and motors have the effort limits."""
+    """Exported shapes are at the URDF's places, without mass; missing meshes are named; motors have effort limits."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
     ball.apply_translation([0.2, 0.1, 0.0])
     ball.export(tmp_path / "ball.stl")

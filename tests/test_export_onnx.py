@@ -29,7 +29,7 @@ ENTRIES = (
 
 @pytest.fixture(scope="module", autouse=True)
 def functions_parsed_once():
-    """Cache the 500 functions that torch's exporter would parse and list for each file, in nearly a second."""
+    """Cache 500 functions of torch's exporter, which otherwise parses and lists them per file (nearly a second)."""
     parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
     listed = staticmethod(functools.cache(ONNXRegistry.from_torchlib))
     with pytest.MonkeyPatch.context() as patch:
@@ -105,7 +105,7 @@ def test_onnx_in_single_precision(tmp_path):
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):
-    """Exported files have only standard operators, no path of the machine, and equal bytes each time."""
+    """Exported files have only standard operators and no path of this machine; two exports have equal bytes."""
     files = {name: content for name, content in exported.files.items() if name.endswith(".onnx")}
     assert files["gravity.onnx"] == onnx_model(coupled[0].prepared(), "gravity")
     for content in files.values():

@@ -105,10 +105,10 @@ def test_the_plugin_equals_the_model(package, tmp_path):
         *model.mass_matrix(q),
         model.nonlinear_effects(q, qd) - model.gravity(q),
         model.gravity(q),
-        # the first call has no history: its friction states are the states of sliding joints
+        # the first call has no history: it assumes the friction states of steady sliding at qd
         model.friction_torque(torch.zeros_like(q), qd, model.memory(qd)),
         model.inverse_dynamics(q, qd, qdd, model.memory(qd)),
-        # a displacement against the direction in which the first velocity had deflected the bristles
+        # the second call: joints have moved against the deflection that the first velocity caused
         model.inverse_dynamics(q + moved, qd, qdd, model.memory_after(model.memory(qd), moved)),
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])

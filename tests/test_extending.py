@@ -30,14 +30,14 @@ JOINTS = ["joint1", "joint2"]
 
 
 def places(thing: str) -> list[str]:
-    """Return the files to which docs/extending.md sends an author of this extension."""
+    """Return the files that docs/extending.md names for an extension; thing: its name there, such as "a baseline"."""
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith(f"| {thing} |"))
     return re.findall(r"`(spelgen/[\w/]+\.(?:py|yaml))`", row.split("|")[2])
 
 
 def stands_in(thing: str, module) -> bool:
-    """Return True if docs/extending.md names the file of a module for this extension, and at most one more file."""
+    """Return True if docs/extending.md names, for the extension `thing`, the file of `module` and at most one more."""
     named = places(thing)
     return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
 
@@ -100,7 +100,7 @@ def test_a_baseline(robots, monkeypatch, log):
     monkeypatch.setattr(registry, "BASELINES", (*registry.BASELINES, stands_still))
     results = spelgen.evaluate(spelgen.build(load_arm(robots / "two_link.urdf"), "spel", width=4), log)
     error = results.horizons[-1].errors["stands still"].mean_relative_rms
-    # a prediction of no motion has the error 1 relative to the motion
+    # errors are relative to the displacement, so the prediction of no motion has the error 1
     assert error == pytest.approx(1, rel=0.2)
     assert "stands still" in results.text()
 

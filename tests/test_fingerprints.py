@@ -46,7 +46,7 @@ def test_a_copy_under_another_name_is_named(change):
 
 
 def test_different_recordings_share_no_samples():
-    """The halves of a recording, other noise on the same motion, and rest at the same position are different."""
+    """Halves of a recording, other noise on the same motion, and rest at the same position are not reported."""
     one = recording(0)
     halves = one[:1000], replace(one[1000:], name="second half")
     assert not repeated(*halves)

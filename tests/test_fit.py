@@ -62,7 +62,7 @@ def test_a_fit_in_memory_is_that_of_files(tmp_path):
 def test_the_seed_orders_batches():
     """The seed determines the order of batches: the same seed gives equal weights, another seed other weights.
 
-    Training and validation logs are the same.
+    All fits have equal training and validation logs.
     """
     logs, held = motions(), motions(2, seed=1)
     weights = []
@@ -133,7 +133,7 @@ def test_logs_that_cannot_be_fitted_are_reported():
 
 
 def swings(seed: int, rate=200.0) -> Trajectory:
-    """Return a log of a smooth motion of the true arm with its own torques."""
+    """Return a log of a smooth motion with the torques of the true arm."""
     random = np.random.default_rng(seed)
     t = np.arange(0, 6, 1 / rate)[:, None]
     speed, phase = random.uniform(2, 5, 2), random.uniform(0, 6, 2)
@@ -209,7 +209,7 @@ def test_a_torque_fit_states_its_error(tmp_path):
 @pytest.mark.parametrize("samples, preset", [(4, "spel"), (4, "closed-form"), (22, "phnode")])
 def test_both_solvers_agree(tmp_path, samples, preset, monkeypatch):
     """Predictions and gradients of the rk4 and the dopri5 solver agree."""
-    # tighter tolerances than the default: near the onset of sliding, steps of 1e-7 have gradients of 1e-3
+    # tighter tolerances than the default: gradients near the onset of sliding are sensitive to integration errors
     monkeypatch.setitem(SOLVER, "rtol", 1e-9)
     monkeypatch.setitem(SOLVER, "atol", 1e-11)
     model = random_model("two_link", tmp_path, seed=0, preset=preset)

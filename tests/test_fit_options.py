@@ -1,4 +1,4 @@
-"""Each objective accepts its own options; any other option is refused with the objective that it belongs to."""
+"""Each objective accepts its own options; the error about any other option names the option's objective."""
 
 from pathlib import Path
 
@@ -194,7 +194,7 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
 
 
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
-    """An option that does not belong to the objective is reported before the logs are read, which may take long."""
+    """If options determine the objective, or contradict it, the logs are not read, which may take long."""
 
     def unread():
         raise AssertionError("the logs were read")

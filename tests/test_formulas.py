@@ -55,7 +55,7 @@ def written(robot, assume="kinematics"):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_sympy_file_by_itself_equals_pinocchio(robots, robot, tmp_path):
-    """The SymPy file runs where spelgen cannot be imported, and its M and V equal Pinocchio's of the URDF."""
+    """The SymPy file runs without spelgen, and its M and V equal M and V of Pinocchio for the URDF."""
     arm, _, found = written(robot)
     write_text(tmp_path / "closed_forms.py", sympy_source(found))
     model = pin.buildModelFromUrdf(str(robots / f"{robot}.urdf"))

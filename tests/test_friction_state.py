@@ -50,7 +50,7 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     for moved in qd:  # reference: explicit Euler, with steps far below the smallest break-away displacement
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
-    # coarse samples may skip a reversal between them, fine samples do not
+    # only fine samples are compared in value: between coarse samples a reversal may be skipped
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0

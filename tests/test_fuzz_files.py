@@ -178,7 +178,7 @@ def test_settings(tmp_path, robots):
 
 
 def test_meshes(tmp_path):
-    """A mesh file of any format with changed bytes is drawn, or the arm is drawn without it."""
+    """If bytes of a mesh file of any format are changed, the page shows the arm with or without this mesh."""
     ball = pytest.importorskip("trimesh").creation.icosphere(subdivisions=1)
     kinds = ("stl", "obj", "ply", "glb", "dae", "off")
     whole = {kind: ball.export(file_type=kind) for kind in kinds}

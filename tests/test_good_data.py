@@ -241,7 +241,7 @@ def test_times_of_a_coarse_clock_are_an_error_where_rows_are_not_evenly_spaced(t
     refused = pytest.raises(LogError, match=r"with the time of another row, but another state.*sample_rate")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
-    # the steps of this clock would mean a sample rate that no arm has
+    # ten rows per step of the clock of 10 us would mean a sample rate of 1 MHz: not corrected but refused
     pa.csv.write_csv(columns_of(np.arange(400) // 10 * 1e-5), tmp_path / "log.csv")
     with refused:
         read_logs(tmp_path / "log.csv", JOINTS)
@@ -342,7 +342,7 @@ NO_LIMITS = {
 
 
 def unlimited_arm(robots, folder, name, form):
-    """Write and load one of the project's robots with the <limit> of `form`, which states no finite range."""
+    """Write and load one of the project's robots without finite position limits; form: how the <limit> states it."""
     text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
     (folder / "x.urdf").write_text(text)
     return load_arm(folder / "x.urdf")
@@ -450,7 +450,7 @@ def columns(**changed):
 
 
 def test_messages_of_a_publisher_of_zeros_are_left_out_with_one_note(tmp_path):
-    """A second publisher may write velocities and efforts that are all 0: its messages are not dropouts of the arm."""
+    """Messages of a second publisher, whose velocities and efforts are all 0, are omitted, with one remark."""
     messages = states()
     zeros = [(x[0] + 3_000_000, JOINTS, [0.1, 0.1], [0.0, 0.0], [0.0, 0.0]) for x in messages]
     for count in (1, 5):
@@ -460,7 +460,7 @@ def test_messages_of_a_publisher_of_zeros_are_left_out_with_one_note(tmp_path):
         assert log.repairs[0].startswith(
             f"{len(zeros[::count])} rows left out, of another topic or publisher"
         )
-    # an arm at rest whose motors are off has such rows, too
+    # velocities and efforts of 0 at the start, of an arm at rest with motors off, are not omitted
     rest = [(x[0], JOINTS, x[2], [0.0, 0.0], [0.0, 0.0]) if k < 50 else x for k, x in enumerate(messages)]
     assert len(read_logs(bag_of(rest, tmp_path / "rest"), JOINTS)[0]) == len(T)
 
@@ -528,7 +528,7 @@ def test_an_older_calibration_of_lerobot_is_one_error_and_other_motors_do_not_ma
 
 
 def test_the_range_of_other_elements_of_a_state_does_not_matter(tmp_path):
-    """Positions in rad with a gripper of 0 to 100 are no normalised values."""
+    """Positions in rad are not mistaken for normalised values if the gripper in the same state has values to 100."""
     folder = dataset(tmp_path / "set", np.column_stack([Q, 50 + 50 * np.sin(T)]), names=(*JOINTS, "gripper"))
     (log,) = read_logs(folder, JOINTS, POSITION)
     np.testing.assert_allclose(log.q, Q, atol=1e-6)

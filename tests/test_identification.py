@@ -60,14 +60,14 @@ def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_are_those_of_inspect(robots, robot):
-    """Base parameters of the bodies have the names, order, groups and values of `inspect`; friction's come last."""
+    """Base parameters of bodies have names, order, groups and values of `inspect`, and precede those for friction."""
     path = robots / f"{robot}.urdf"
     arm = load_arm(path).chain
     exact = exact_base_parameters(arm)
     base = base_parameters(arm, FrictionModel())
     inertial = 10 * len(arm.bodies)
     assert base.bodies == len(exact) == inspect(path).to_dict()["base_parameters"]
-    # drives may add terms: the rotor of a symmetric last link acts as the link does
+    # names may differ by R (regrouped): the rotor inertia of a symmetric last link adds to the link's
     names = [name.removesuffix("R") for name in base.names[: base.bodies]]
     assert names == [each.name.removesuffix("R") for each in exact]
     assert {each.name for each in inspect(path).closed_forms().base} == {each.name for each in exact}
@@ -87,7 +87,7 @@ def columns(arm, friction, q, qd, qdd):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_make_the_torque(robots, robot):
-    """The regressor Y of all parameters equals Y[:, columns] @ combination, with both attributes of the result."""
+    """The regressor Y of all parameters equals Y[..., base.columns] @ base.combination, and its rank is len(base)."""
     arm, friction = load_arm(robots / f"{robot}.urdf").chain, FrictionModel(stribeck=True)
     base = base_parameters(arm, friction)
     states = np.random.default_rng(5).uniform(-2, 2, (3, 60, len(arm.coordinates)))
@@ -245,7 +245,7 @@ def test_pseudo_inertia_is_pinocchios(seed):
 
 
 def test_an_impossible_body_is_replaced_by_the_nearest_possible_one():
-    # a tensor with Izz > Ixx + Iyy, which no physical body has
+    # a tensor with Izz > Ixx + Iyy: not physically consistent
     factor, possible = reference_factor(np.array([1.0, 0, 0, 0, 0.1, 0, 0, 0.1, 0, 0.5]))
     assert not possible
     ten = parameters_of(factor @ factor.T)

@@ -36,7 +36,7 @@ FILES = [".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in s
 LAYERS = [name for name in FILES if not name.endswith(".__init__")]
 OURS = {f"spelgen.{name}" for name in LAYERS}
 
-# Modules that a file may not import, neither directly nor through others.
+# Exact arithmetic, which fits and pages of runs must not import, neither directly nor through other modules.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
 # Module that every file may import: it computes G from the files, without the exact arithmetic of its folder.
 PLAIN = {"spelgen.arm.actuation"}
@@ -45,7 +45,7 @@ DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "scene")}
-# Modules that also identify by least squares, for which they import the exact base parameters.
+# Exceptions: these modules import the exact base parameters, to identify by least squares as well.
 LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {

@@ -98,7 +98,7 @@ def test_a_gap_of_one_message_is_a_gap_of_the_log(joints, tmp_path):
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
 def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
-    """A table with the rows of several topics, as plot tools export it, is joined; other topics' cells are empty."""
+    """Rows of several topics in one table, with empty cells in the columns of other topics, are joined."""
     rng = np.random.default_rng(len(joints))
     signals = motion(3, len(joints))
     # sample times of q and qd, and sample times of torques

@@ -61,7 +61,7 @@ def errors(logs, arm) -> str:
 
 
 def advised(text: str) -> LogMapping:
-    """Return the mapping that the one line of advice in an error states."""
+    """Return the log mapping that an error advises; the error must contain exactly one advised line."""
     (line,) = re.findall(r"write '(.*)' under 'logs'", text)
     return LogMapping.model_validate(yaml.safe_load(line))
 
@@ -272,7 +272,7 @@ def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, 
     log = {name: x if name == "t" else x[first] for name, x in columns.items()}
     (found,) = read_logs(written(log, tmp_path / "log.csv"), joints)
     assert len(found) == pytest.approx(len(np.unique(newest)), rel=0.02)
-    # a state at which all joints reverse may be read twice, as it does not change
+    # not 1: where all joints reverse, positions hardly change, so that a repeated state may not be recognised
     assert np.mean((np.diff(found.q, axis=0) != 0).any(axis=1)) > 0.98
 
 
@@ -287,7 +287,7 @@ def test_frames_that_are_written_twice_now_and_then_are_counted_and_dropped_on_r
     (kept,) = read_logs(file, joints)
     (note,) = kept.repairs
     assert "rows repeat the row before in motion: 'dropouts: dropped' under 'logs' removes them" in note
-    # where all joints reverse, a repeated row cannot be recognised
+    # tolerance: where all joints reverse, positions hardly change, and a repeated row cannot be recognised
     count = int(note.split(" rows ")[0])
     assert 0.95 * len(repeats) < count <= len(repeats)
     (dropped,) = read_logs(file, joints, {"dropouts": "dropped"})

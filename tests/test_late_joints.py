@@ -75,7 +75,7 @@ def test_the_clock_of_one_joint_that_runs_fast_or_slow_is_named(arm, rate, torqu
 @pytest.mark.parametrize("arm", ["six_dof", "ur10e"], indirect=True)
 @pytest.mark.parametrize("units", [{"q": "deg"}, {"q": "deg", "qd": "rad/s"}])
 def test_a_unit_of_positions_that_contradicts_the_velocities_is_named(arm, units):  # noqa: F811
-    """If the stated unit of positions contradicts right velocities, the message names the unit of the positions."""
+    """If velocities are right and contradict the stated unit of positions, the message names the unit of positions."""
     mapping = LogMapping.model_validate({"units": units})
     log = recorded(arm, 13)
     error = told(arm, replace(log, q=np.deg2rad(log.q), mapping=mapping), mapping)
@@ -91,7 +91,7 @@ def test_a_unit_of_positions_that_contradicts_the_velocities_is_named(arm, units
     indirect=["arm"],
 )  # fmt: skip
 def test_a_unit_of_torques_that_the_mapping_states_wrongly_is_named(arm, sign, line):  # noqa: F811
-    """If the stated unit of torques is wrong, the message states the right unit, instead of a gain of 1000 on mNm."""
+    """If the stated unit of torques is wrong, the message advises the right unit, and no gain such as 1000 for mNm."""
     mapping = LogMapping.model_validate({"units": {"tau": "mNm"}})
     log = recorded(arm, 13)
     error = told(arm, replace(log, tau=sign * 1e-3 * log.tau, mapping=mapping), mapping)
@@ -161,7 +161,7 @@ def test_a_wrong_unit_of_a_prismatic_joint_is_named(robots, stated, logged):
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize(("ratio", "is_motor_torque"), [(50.0, False), (-101.0, True)])
 def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_torque, tmp_path):  # noqa: F811
-    """Positions and velocities of one motor before its gear are no degrees: the line has the ratio of the gear."""
+    """If the motion of one motor is logged before its gear, the advised line has the gear ratio, not another unit."""
     log = recorded(arm, 15, noise=0.01)
     factors = np.where(np.arange(log.q.shape[1]) == 1, ratio, 1.0)
     tau = log.tau / (factors if is_motor_torque else 1.0)
@@ -177,7 +177,7 @@ def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_t
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # noqa: F811
-    """The ratios of the advised gains are exact, since the dynamic coupling of the joints determines them."""
+    """Torques in percent of each joint's rated torque get one gain per joint; their ratios are right to about 30 %."""
     log, gains = recorded(arm, 16, noise=0.01), np.array([1.3, 0.02, 0.4, 0.006])
     error = told(arm, replace(log, tau=log.tau / gains))
     assert "--accept torque-unit" in error

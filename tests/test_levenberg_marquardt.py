@@ -39,7 +39,7 @@ def first_state(problem):
 
 
 def test_the_minimum_of_the_rosenbrock_function_is_found():
-    """The solver finds the minimum: no step raises the cost, each is reported, and at the minimum it takes no step."""
+    """The solver finds the minimum: no step raises the cost, and from the minimum no step is made."""
     problem, states = Rosenbrock(), [first_state(Rosenbrock())]
     result = levenberg_marquardt(
         problem, states[0], max_steps=100, min_decrease=1e-20, callback=states.append
@@ -63,10 +63,10 @@ def test_a_fit_is_resumed_from_any_of_its_states():
 
 
 def test_an_ascent_direction_ends_the_solver():
-    """If steps have the wrong sign, so that no damping lowers the cost, the solver ends with this reason.
+    """If steps have the wrong sign and no damping lowers the cost, the solver ends with the reason NO_DECREASE.
 
-    It ends with the reason of a small prediction, if the predicted reduction is negligible. Small dampings that
-    give the same step are tried once.
+    If also the predicted reduction is negligible, it ends with SMALL_PREDICTION. Of small dampings with nearly equal
+    steps, only one is tried.
     """
     tried = []
 

@@ -27,16 +27,16 @@ def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
 @pytest.mark.parametrize("motion", [excitation, pick_and_place])
 @pytest.mark.parametrize("seed", range(2))
 def test_the_joints_with_clipped_torques_are_named_with_their_limits(arm, motion, seed):  # noqa: F811
-    """Clipped torques are named with their limits: of all joints at a fraction of the largest torque, or of one joint.
+    """Joints with clipped torques are named with their torque limits.
 
-    The limits of one joint may differ in both directions.
+    First all joints are clipped at 60 % of their largest torque, then one joint, with different limits per direction.
     """
     log = recorded(arm, seed, motion)
     names, rng = arm.chain.joint_names, np.random.default_rng(seed)
     limit = 0.6 * np.abs(log.tau).max(axis=0)
     found = clipped_joints(arm, replace(log, tau=np.clip(log.tau, -limit, limit)))
     share = (np.abs(log.tau) > limit).mean(axis=0)
-    # joints that are at the limit for more than 40 % of the time have too few other samples to be named
+    # joints at the limit in more than 40 % of the samples may be missing: too few other samples remain
     assert {names[k] for k in np.flatnonzero((share > 0.05) & (share < 0.4))} <= found.keys()
     assert found
     assert all(
@@ -67,7 +67,7 @@ def test_clipped_torques_are_refused_and_slower_motion_mends_them(arm):  # noqa:
 
 
 def test_torques_of_uniform_acceleration_are_flat_and_right(robots):
-    """The flat torque of a vertical joint that accelerates and brakes uniformly is not reported as clipped."""
+    """Constant torques of a joint with a vertical axis, in uniform acceleration, are not reported as clipped."""
     arm = load_arm(robots / "scara.urdf")  # noqa: F811
     t = np.arange(0.0, 20.0, 1 / RATE)
     n = len(arm.chain.coordinates)

@@ -69,7 +69,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """Return a run folder of the model, with noise levels of half a minute of logs."""
+    """Return a run folder of the model, with the noise levels `levels`, which state half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
     folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
@@ -124,7 +124,7 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
 
 
 def test_the_jacobian_is_the_velocity_of_the_tip(arm):
-    """The estimator's Jacobian of the tip equals the one of `TipKinematics`."""
+    """The Jacobian of the tip that the estimator computes equals the Jacobian by `TipKinematics`."""
     from spelgen.dynamics.tip import tip_kinematics
     from spelgen.dynamics.tip_frame import tip_frame
 
@@ -177,7 +177,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     # predictions of more than 0.3 s ahead do not include the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
-    # Before its first report, the payload is an external torque, which `compensate_external` compensates.
+    # Before the first payload report, the payload is part of the external torque: `compensate_external` includes it.
     part, k = dataclasses.replace(log, tau=tau)[:180], 179
     for compensated in (False, True):
         early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
@@ -198,7 +198,7 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
     touched = log.tau + np.outer((log.t > 6.0) & (log.t < 8.0), 0.1 * EFFORT * (np.arange(6) == 1))
     _, states = estimates(run, levels, log, touched)
     assert not any(state.load_changed or state.payload.status == "payload" for state in states)
-    # both at once: the load is found after the end of the contact
+    # payload and contact at the same time: the payload is found after the end of the contact
     _, states = estimates(run, levels, log, picked + touched - log.tau)
     assert abs(states[-1].payload.mass - 2.0) < 0.2
 
@@ -266,7 +266,7 @@ def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
 
 
 def test_delayed_torques_are_compared_with_the_motion_of_their_time():
-    """Torques that are logged 15 ms late are compared with the motion at their time.
+    """Torques that are logged 15 ms late are compared with the motion 15 ms earlier.
 
     The fit finds the delay; without it, the motion would cause wrong external torques.
     """
@@ -343,9 +343,9 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
 
 @pytest.mark.parametrize(("effort", "expected"), [(np.inf, "used"), (1.0, "saturated")])
 def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
-    """A load may need torques far above the logged ones: without a limit in the URDF such samples are used.
+    """Torques of four times the largest logged torque are refused as saturated only if the URDF has such a limit.
 
-    effort: torque limit of the URDF, divided by the largest logged torque.
+    effort: torque limit of the URDF, divided by the largest logged torque. expected: result for these torques.
     """
     model, log, _ = arm
     largest = np.abs(log.tau).max(axis=0)
@@ -395,7 +395,7 @@ def test_one_log_has_one_result(arm, levels, run):
     assert states[-1].contact.external_torque.tobytes() == again[-1].contact.external_torque.tobytes()
     np.testing.assert_allclose(single.disturbance, states[-1].disturbance, rtol=1e-9)
     np.testing.assert_allclose(single.contact.external_torque, states[-1].contact.external_torque, atol=1e-9)
-    # An asymmetry would grow from rounding errors until it affects the odds of a payload.
+    # Exactly symmetric: otherwise rounding errors would grow until they affect the odds of a payload.
     covariance = estimator.estimate.filters[0].P
     np.testing.assert_array_equal(covariance, covariance.T)
 
@@ -679,7 +679,7 @@ def test_thresholds_rise_while_the_arm_vibrates_and_not_by_a_contact(arm, levels
 
 
 def test_logs_that_the_estimator_cannot_use_are_refused_or_marked(arm, levels, run):
-    """Torques of another unit are an error; external torques in most of a log are stated, and a load is no contact."""
+    """Torques in another unit are an error; external torques in most of a log give a remark, a load does not."""
     model, log, qdd = arm
     fit = load_run(run)
     with pytest.raises(LogError, match=r"2399 of 2400 samples .*2399 saturated.*torques in Nm"):

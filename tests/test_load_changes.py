@@ -1,4 +1,4 @@
-"""Recordings with another load are named, with the mass: one model of all of them is wrong for each."""
+"""If recordings have different loads, a warning names them with the masses: no single model fits all of them."""
 
 import re
 from dataclasses import replace
@@ -24,7 +24,7 @@ def loaded(arm, log, mass):  # noqa: F811
 
 
 def parts(log, count=4):
-    """Return the parts of a recording as recordings of their own: the same arm, other motions."""
+    """Split a recording into `count` recordings, which have the same arm and different motions."""
     size = len(log.t) // count
     return [replace(log[k * size : (k + 1) * size], name=f"part {k}") for k in range(count)]
 
@@ -64,7 +64,7 @@ def test_recordings_with_another_load_are_named_with_its_mass(arm, mass):  # noq
 @pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_recordings_with_one_load_are_not_doubted(arm, seed):  # noqa: F811
-    """Neither different motions of one arm, nor another friction or torque offset in one recording, is a load."""
+    """Different motions, or another friction or torque offset in one recording, are not reported as another load."""
     first, second, *others = parts(recorded(arm, seed))
     size = first.tau.std(axis=0)
     still = parts(recorded(arm, seed, pick_and_place))
@@ -86,7 +86,7 @@ def test_one_load_among_many_recordings_is_named_once(arm):  # noqa: F811
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_a_tool_that_the_urdf_lacks_is_no_other_zero(arm):  # noqa: F811
-    """All recordings have a tool of 3 kg: it is no reason to doubt zeros, senses, order, units or gravity."""
+    """A tool of 3 kg in all recordings is not mistaken for wrong zeros, senses, order, units or gravity."""
     assert warnings(arm, [loaded(arm, x, 3.0) for x in parts(recorded(arm, 3))]) == []
 
 

@@ -82,7 +82,7 @@ def test_an_edited_module_is_refused_and_not_executed(tmp_path, standalone, edit
 def test_the_remedy_for_an_edited_module_works(tmp_path):
     """The advised `from MODULE import Model` gives a model of an edited module that `spelgen.fit` accepts.
 
-    A run folder refuses to keep it.
+    But the fit of an edited module cannot be saved as a run folder.
     """
     import spelgen
     from spelgen.errors import RunError

@@ -943,7 +943,7 @@ def test_separators_of_thousands_are_an_error_with_what_to_do(tmp_path):
 
 
 def test_vectors_of_matlab_and_conversions_of_other_files(tmp_path, monkeypatch):
-    """For .mat, .npy and .txt files, the command that the error message states converts them to a readable log."""
+    """Files .mat, .npy and .txt are refused, and the command in the error message converts them to readable logs."""
     import scipy.io
 
     monkeypatch.chdir(tmp_path)
@@ -1009,9 +1009,9 @@ def test_a_path_is_no_code_in_an_advised_command(tmp_path, name):
 
 
 def test_columns_without_numbers_and_dashes_have_a_remedy_that_works(tmp_path):
-    """The advice of the error about cells with a dash, which have no value, works.
+    """A log with one dash instead of a value is read with the advised `dropouts: dropped`.
 
-    For a column of dashes only, it is to name another column: `dropouts: dropped` would remove all rows.
+    For a column of dashes only, which would remove all rows, the advice is to name another column.
     """
     lines = text_log().splitlines()
     rows = [line.rpartition(",")[0] for line in lines]

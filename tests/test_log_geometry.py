@@ -58,7 +58,8 @@ def pick_and_place(arm, rng):
 def recorded(arm, seed, motion=excitation, noise=0.02, gravity=1.0) -> Trajectory:
     """Return a log of an arm whose inertials differ by 30 % from the URDF's, with friction and noise.
 
-    motion: returns times (T,) and positions (T, n). noise: relative. gravity: factor on the gravity torque.
+    motion: returns times (T,) and positions (T, n). noise: relative to the standard deviation of each torque.
+    gravity: factor on the gravity torque.
     """
     rng = np.random.default_rng(seed)
     t, q = motion(arm, rng)
@@ -81,7 +82,7 @@ def flipped(log, k, motion, torque):
 
 
 def drawn_joint(log, rng, first=0):
-    # the last joint is not drawn, as its link may be symmetric, so that its sense and its zero have no effect
+    # never the last joint: if its link is symmetric, its sense and its zero have no effect on torques
     return int(rng.integers(first, log.q.shape[1] - 1))
 
 
@@ -154,7 +155,7 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
 
 
 def test_two_reversed_joints_are_not_taken_for_a_third(shared):
-    """The best single correction is a wrong one, the reversed torque of a joint whose position is reversed."""
+    """The error names both reversed joints, not the single correction that fits best and concerns the torque only."""
     arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
     wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
     error = told(arm, wrong)
@@ -168,7 +169,7 @@ def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     turning = [k for k, x in enumerate(arm.chain.coordinates) if x.joint_type == "revolute"]
     k = turning[1] if len(turning) > 2 else 2
     log = recorded(arm, int(rng.integers(1000)))
-    # a zero offset of a joint of rpr is not visible, as other inertials explain the same torques
+    # zero offsets of rpr cannot be found: the same torques also result from other inertials without offset
     if arm.chain.name == "rpr":
         assert check_logs([turned(log, k, np.deg2rad(angle))], arm).errors == ()
         return
@@ -221,7 +222,7 @@ def test_compensated_gravity_is_called_so(arm, part):
 
 
 def test_another_unit_is_offered_as_gain(arm):
-    """Torques in another unit get a gain, which gravity determines as accurately as the masses of the URDF."""
+    """Torques in another unit get a gain. It has the relative error of the URDF's masses, which determine gravity."""
     log = recorded(arm, 6)
     error = told(arm, replace(log, tau=log.tau / 0.003))
     gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
@@ -258,7 +259,7 @@ def test_a_reversed_joint_of_servos_is_named_although_nothing_explains_the_uncha
 def test_a_link_with_a_mistyped_mass_is_named(arm):
     """A link whose mass in the URDF is six times too large is named; its tensor about the centre of mass is right."""
     moments = [np.linalg.norm(np.array(body.inertia[1:4], dtype=float)) for body in arm.chain.bodies]
-    # body 1 is not drawn: joint 1 of these arms is vertical, so that the body's first moment has no effect
+    # never body 1: the axis of joint 1 is vertical, so that the body's first moment has no effect
     k = 1 + int(np.argmax(moments[1:]))
     body = arm.chain.bodies[k]
     heavy = replace(body, inertia=(*(6 * float(x) for x in body.inertia[:4]), *body.inertia[4:]))
@@ -294,7 +295,7 @@ def test_a_mistyped_mass_at_the_wrist_is_named(arm, k):
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
-    """Only the last joint of this arm carries weight: another unit of its torque is no reason to refuse the log."""
+    """If the URDF's last link is too light, the link is named with its mass ratio, and the log is not refused."""
     log, mistyped, link = exact_log_and_mistyped_arm(arm, 2, Fraction(1, 10))
     report = check_logs([log], mistyped)
     assert report.errors == ()
@@ -539,7 +540,7 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
 def test_presliding_hysteresis_does_not_change_a_zero_offset(arm, seed, angle):
     """The zero of a joint is named to 0.1 rad although its friction has a hysteresis of 0.05 rad.
 
-    Without hysteresis in the model, the offset of lowest cost compensates friction: it was 0.4 rad wrong, or none.
+    If the model had no hysteresis, an offset wrong by 0.4 rad would compensate friction, or none would be found.
     """
     log = recorded(arm, seed, pick_and_place, noise=0.01)
     log = replace(log, tau=log.tau + 0.4 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))

@@ -24,7 +24,7 @@ STATES = [
 
 
 def documents(names):
-    """Return JSON documents with the same recording, by the name of their form."""
+    """Return {name of a form: JSON document}; all documents contain the same recording."""
     stamps = [{"sec": int(t), "nanosec": round(t % 1 * 1e9)} for t in T.tolist()]
     order = [2, 0, 3, 1]
     points = [

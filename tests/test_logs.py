@@ -499,7 +499,7 @@ def test_the_filter_has_no_delay_and_takes_out_noise():
     noisy = Trajectory(clean.t, *(x + e for x, e in zip((clean.q, clean.qd, clean.tau), noise, strict=True)))
     smooth = low_pass(noisy, 5.0)
     np.testing.assert_array_equal(smooth.t, clean.t)
-    middle = slice(50, -50)  # the ends are omitted, at which the filter has neighbours on one side only
+    middle = slice(50, -50)  # the ends are omitted: there the filter has neighbours on one side only
     for quantity in ("q", "qd", "tau"):
         error = getattr(smooth, quantity)[middle] - getattr(clean, quantity)[middle]
         assert (

@@ -1,4 +1,4 @@
-"""A run keeps the mapping of its logs, and is adapted and reproduced by it; trained gains have intervals."""
+"""A run stores the mapping of its logs and uses it to adapt and to reproduce the run; trained gains have intervals."""
 
 import re
 import shlex
@@ -91,7 +91,7 @@ def test_the_lines_that_reproduce_a_run_give_the_same_model(folder, monkeypatch)
     run = RunFolder(folder / "run")
     (work := folder / "again").mkdir()
     monkeypatch.chdir(work)
-    # states are not predicted for seconds ahead, to save time
+    # no horizons of whole seconds in the evaluation, to save time
     monkeypatch.setattr("spelgen.evaluation.evaluate.SECONDS", ())
     for line in commands(run, run.read_spec(), run.read_record()):
         program, *words = shlex.split(

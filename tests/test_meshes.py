@@ -57,9 +57,9 @@ def test_an_arm_of_fine_meshes_is_drawn(tmp_path):
 
 
 def gltf(buffer: dict[str, object], count: int = 3, view: int | None = 0) -> str:
-    """Return a glTF file with one mesh, whose vertex positions are in a buffer.
+    """Return a glTF file with one mesh of ``count`` vertices, whose positions are in ``buffer``, the glTF description.
 
-    view: index of the view of the buffer; None: the vertices are ``count`` zeros.
+    view: index of the bufferView of the positions; None: all positions are zero, as glTF defines.
     """
     positions = {"componentType": 5126, "count": count, "type": "VEC3"}
     if view is not None:

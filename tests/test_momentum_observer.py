@@ -75,7 +75,7 @@ def test_it_depends_only_on_past_samples():
 
 
 class InVelocities:
-    """The planar model with the interface of dynamics without momenta."""
+    """Dynamics of the planar model with `forward_dynamics` only, like user-defined dynamics that have no momenta."""
 
     def __init__(self) -> None:
         self.model = Model()

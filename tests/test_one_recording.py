@@ -1,4 +1,4 @@
-"""A fault of one of several recordings is an error that names this recording, and gives no line for all of them."""
+"""The error about a fault of one recording of several names it, and advises no line, which would apply to all."""
 
 from dataclasses import replace
 

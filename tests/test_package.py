@@ -55,7 +55,7 @@ def test_wheel_holds_all_that_the_package_needs(installed):
 
 
 def test_installed_command_builds_the_same_module(installed, robots, tmp_path):
-    # the URDF is copied to the working folder, as a module states the path of a URDF elsewhere
+    # in the working folder: otherwise the module would contain the path of the URDF, and modules would differ
     for path in robots.glob("rpr.*"):
         shutil.copy(path, tmp_path)
     command = [sys.executable, "-m", "spelgen", "build", "rpr.urdf", "-o", "module.py"]

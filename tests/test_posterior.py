@@ -44,7 +44,7 @@ from tests.test_closed_form import drawn
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
-    """Fits and least squares use the same names: the report matches their values by name."""
+    """Base parameters of fits have the names and combinations of the exact ones: the report matches both by name."""
     urdf = robots / f"{robot}.urdf"
     if robot in ("followed", "gantry"):
         urdf = tmp_path / f"{robot}.urdf"
@@ -52,7 +52,7 @@ def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
     arm = load_arm(urdf)
     exact = base_parameters(arm.chain, FrictionModel(), arm.actuation.drives().speeds)
     count = 10 * len(arm.chain.bodies) + len(arm.chain.coordinates)
-    # base parameters of friction and offsets, which come last, are not compared
+    # not compared: the base parameters of friction and offsets, which are the last
     common = exact.columns < count
     model = build(arm, "closed-form")
     names, combination = base_combinations(model.chain, motors_of(model))
@@ -120,7 +120,7 @@ def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fi
 
     With errors correlated over 0.5 s, intervals of the posterior covariance, which assumes 0.2 s, are too narrow.
     """
-    # errors divided by half intervals, of reported intervals and of intervals by the posterior covariance
+    # error / half width of the interval: of reported intervals, and of intervals from the posterior covariance
     estimates, ratios, ratios_by_posterior = [], [], []
     measured = torque_fit.jackknife
 
@@ -146,7 +146,7 @@ def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fi
 def test_least_squares_counts_friction_that_changes_during_a_log(robots):
     """Intervals of least squares include changes of friction during a log.
 
-    Coulomb friction rises by half in a minute: the standard deviation of its mean is the one of ten independent values.
+    Coulomb friction rises by half in a minute; the variance of its mean is a tenth of the variance during the log.
     """
     arm = load_arm(robots / "rpr.urdf").chain
     q, qd, qdd = smooth_motion(3, 60.0, np.random.default_rng(0))

@@ -88,7 +88,7 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 def test_networks_read_rotation_matrices(net, part, tmp_path):
     """Networks of phnode equal the paper's, evaluated layer by layer on rotation matrices.
 
-    Inputs are the varying entries of the 9 numbers of R per turning joint, and of the 3 of r per sliding joint.
+    Inputs: entries of R (3, 3) per turning joint and of r (3,) per sliding joint, without the constant entries.
     """
     owner = random_model("rpr", tmp_path, seed=5, design=replace(load_design("phnode"), net=net))
     model, encoding = owner.get_submodule(part), owner.encoding

@@ -49,7 +49,7 @@ class Reading:
     def draw_inertias(self, rng: np.random.Generator) -> None:
         """Give each body of the model random, physically consistent inertial values."""
         for k in range(1, self.model.njoints):
-            # the tensor is the one of four point masses, and so physically consistent
+            # the inertia tensor of four point masses, which is physically consistent
             points = rng.normal(scale=0.5, size=(4, 3))
             tensor = np.eye(3) * (points**2).sum() - points.T @ points
             self.model.inertias[k] = pin.Inertia(rng.uniform(1.0, 4.0), rng.uniform(-0.5, 0.5, 3), tensor)
@@ -181,7 +181,7 @@ def test_structure_agrees_with_pinocchio(tmp_path, drawn):
 @RANDOM
 @given(drawn=arms())
 def test_values_are_those_of_pinocchio(tmp_path, drawn):
-    """M and V of the exact geometry equal Pinocchio's of the URDF, with the bodies' lumped inertial values."""
+    """M and V from the exact geometry and the lumped inertial values equal M and V of Pinocchio for the URDF."""
     arm = read(drawn, tmp_path)
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (20, len(drawn.joints)))
     inertias = [[float(x) for x in body.inertia or ()] for body in arm.bodies]

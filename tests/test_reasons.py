@@ -1,4 +1,4 @@
-"""Statements and reasons of the inspection are the known ones for the robots and small arms."""
+"""`inspect` gives the expected statements about M and V, with reasons, for the project's robots and small arms."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def git(*arguments, folder):
 def test_a_source_is_read_at_its_commit(tmp_path, monkeypatch, shared):
     """A source is read at its commit: a later commit of the clone has no effect.
 
-    The generated URDF equals the one of the reference data, byte for byte.
+    The generated URDF equals the URDF in the reference data, byte for byte.
     """
     source = recordings.SOURCES["xmate3"]
     clone = tmp_path / "clones" / source.repository.name

@@ -58,7 +58,7 @@ def test_unneeded_defects_are_warnings_at_most(odd, more, sidecar, codes):
 
 @pytest.mark.parametrize("group", ["simulation", "tracking"])
 def test_settings_with_errors_are_not_copied(odd, tmp_path, group):
-    """Settings with an error are refused before a simulated arm copies them or a comparison's digest includes them."""
+    """Settings with an error are refused: no as-built arm is written, and a comparison does not accept the arm."""
     urdf = odd(sidecar=f"{group}: {{lenght: 1}}")
     expected = f"{group}: unknown key 'lenght'"
     with pytest.raises(SettingsError, match=expected):

@@ -57,7 +57,7 @@ for line in sys.stdin:
 
 @dataclass(frozen=True)
 class Case:
-    """A URDF, the options with which it is read, and a part of the error by which it is refused; None: it is built."""
+    """A URDF to build: its text, options of the command, and a part of the expected error (`refused`; None: none)."""
 
     make: Callable[[], str | bytes]
     refused: str | None

@@ -1,4 +1,4 @@
-"""Rigid-body dynamics equal Pinocchio's of the URDF, and mechanics that are derived by hand."""
+"""Rigid-body dynamics equal Pinocchio's dynamics of the URDF, and equations that are derived by hand."""
 
 from fractions import Fraction
 
@@ -58,7 +58,7 @@ def test_rotors_count_by_the_square_of_their_gear(robots):
 
 
 def test_a_telescope_moves_its_second_stage_twice():
-    """The velocity of a telescope's second stage is three times the first one's, so M = m1 + 9 m2.
+    """The second stage of a telescope moves three times as fast as the first stage, so M = m1 + 9 m2.
 
     Stage 2 mimics stage 1 with the factor 2, and slides on it.
     """
@@ -74,7 +74,7 @@ def test_a_telescope_moves_its_second_stage_twice():
 
 
 def test_a_mimic_elbow_is_a_pendulum_with_a_varying_inertia():
-    """A mimic elbow makes a pendulum with varying inertia, equal to the one derived by hand.
+    """With a mimic elbow a pendulum has a varying inertia; its dynamics equal equations that are derived by hand.
 
     Two point masses at length L; the elbow is -q/2 + 0.3, so that the angle of the second rod is b = q/2 + 0.3:
 
@@ -186,7 +186,7 @@ def same_dynamics(one, other, joints, tolerance):
 
 
 def test_mimic_and_locked_joints_are_the_arms(tmp_path):
-    """Dynamics of an arm with mimic and locked joints equal Pinocchio's of the whole file under these constraints."""
+    """Dynamics of an arm with mimic and locked joints equal Pinocchio's dynamics with the same constraints."""
     path = tmp_path / "lift.urdf"
     path.write_text(LIFT)
     lift = make_arm(read_urdf(path), joints=["low", "swing"])

@@ -227,6 +227,6 @@ def dh_mass_matrix(robot, q):
 
 
 def written_inertials(robot):
-    """Return the inertials of the URDF, which are in DH frames in the modified convention."""
+    """Return mass, centre and tensor per link from a URDF whose link frames are modified DH frames."""
     links = read_urdf(ROBOTS / f"{robot}.urdf").links
     return [(each.inertial.mass, each.inertial.com, each.inertial.tensor) for each in links if each.inertial]

@@ -43,7 +43,7 @@ def started(arm, **parameters):
 
 
 def torques(model, q, qd, qdd, friction_of=None):
-    """Return the torques of the torch model; friction states are the ones of joints that slide at ``friction_of``.
+    """Return the torques of the torch model; friction states result from sliding at ``friction_of``.
 
     friction_of: velocities (n,); None: joints that have not moved.
     """
@@ -125,7 +125,7 @@ def test_computed_torque_tracks_references_by_topic(arm):
 
 
 def test_without_the_model_the_same_gains_do_not_track(arm):
-    """If a tenth of the gravity torque is not compensated, the same gains give an error above 2 mrad."""
+    """If a tenth of the gravity torque is missing in the model, the tracking error exceeds 2 mrad, with equal gains."""
     controller, simulated = started(arm, mode="computed_torque")
     unknown = torques(arm[0], START, [0, 0], [0, 0]) / 10
     worst = 0.0

@@ -95,7 +95,7 @@ def test_hidden_units_are_shared_in_proportion_to_outputs():
 
 
 def entries(f1, f2, c1):
-    """Return M of two functions f1 and f2 and a constant c1, as the rows of an emitted module do."""
+    """Return M (..., 3, 3) from functions f1, f2 and a constant c1, like `mass_entries` of an emitted module."""
     return symmetric([f1], [f1 - 2 * f2, c1], [0, f2, 3 * f2])
 
 
@@ -287,10 +287,9 @@ def test_values_are_in_units(tmp_path):
 
 
 def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
-    """Return the Cholesky factors of inertial parameters, rounded to the digits that modules of the first release had.
+    """Return Cholesky factors of inertial parameters `ten` (bodies, 10), rounded as in modules of the first release.
 
-    The inertia of link3 of rpr is at the limit of physical consistency: it was replaced by a consistent one of six
-    digits.
+    They had ten digits, and six for link3 of rpr, whose inertia is at the limit of physical consistency.
     """
     digits = [6 if (robot, index) == ("rpr", 2) else 10 for index in range(len(ten))]
     rounded = [[float(f"{x:.{k}g}") for x in row] for row, k in zip(ten.tolist(), digits, strict=True)]
@@ -299,9 +298,9 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Return the parameters of bodies that equal the first release's after 0.01 was added to its parameters.
+    """Return parameters that give the bodies which the first release had after 0.01 was added to all its parameters.
 
-    The first release had lower triangular Cholesky factors, with the entries exp(0.01) and 0.01 relative to nominal.
+    Its Cholesky factors were lower triangular; relative to nominal, their entries were then exp(0.01) and 0.01.
     """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
@@ -311,10 +310,10 @@ def weights_of_first_stage(bodies):
 
 
 def rotation_inputs(joint_types, axes):
-    """Return, for each input of the first release's networks, how it is made from today's inputs.
+    """Return (joint, index, sign, constant) per input of the first release's networks.
 
-    The first release had nine numbers per rotation. A tuple is: joint, index of today's input, its sign (0: none), and
-    a constant.
+    The input equals sign * (current input `index`) + constant, and depends on `joint`. The first release had nine
+    inputs per rotation.
     """
     n, inputs = len(joint_types), []
     for joint, kind in enumerate(joint_types):
@@ -349,7 +348,7 @@ def network_of_first_stage(network, inputs, generator):
             weight.zero_()
             for (joint, now, sign, constant), column in zip(inputs, drawn.unbind(1), strict=True):
                 if sign:
-                    # basis functions of -x are the ones of x in reverse order
+                    # basis functions at -x equal the basis functions at x in reverse order
                     weight[:, now] += column.flip(-1) if grid and sign < 0 else column * (1 if grid else sign)
                 elif grid:
                     bumps = torch.exp(-((constant / (2 / 3) - network.grid) ** 2))

@@ -45,7 +45,7 @@ ALONE = Alone()
 
 @pytest.fixture
 def hybrid(robots):
-    """Return a hybrid model with functions of single joints and without networks, whose fits take longer."""
+    """Return a hybrid model with functions of single joints and without networks, which would take longer to fit."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     model.residuals.potential = model.residuals.mass = None
     return model
@@ -91,7 +91,7 @@ def test_samples_next_to_a_held_out_block_are_not_fitted(hybrid):
 def test_a_function_must_lower_the_error_of_the_last_half(hybrid):
     """A function that is fitted to the first half must also lower the error in the last half.
 
-    The mean of both halves would lower the error in all ten blocks.
+    With 0.45 of the torque in the last half, it would raise the error there (refused); with 0.75 it lowers the error.
     """
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
@@ -129,7 +129,7 @@ def test_an_error_reduction_in_one_of_ten_blocks_is_not_significant(hybrid):
     noise = torch.randn(4000, 2, generator=torch.Generator().manual_seed(0)).double()
     noise[:, 1] = 0.0
     found = select_functions(hybrid, samples(everywhere + 0.1 * noise, q), ALONE, [], *data(1.0, len(q)))
-    # the best of the functions that explain the residual of joint 1 is selected, and none for joint 2, which has none
+    # joint 1: only the best of several functions is selected; joint 2 has no residual and gets no function
     assert [(residual.name, residual.joint) for residual in found] == [("raw_torque_splines", 0)]
     # the same torque in only one of ten blocks is not selected: it lowers the held-out error of one block at most
     once = everywhere * (torch.arange(4000) < 400).unsqueeze(-1)
@@ -152,7 +152,7 @@ def test_a_block_beyond_the_range_of_others_does_not_prevent_selection():
 
 
 def test_a_network_is_fitted_to_the_residual_of_functions_of_joints(robots, monkeypatch):
-    """Networks are fitted to the residual that functions of single joints leave, not to the whole residual."""
+    """Networks are fitted to the residual after functions of single joints, not to the whole residual."""
     model = build(robots / "two_link.urdf", "hybrid", width=8)
     torch.nn.init.constant_(model.residuals.raw_torque_splines, 3.0)
     left = []
@@ -183,7 +183,7 @@ def test_an_error_reduction_must_exceed_its_scatter():
 def test_repeated_samples_count_once():
     """Repeated samples with equal errors are counted once by the Bayesian ridge regression.
 
-    Twenty copies of each sample, with this correlation length, give the estimate of one copy.
+    Twenty copies of each sample, with a correlation length of 20, give the estimate of one copy.
     """
     draw = torch.Generator().manual_seed(0)
     x = torch.randn(300, 4, generator=draw).double()
@@ -249,7 +249,7 @@ def test_the_first_noise_is_that_of_least_squares(correlation):
     count, deviations = 400, torch.tensor([0.5, 0.01]).double()
     x = torch.randn(count, 3, generator=draw).double()
     measured = deviations * torch.randn(count, 2, generator=draw).double()
-    # this part of the torque is a multiple of a regressor column, and so no noise
+    # this part of the torque is a multiple of a regressor column, so it does not count as noise
     measured[:, 0] += 7.0 * x[:, 1]
     jacobian = object.__new__(torque_jacobian.TorqueJacobian)
     slopes = ((0, torch.arange(3), x, measured[:, 0]), (1, torch.arange(0), x[:, :0], measured[:, 1]))
@@ -321,9 +321,9 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 
 def test_noise_is_at_most_the_largest_error():
-    """The estimated noise is limited by the largest error: 2 Nm instead of a residual of 5 Nm at joint 1.
+    """The estimated noise is at most `max_error`: 2 Nm at joint 1, although the residual is 5 Nm.
 
-    Joint 2 has a residual of 1 Nm, below its largest error. Each noise is multiplied by sqrt(correlation length).
+    Joint 2 has a residual of 1 Nm, below its `max_error`. Each noise is multiplied by sqrt(correlation length).
     """
     columns = torch.tensor([[5.0, 5.0], [10.0, 10.0], [2.0, 2.0]]).double()
     estimator = torque_problem.NoiseEstimator(50, *columns)
@@ -343,7 +343,7 @@ def test_noise_is_estimated_per_joint():
 def test_noise_is_corrected_for_degrees_of_freedom():
     """The noise is corrected for the degrees of freedom of the fit.
 
-    Of ten independent errors, four determined parameters leave six, and twenty leave one.
+    With ten independent errors, the squared residual is divided by 6 for four parameters, by 1 for twenty parameters.
     """
     estimator, squares = (
         torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
@@ -387,7 +387,7 @@ def test_no_step_of_a_servo_joint_raises_its_cost():
 def test_friction_of_two_directions_is_their_mean_in_mujoco(robots):
     """MJCF has one friction loss per joint: the mean of the magnitudes in both directions.
 
-    Of 1 Nm forward and 3 Nm backward it is 2 Nm.
+    For friction of 1 Nm forward and 3 Nm backward, it is 2 Nm.
     """
     arm = load_arm(robots / "two_link.urdf")
     learned = rigid_body_projection(build(arm, "closed-form"), arm)
@@ -421,7 +421,7 @@ def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, unlikely):
 def test_a_friction_state_must_lower_the_residual_in_most_blocks():
     """A friction state must lower the squared residual in most blocks of a log.
 
-    For joint 1 it is a third in each block; for joint 2 a hundredth, but in two of ten blocks only.
+    At joint 1 it lowers the squares to 1/3 in each block (accepted), at joint 2 to 1/100 in two of ten (refused).
     """
     other = torch.ones(1000, 2).double()
     residual = other.clone()

@@ -130,7 +130,7 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # the curves are compared relative to kp: the model's Stribeck velocity belongs to another form of the curve
+    # friction / kp is compared as a curve over velocity, as model and simulator have different Stribeck formulas
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -252,7 +252,7 @@ def servo_truth(servos, q):
 
 
 def servo_values(q):
-    """Return the function from a model to gravity / kp at q (T, 2) and the elbow's inertia / kp."""
+    """Return a function of a model: gravity / kp at q (T, 2), and the elbow's inertia / kp."""
 
     def values(model):
         kp, position = model.servo.kp(), torch.from_numpy(q)
@@ -265,7 +265,7 @@ def servo_values(q):
 def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
     """Intervals of a servo fit contain the true values, also if the URDF's masses are 20 % wrong.
 
-    The second arm has other servos, too.
+    One fit has the URDF of the simulated arm; the other has wrong masses, and its logs other servos.
     """
     other = Servos((10.0, 6.0), (0.5, 0.6), (0.02, 0.02), (0.08, 0.1), delay=0.015)
     heavy = spelgen.build(arm, "closed-form")
@@ -308,7 +308,7 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             stated = posterior.drives[name][k]
             value, high = joint[ratio]["value"], joint[ratio]["high"]
             assert stated.value == pytest.approx(value)
-            # the recorded interval is of the logarithm, and includes 3 % of the delay in the lag
+            # not equal: the record has the interval of the logarithm, and for the lag includes 3 % of the delay
             assert 0.5 < (stated.high - value) / (high - value) < 1.05
     with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
         posterior.torque(*np.zeros((3, 1, 2)))
@@ -359,7 +359,7 @@ def test_exports_contain_the_servos(fitted, arm, tmp_path, monkeypatch):
     assert "dead zones are left out" in spelgen.export(fitted, to="mjcf").files[".xml.README.md"].decode()
     files = spelgen.export(
         fitted, to="c"
-    ).files  # the export compares the C with the model, where there is a compiler
+    ).files  # the export compares the C with the model, if there is a compiler
     assert b"servo_arm_servo_torque(\n    const servo_arm_real u[SERVO_ARM_N]" in files["servo_arm.h"]
 
 

@@ -116,7 +116,7 @@ def test_anomalous_commands_are_reported(arm, logs, columns, code):
 
 def test_errors_at_rest_are_reported(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
-    # largest errors at rest that dry friction and gravity cause, in ratio to kp
+    # error at rest: up to (dry friction + gravity torque) / kp
     assert 0.3 * 0.15 / 14 < shoulder.following.steady_state_error < (0.15 + 0.9) / 14
     assert 0.3 * 0.08 / 9 < elbow.following.steady_state_error < (0.08 + 0.16) / 9
 
@@ -163,7 +163,7 @@ DEGREES = LogMapping.model_validate({"input": "position", "units": {"q": "deg"}}
 
 @pytest.mark.parametrize("seed", range(4))
 def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, logs, seed):
-    # encoder counts of each motor's calibrated range
+    # encoder counts of each motor's calibrated range, to which 200 normalised units correspond
     counts = np.random.default_rng(seed).integers(1100, 2600, 2)
     step = np.radians(200 / counts)
     wrong = changed(logs, q=lambda x: np.round(x.q / step) * step, mapping=lambda x: DEGREES)
@@ -188,7 +188,7 @@ def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm
 
 
 def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
-    # positions and commands are both converted from degrees, so that the commands look nearly constant
+    # the mapping states degrees for positions and commands: commands in rad, converted too, are nearly constant
     small = changed(logs, u=lambda x: np.radians(x.u))
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     assert len(errors) == 1

@@ -123,7 +123,7 @@ class TestFriction:
         np.testing.assert_allclose(friction(qd), [[1.0 + 0.4], [-1.0 - 0.9], [0.0]], atol=1e-14)
 
     def test_it_never_drives_and_has_no_kink(self):
-        # the largest possible difference between both directions of motion
+        # no friction in the positive direction: the largest possible difference between directions
         joint = JointSettings(coulomb=(0.0, -1.0))
         friction = make_friction(slider(), Settings(joints={"a": joint}))
         qd = np.linspace(-0.5, 0.5, 100_001)[:, None]

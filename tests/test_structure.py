@@ -1,4 +1,4 @@
-"""The derived structure of the robots is the known one; its cost grows slowly with joints."""
+"""The derived structure of the project's robots is correct; the time to derive it grows slowly with joints."""
 
 from fractions import Fraction
 
@@ -88,9 +88,9 @@ def test_generic_arms_follow_the_formula(joints, seed):
 
 
 def test_edo_by_singular_values(shared):
-    """Joints 1-3 of edo have eleven outputs, as singular values show, of which the eleventh is 1e-10 small.
+    """Joints 1-3 of edo have eleven outputs: eleven singular values of samples of M are not zero.
 
-    The tolerance of the reference data counts ten.
+    The eleventh is only 1e-10 of the first: with their tolerance, the reference data count ten.
     """
     joints = [f"joint_{k}" for k in range(1, 7)]
     arm = make_arm(read_urdf(shared / "arms" / "edo.urdf"), joints=joints)

@@ -145,7 +145,7 @@ PUBLIC = {
 def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_taken(scara, tmp_path, source):
     """If a log has several signals of a quantity, the mapping takes the measured one of the joints.
 
-    Column names are the ones of public recordings, with set points, tool forces and estimates of similar names.
+    Column names are from public recordings; set points, tool forces and estimates have similar names.
     """
     clock, *measured, others = PUBLIC[source]
     names = [*measured, *others.split()]
@@ -293,7 +293,7 @@ def test_times_without_a_known_name_are_found_by_their_steps(scara, tmp_path, sc
 @pytest.mark.parametrize(("first", "second"), [("left_", "right_"), ("robot1/", "robot2/")])
 @pytest.mark.parametrize("form", ["{}{}_{}", "{}{}{}"])
 def test_columns_of_two_arms_are_refused(scara, tmp_path, first, second, form):
-    """A draft never takes the columns of one of two arms that both fit the URDF."""
+    """If a log has columns of two arms that both fit the URDF, no mapping is drafted; the error names both arms."""
     joints = [x.name for x in scara.chain.coordinates] if "_" in form else range(4)
     head = [
         "t",

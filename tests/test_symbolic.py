@@ -15,7 +15,7 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """Outputs, constants and relations of the structure equal the ones of the exact polynomials' coefficients."""
+    """Outputs, constants and relations of the structure agree with the coefficients of the exact polynomials."""
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
 
@@ -55,7 +55,7 @@ def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
 
 
 def _rank(vectors: list[dict]) -> int:
-    # many monomials have equal coefficient vectors, and distinct vectors are enough for the rank
+    # many monomials have equal coefficient vectors; repeated vectors do not change the rank and are omitted
     distinct = {tuple(sorted((index, str(value)) for index, value in v.items())): v for v in vectors}
     if not distinct:
         return 0
@@ -70,7 +70,7 @@ def _joints_of(polynomial, n: int) -> set[int]:
 def test_two_link_is_the_papers_equation_20(robots):
     """The polynomials of two_link are eq. 20 of the paper: M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]].
 
-    Links have one metre, and the mass is at half of it.
+    Each link is 1 m long, with its centre of mass in the middle.
     """
     true = polynomials(load_arm(robots / "two_link.urdf").chain, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {

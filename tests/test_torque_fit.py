@@ -131,9 +131,9 @@ def test_the_prior_shares_what_joints_share():
 
 
 def test_the_prior_shares_each_element_of_bristles():
-    """The prior of bristle fractions has a part per element that all joints share, independent of other elements.
+    """The prior covariance of bristle fractions has a common part of all joints for each element of the bristles.
 
-    There are three elements at two joints.
+    Different elements are independent. Shown for three elements at two joints.
     """
     prior = GaussianPrior(fractions=0.5, shared_fractions=2.0)
     found = prior_covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
@@ -288,9 +288,9 @@ def test_a_fit_is_as_good_as_least_squares_for_any_urdf(emitted, robots, tmp_pat
 
 
 def test_torques_that_no_bodies_have_are_named(emitted, monkeypatch):
-    """Torques that no physically consistent bodies have, such as negative inertia at one joint, are named.
+    """Torques that no physically consistent bodies can cause, here by a negative inertia at a joint, give a warning.
 
-    Ridge regression explains these torques. Its held-out error bounds the noise of the second and third fit.
+    Ridge regression explains these torques, so two more fits follow, with noise bounded by its held-out error.
     """
     bounds, staged_fit = [], torque_fit._staged_fit
 
@@ -608,7 +608,7 @@ def test_a_run_is_adapted_to_a_load(run, emitted, tmp_path):
 
 
 def sparse(model):
-    """Return logs at 20 Hz, at which accelerations cannot be computed, of a model's motion."""
+    """Return logs of a model's motion at 20 Hz, a rate too low to compute accelerations."""
     samples = (recorded(model, 5.0, 0.0, seed=seed) for seed in range(2))
     return [
         Trajectory(0.05 * np.arange(100), *(getattr(x, k)[:500:5] for k in ("q", "qd", "tau")))
@@ -766,7 +766,7 @@ def test_a_subset_of_many_samples_is_fitted_first(emitted, monkeypatch):
 def test_negligible_friction_does_not_vary_with_position(robots):
     """Friction that varies with position is selected only if friction itself is not negligible.
 
-    The same torque is 30 % of the friction of one model, and far more than ten times the friction of the other.
+    A position-dependent residual of 0.3 Nm is selected with friction of 1 Nm, and not with friction of 1e-9 Nm.
     """
     t = torch.linspace(0, 60, 1200).double()[:, None] * torch.tensor([1.1, 1.7])
     noise = 0.01 * torch.randn(t.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -786,7 +786,7 @@ def test_negligible_friction_does_not_vary_with_position(robots):
 def test_a_spring_that_bodies_could_absorb_is_found(emitted, robots):
     """A spring is found although rigid bodies can explain much of the spring's torque in few logs.
 
-    In other logs the bodies explain nothing of this torque.
+    In the test log, the bodies fitted without a spring do not predict this torque.
     """
     true, joint = drawn(emitted["six_dof"][0], seed=3, deviation=0.3), 4
     stiffness = 2 * recorded(true, 3.0, 0.0).tau[:, joint].std()
@@ -883,7 +883,7 @@ def test_a_model_states_its_residual_terms(robots):
 def test_functions_of_a_joint_and_bodies_are_fitted_together(emitted, robots):
     """Residual terms and rigid bodies are fitted together: varying friction, ripple, and a spring like gravity.
 
-    Fitted by turns, each would explain the torque of others.
+    Fitted one after the other, each term would explain torque of the other terms.
     """
     true = drawn(emitted["six_dof"][0], seed=3, deviation=0.3)
     scale = recorded(true, 20.0, 0.0).tau.std(axis=0)

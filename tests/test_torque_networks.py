@@ -1,4 +1,4 @@
-"""Networks fitted to torques reproduce an arm that they can represent to many digits."""
+"""If networks can represent an arm exactly, networks fitted to its torques reproduce it to many digits."""
 
 import torch
 from emitted import NETWORKS, ROBOTS, built, import_source

@@ -51,7 +51,7 @@ def recordings(loaded):
 
 
 def test_the_protocol_is_the_papers(loaded):
-    """The protocol is the paper's: six PID controllers on sines of 30 degrees at 1/8 Hz.
+    """The settings have the simulation of the paper: six PID controllers on sines of 30 degrees at 1/8 Hz.
 
     There are 24,000 samples at 500 Hz, 70 % of them for training; the controller has 125 Hz.
     """
@@ -75,7 +75,7 @@ def test_the_arm_follows_its_sines_to_a_few_degrees(recordings):
 
 @pytest.mark.parametrize("choice", ["same", "own"])
 def test_trajectories_follow_one_path_or_each_its_own(loaded, choice):
-    """Trajectories follow one path with different starts, so that they overlap, or each its own path."""
+    """With paths "same", trajectories start at different times of one path and overlap; otherwise each has its own."""
     settings = changed(loaded.settings, {"paths": choice})
     period = 1 / settings.tracking.frequency
     begun = paths(loaded.chain, settings, np.array([0.0, 2 / 6 * period]))

@@ -113,9 +113,9 @@ class TestValues:
         assert "missing-robot-name" in [each.code for each in robot.diagnostics]
 
     def test_values_equal_those_of_yourdfpy(self, shared):
-        """Limits, axes, mimic relations and masses equal the ones of yourdfpy.
+        """Limits, axes, mimic relations and masses equal the values of the URDF reader yourdfpy.
 
-        Its origins are matrices, and its absent inertias are 1.0: both are not compared.
+        Not compared: origins, which are matrices in yourdfpy, and absent inertias, for which it has 1.0.
         """
         yourdfpy = pytest.importorskip("yourdfpy")
         options = {"load_meshes": False, "build_scene_graph": False}

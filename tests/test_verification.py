@@ -100,7 +100,7 @@ def test_same_seed_same_proof(rpr, true):
 
 
 def test_a_negative_mass_leaves_the_reading_undecided(robots, tmp_path):
-    """Pinocchio reads a negative mass as other numbers: this is no contradiction, and no defect to report."""
+    """With a negative mass, which Pinocchio reads differently, the comparison is "undecided", not a contradiction."""
     path = tmp_path / "arm.urdf"
     text = (robots / "rpr.urdf").read_text()
     path.write_text(re.sub('<mass value="', '<mass value="-', text, count=1))

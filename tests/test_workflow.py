@@ -26,7 +26,10 @@ def spelgen(*arguments):
 
 
 def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
-    """Run build, simulate, train and evaluate without options, in another folder than the URDF's."""
+    """Run build, simulate, train and evaluate with default options, outside of the URDF's folder.
+
+    judged: whether predictions are evaluated, too (without --quick).
+    """
     elsewhere = folder / "robots of others"
     elsewhere.mkdir()
     copied = elsewhere / urdf.name
@@ -48,7 +51,7 @@ def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
 @pytest.mark.parametrize("name", OWN)
 def test_every_command_works_for_the_robots_here(name, robots, tmp_path, monkeypatch):
     settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
-    # the simulated inputs are the ones of the settings, for a shorter time
+    # simulated inputs as in the settings, but for a shorter time
     settings.pop("tracking", None)
     driven = "inputs" in settings["simulation"]
     settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT
