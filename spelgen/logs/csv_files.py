@@ -32,8 +32,8 @@ NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#IN
 NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
 
 
-# [B] size of the head of a file, from which names, encoding, delimiter and decimal point are detected. It is as large as
-# the largest cell that the module csv reads.
+# [B] size of the head of a file, from which names, encoding, delimiter and decimal point are detected. It is as large
+# as the largest cell that the module csv reads.
 HEAD = 2**17
 # Character sets of spreadsheets, the most frequent first.
 CHARACTER_SETS = ("latin-1", "cp932", "gb18030", "cp949", "cp1251")
