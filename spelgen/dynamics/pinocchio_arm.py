@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -27,11 +28,27 @@ def arm_dynamics(
 def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
     """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
 
-    The armature is the rotor inertia on the joint side. Raises ArmError if a body has no <inertial>, or negative mass,
-    for which Pinocchio returns meaningless numbers.
+    The armature is the rotor inertia on the joint side. Raises the errors of `require_inertials`.
+    """
+    require_inertials(arm)
+    model = kinematic_model(arm)
+    # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
+    for index, body in enumerate(arm.bodies, start=1):
+        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
+    # A mimic joint has no motor of its own, and therefore no armature.
+    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
+    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
+    return model
+
+
+def require_inertials(arm: Chain, file: Path | None = None) -> None:
+    """Raise ArmError if a body has no <inertial>, or negative mass, for which Pinocchio returns meaningless numbers.
+
+    file: path of the URDF, for the error.
     """
     error = partial(
         ArmError,
+        file=file,
         expected="mass, center of mass and inertia of each moving body",
         do="write estimates into the URDF; a model that is trained on logs needs none",
     )
@@ -41,14 +58,6 @@ def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
         name: f"a body of {value:g} kg" for name, value in mass.items() if value is not None and value < 0
     }
     collect([error(got, element=f"joint {name!r}") for name, got in faults.items()])
-    model = kinematic_model(arm)
-    # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
-    for index, body in enumerate(arm.bodies, start=1):
-        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
-    # A mimic joint has no motor of its own, and therefore no armature.
-    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
-    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
-    return model
 
 
 def kinematic_model(arm: Chain) -> pin.Model:

@@ -406,6 +406,9 @@ def _backward_times(rows: Rows) -> LogError:
     got = f"t = {t[k + 1]:g} s after {t[k]:g} s ({counted(backward.size, 'such step')}, this is the first)"
     clock = rows.layout.columns[0]
     do = f"number the recordings, in Python: log['trajectory'] = (log['{clock}'].diff() < 0).cumsum()"
+    if 2 * backward.size > len(t):
+        got = f"times that fall from {t[0]:g} s to {t[-1]:g} s, such as the time that remains"
+        do = "write 'sample_rate: HZ' under 'logs' in the robot's YAML if the rows are evenly spaced"
     return rows.layout.row_error(got, rows.numbers[k + 1], clock, "increasing times", do)
 
 
