@@ -94,8 +94,8 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "joints:\n  a: {rotor_inertia: 1 kg m2}",
-            "arm.yaml:2: joints.a.rotor_inertia: got '1 kg m2', expected a number; write the number only, with a decimal "
-            "point; docs/settings.md has its unit",
+            "arm.yaml:2: joints.a.rotor_inertia: got '1 kg m2', expected a number; write the number only, with a "
+            "decimal point; docs/settings.md has its unit",
         ),
         (
             "joints:\n  a:{gear: 1}",

@@ -159,6 +159,10 @@ def test_times_that_fall_are_called_so(scara, tmp_path):
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
     with pytest.raises(LogError, match=r"got times that fall from .*write 'sample_rate: HZ'"):
         read_logs(path, scara)
+    # Rows in reverse order are sorted, also without velocities.
+    path = written(path, head, np.column_stack([T, Q, QD, TAU])[::-1])
+    for mapping in ({}, {"velocity": "differentiated"}):
+        np.testing.assert_array_equal(read_logs(path, scara, mapping)[0].q, Q)
 
 
 @pytest.mark.parametrize("file", ["struct.mat", "flat.mat", "dict.npy"])
