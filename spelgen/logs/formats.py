@@ -42,10 +42,10 @@ CONVERT = {
         "json.dumps(x) + chr(10) for x in yaml.load_all(open('{0}'), yaml.CSafeLoader) if x)"
     )),
     ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
-    # A .npy file of a dict is a pickle, which is loaded only if the user trusts it.
+    # A .npy file of a dict is a pickle, which is loaded only with a warning.
     ".npy with a dict": _PYTHON.format(
         "numpy; numpy.savez('{1}.npz', **numpy.load('{0}', allow_pickle=True).item())"
-    ) + ' (only a file that you trust: pickles may contain code)',
+    ) + ' (only a file of a known source: pickles may contain code)',
     # JSON has the fields of structs, as x.q; NPZ would have them as Python objects.
     ".mat": _PYTHON.format(
         "json, scipy.io; json.dump(scipy.io.loadmat('{0}', simplify_cells=True), open('{1}.json', 'w'), "

@@ -256,7 +256,7 @@ def _group_with(group: type[BaseModel], key: str, place: str = "") -> str | None
     for name, field in group.model_fields.items():
         inner = _first_group(field.annotation)
         of_joint = ": NAME" if str(field.annotation).startswith("dict") else ""
-        found = inner and _group_with(inner, key, f"{place}: {name}{of_joint}".removeprefix(": "))
+        found = _group_with(inner, key, f"{place}: {name}{of_joint}".removeprefix(": ")) if inner else None
         if found is not None:
             return found
     return None
