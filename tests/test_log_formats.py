@@ -643,6 +643,14 @@ FORMS = {
         *(f"{x},0" for x in lines[1:]),
     ],
     "a line of units": lambda lines: [lines[0], UNIT_LINE, *lines[1:]],
+    "units above the header": lambda lines: [UNIT_LINE, *lines],
+    "units in a comment": lambda lines: ["# arm 3", f"# {UNIT_LINE}", *lines],
+    "descriptions below units": lambda lines: [
+        lines[0],
+        UNIT_LINE,
+        *[",".join(["measured"] * 7)],
+        *lines[1:],
+    ],
     "the header twice": lambda lines: [lines[0], *lines],
     "comments and units": lambda lines: ["# arm 3", lines[0], UNIT_LINE, *lines[1:]],
     "decimal commas in quotes": lambda lines: [
@@ -680,6 +688,36 @@ def test_the_cut_last_line_of_a_csv_is_left_out(tmp_path):
     (tmp_path / "x.csv").write_text("\n".join([*lines[:3], lines[3][:9], *lines[4:]]))
     with pytest.raises(LogError, match=r"x\.csv:4: got \d values \(.*\), expected 7, as in the header"):
         read_logs(tmp_path / "x.csv", JOINTS)
+
+
+def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path):
+    (tmp_path / "x.csv").write_text(f"{text_log()}\nSamples: 4\nDuration: 3 s\n")
+    (found,) = read_logs(tmp_path / "x.csv", JOINTS)
+    check(found, "x")
+    assert found.remarks == ("the last 2 lines are no rows and were left out: Samples: 4",)
+
+
+@pytest.mark.parametrize("place", ["above", "below", "comment"])
+def test_a_line_of_units_counts_at_each_place_beside_the_header(tmp_path, place):
+    """A unit that a line above or below the header states is never read as an SI unit."""
+    lines = text_log().splitlines()
+    units = UNIT_LINE.replace("Nm", "mNm")
+    head = {"above": [units, lines[0]], "below": [lines[0], units, "measured" + ",measured" * 6]}
+    lines = [*head.get(place, [f"# {units}", lines[0]]), *lines[1:]]
+    (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(LogError, match=r"write .units: \{tau: mNm\}"):
+        read_logs(tmp_path / "x.csv", JOINTS)
+
+
+@pytest.mark.parametrize("appended", ["", "\ufeff"])
+def test_each_part_of_an_appended_file_has_its_own_lines_of_units(tmp_path, appended):
+    lines = text_log().splitlines()
+    part = "\n".join([lines[0], UNIT_LINE, *lines[1:]]) + "\n"
+    (tmp_path / "x.csv").write_text(part + appended + part, encoding="utf-8")
+    found = read_logs(tmp_path / "x.csv", JOINTS)
+    assert [x.name for x in found] == ["1", "2"]
+    for x in found:
+        np.testing.assert_array_equal(x.q, found[0].q)
 
 
 def test_a_cell_that_is_no_number_is_reported_with_its_row(tmp_path):
@@ -950,7 +988,7 @@ def test_vectors_of_matlab_and_conversions_of_other_files(tmp_path, monkeypatch)
     scipy.io.savemat("m.mat", columns(t=T[:, None]))
     np.save("n.npy", np.column_stack([T, Q, QD, TAU]))
     Path("t.txt").write_text(text_log())
-    for name, log in (("m.mat", "m.npz"), ("n.npy", "n.csv"), ("t.txt", "t.csv")):
+    for name, log in (("m.mat", "m.json"), ("n.npy", "n.csv"), ("t.txt", "t.csv")):
         with pytest.raises(LogError, match="; convert it: ") as caught:
             read_logs(name, JOINTS)
         command = str(caught.value).split("convert it: ")[1].replace("python", sys.executable)

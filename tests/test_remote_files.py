@@ -69,7 +69,8 @@ def test_local_removal_removes_the_remote_file(robots, memory):
     run = RunFolder("memory://old/run")
     assert run.config.read_text() == "{}"
     spec = make_spec(robots / "two_link.urdf", "closed-form")
-    run.start(spec, None, force=True)
+    with run.started(spec, None, force=True):
+        pass
     assert memory.find("/old/run") == ["/old/run/spec.json"]
     assert run.read_spec() == spec
 

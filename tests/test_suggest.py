@@ -1,16 +1,20 @@
 """A mapping that is suggested from column names reads the log with its original values."""
 
 import csv
+import subprocess
+import sys
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+import scipy.io
 from typer.testing import CliRunner
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import LogError
+from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
 
@@ -79,6 +83,108 @@ def test_derivatives_of_positions_are_velocities(scara, tmp_path, derivative):
     found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
     require_same(found)
     assert "differentiated" not in text
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"),
+    [
+        ("cp932", ("時刻[ms]", "関節{}位置", "関節{}速度", "関節{}トルク")),
+        ("gb18030", ("时间[ms]", "关节{}位置", "关节{}速度", "关节{}力矩")),
+        ("cp949", ("시간[ms]", "관절{} 위치", "관절{} 속도", "관절{} 토크")),
+        ("cp1251", ("время [ms]", "положение {}", "скорость {}", "момент {}")),
+        ("latin-1", ("tiempo [ms]", "posición {}", "velocidad {}", "par {}")),
+    ],
+)
+def test_names_of_columns_may_be_in_any_character_set_of_spreadsheets(scara, tmp_path, encoding, words):
+    clock, *names = words
+    head = [clock, *(name.format(k) for name in names for k in range(1, 5))]
+    path = written(tmp_path / "log.csv", head, np.column_stack([1000 * T, Q, QD, TAU]))
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    require_same(suggested(path, scara)[0])
+
+
+@pytest.mark.parametrize("form", ["columns", "matrices"])
+@pytest.mark.parametrize(("state", "torque"), [("x", "u"), ("state", "tau"), ("obs", "u")])
+def test_a_state_of_positions_and_velocities_is_recognised_by_its_values(
+    scara, tmp_path, form, state, torque
+):
+    """A draft assigns the last half of a state [q; qd] to the velocities; its names do not state them."""
+    if form == "matrices":
+        path = tmp_path / "log.npz"
+        np.savez(path, **{"t": T, state: np.column_stack([Q, QD]), torque: TAU})
+    else:
+        head = ["t", *(f"{state}{k}" for k in range(8)), *(f"{torque}{k}" for k in range(4))]
+        path = written(tmp_path / "log.csv", head, np.column_stack([T, Q, QD, TAU]))
+    require_same(suggested(path, scara)[0])
+
+
+@pytest.mark.parametrize("form", ["two matrices", "one matrix"])
+def test_matrices_of_two_arms_are_refused(scara, tmp_path, form):
+    arrays = {"q": np.column_stack([Q, -Q]), "tau": np.column_stack([TAU, TAU])}
+    if form == "two matrices":
+        arrays = {"left_q": Q, "left_tau": TAU, "right_q": -Q, "right_tau": TAU}
+    np.savez(tmp_path / "log.npz", t=T, **arrays)
+    with pytest.raises(LogError, match=r"got (positions of 2 arms|8 columns of positions that change)"):
+        suggest_mapping(tmp_path / "log.npz", scara.chain.joint_names)
+
+
+def test_units_and_clocks_in_the_middle_of_names(scara, tmp_path):
+    """A unit may precede a number, and a stamp may be called nanos; torques of disturbances are not torques."""
+    head = ["stamp_seconds", "stamp_nanos", *(f"q{k}/°" for k in range(4))]
+    head += [f"{name}_{k}" for name in ("speed", "load_0.1%", "DistTrq") for k in range(4)]
+    whole = np.floor(1.7e9 + T)
+    rows = np.column_stack([whole, 1e9 * (1.7e9 + T - whole), np.degrees(Q), QD, 10 * TAU, 7 * TAU])
+    path = written(tmp_path / "log.csv", head, [[int(x) for x in row[:2]] + row[2:].tolist() for row in rows])
+    text = suggest_mapping(path, scara.chain.joint_names).text
+    assert '"tau": "0.1 percent"' in text
+    assert '"q": "deg"' in text
+    assert "stamp_seconds + stamp_nanos" in text
+
+
+def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
+    late = T + 0.004 * np.random.default_rng(0).random(len(T))
+    ticks = [134_000_000_000_000_000 + round(1e7 * t) for t in T]
+    head = ["host_time", "robot_time", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = np.column_stack([Q, QD, TAU]).tolist()
+    path = written(tmp_path / "log.csv", head, [[a, b, *x] for a, b, x in zip(late, T, rows, strict=True)])
+    require_same(suggested(path, scara)[0])
+    path = written(
+        tmp_path / "log.csv", ["time", *head[2:]], [[b, *x] for b, x in zip(ticks, rows, strict=True)]
+    )
+    found, text = suggested(path, scara)
+    require_same(found)
+    assert '"0.1 us"' in text
+
+
+def test_times_that_fall_are_called_so(scara, tmp_path):
+    """The error about the time that remains does not advise to make a recording of each row."""
+    head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in scara.chain.joint_names)]
+    path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
+    with pytest.raises(LogError, match=r"got times that fall from .*write 'sample_rate: HZ'"):
+        read_logs(path, scara)
+    # Rows in reverse order are sorted, also without velocities.
+    path = written(path, head, np.column_stack([T, Q, QD, TAU])[::-1])
+    for mapping in ({}, {"velocity": "differentiated"}):
+        np.testing.assert_array_equal(read_logs(path, scara, mapping)[0].q, Q)
+
+
+@pytest.mark.parametrize("file", ["struct.mat", "flat.mat", "dict.npy"])
+def test_files_of_matlab_and_pickles_are_converted_by_the_printed_command(scara, tmp_path, file):
+    """The command converts structs and dicts, too; a pickle only with a warning. MATLAB 7.3 files are HDF5."""
+    arrays = {"t": T, "q": Q, "qd": QD, "tau": TAU}
+    if file == "dict.npy":
+        np.save(tmp_path / file, arrays, allow_pickle=True)
+    else:
+        scipy.io.savemat(tmp_path / file, {"log": arrays, "robot": "x"} if file == "struct.mat" else arrays)
+    (error,) = log_files(tmp_path / file)[1]
+    command, _, warning = str(error.do).removeprefix("convert it: ").partition('" (')
+    assert ("pickles" in warning) == (file == "dict.npy")
+    subprocess.run([sys.executable, "-c", command.split('"')[1]], check=True)
+    suffix = ".npz" if file == "dict.npy" else ".json"
+    require_same(suggested((tmp_path / file).with_suffix(suffix), scara)[0])
+    (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(600))
+    (error,) = log_files(tmp_path / "new.mat")[1]
+    assert "h5py" in str(error.do)
 
 
 def test_rows_without_times_get_a_rate_to_write(scara, tmp_path):

@@ -140,13 +140,12 @@ class _Fitting:
         else:
             self.notes += objective.begin()
             # The run folder is written after `objective.begin` succeeded: logs that cannot be fitted create no run.
-            self.run.start(required_spec(request.model), request.urdf, force=request.options.force)
-            self._save()
-            mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
-            if mapping:
-                write_json(self.run.mapping, mapping)
-            # config.json is written last: a folder with this file has all files that a resumed fit needs.
-            write_json(self.run.config, self.record.to_dict())
+            with self.run.started(required_spec(request.model), request.urdf, force=request.options.force):
+                self._save()
+                mapping = self.record.mapping.model_dump(mode="json", exclude_defaults=True)
+                if mapping:
+                    write_json(self.run.mapping, mapping)
+                write_json(self.run.config, self.record.to_dict())
         status = self._run()
         model, checkpoint = request.model, Checkpoint.model_validate(objective.checkpoint())
         model.load_state_dict(checkpoint.best_weights)

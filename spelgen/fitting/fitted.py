@@ -191,10 +191,8 @@ class Fit:
 
         spec = required_spec(self.model)
         run = RunFolder(folder)
-        with locked(run.path):
-            run.start(spec, self.urdf, force=force)
+        with locked(run.path), run.started(spec, self.urdf, force=force):
             run.save(self.history, self.model.state_dict(), self.checkpoint.content)
-            # config.json is written last: a folder with this file has all files of a run.
             if self.baselines:
                 write_json(run.baseline, self.baselines)
             write_json(run.config, self.record.to_dict())
@@ -213,9 +211,9 @@ class Fit:
             return self.model.inverse_dynamics(*inputs).cpu().double().numpy()
 
     def __repr__(self) -> str:
-        end = f"{self.epochs} epochs, {self.result}"
-        if self.status:
-            end = f"{self.status} after {end}"
+        # A fit to torques has no epochs.
+        end = f"{self.status} after {self.epochs} epochs" if self.epochs else self.status
+        end = f"{end}, {self.result}" if end else self.result
         return f"<Fit of {self.record.robot!r} to {self.config.objective}: {end}>"
 
     def _repr_html_(self) -> str:

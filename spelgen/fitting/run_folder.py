@@ -2,7 +2,8 @@
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -55,11 +56,13 @@ class RunFolder:
             do = "--resume it, --force to replace it, or -o another"
             raise RunError("there is a run in this folder", file=self.path, do=do)
 
-    def start(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> None:
-        """Make the folder, write the specification, and copy the URDF and the settings of the robot.
+    @contextmanager
+    def started(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> Iterator[None]:
+        """Context manager that makes the folder, writes the specification, and copies the robot's URDF and settings.
 
         Files of a previous run are removed. A folder contains a run if it contains config.json, which the caller writes
-        last. Raises RunError if the folder contains a run and ``force`` is False.
+        last, so that a run has all files. If the caller is interrupted before, its files are removed. Raises RunError
+        if the folder contains a run and ``force`` is False.
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}
@@ -70,11 +73,17 @@ class RunFolder:
             content[self.settings] = settings.read_bytes()
         # The files are removed in the order of `__init__`. The first one is config.json, which marks the folder as a
         # run: if the removal is interrupted, the folder is not treated as a run.
-        for file in vars(self).values():
-            if file != self.path:
+        files = [x for x in vars(self).values() if x != self.path]
+        try:
+            for file in files:
                 remove(file)
-        for file, written in content.items():
-            write_bytes(file, written)
+            for file, written in content.items():
+                write_bytes(file, written)
+            yield
+        except BaseException:
+            for file in files:
+                remove(file)
+            raise
 
     def save(self, history: Sequence[Content], weights: Content, checkpoint: Content) -> None:
         """Write the history to metrics.jsonl, the best weights to model.pt, and the checkpoint to checkpoint.pt."""

@@ -64,8 +64,11 @@ class Interval:
 
     @property
     def text(self) -> str:
-        """The estimate and half the width of its 95 % interval, as in ``1.234 ± 0.056``."""
-        return f"{self.value:.4g} ± {self.half:.2g}"
+        """The estimate and half the width of its 95 % interval, as in ``1.234 ± 0.056``, with the same last digit."""
+        half = f"{self.half:.1e}"
+        # Adding 0 turns -0 into 0.
+        value = round(self.value, 1 - int(half[-3:])) + 0.0 if 0 < self.half < math.inf else self.value
+        return f"{value:.4g} ± {self.half:.2g}"
 
     def to_dict(self) -> dict[str, object]:
         """Return the estimate and its interval in JSON form."""

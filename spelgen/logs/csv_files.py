@@ -16,6 +16,7 @@ import pyarrow.csv
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
 from spelgen.logs.tables import STATED_KEY, LogTable
+from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number, stamps
 from spelgen.settings.log_mapping import PLAIN, LogMapping, is_unit, plain_unit
 
@@ -31,70 +32,76 @@ NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#IN
 NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
 
 
+# [B] size of the head of a file, from which names, encoding, delimiter and decimal point are detected. It is as large
+# as the largest cell that the module csv reads.
+HEAD = 2**17
+# Character sets of spreadsheets, the most frequent first.
+CHARACTER_SETS = ("latin-1", "cp932", "gb18030", "cp949", "cp1251")
+
+
 class Beginning(NamedTuple):
     """Beginning of a CSV file, up to the first row of values.
 
     Attributes:
-        encoding: text encoding of the file.
         delimiter: character between columns.
         names: names of the columns; for a file without a header, the values of its first row.
+        header: text of the header; for a file without a header, its first row.
         lines: number of lines before the first row of values: comments, the header, and lines such as units.
-        units: units of the columns, from a line below the header, in lower case; [] without such a line.
+        units: units of the columns, from a line above or below the header, in lower case; [] without such a line.
         rows: the first rows of values.
     """
 
-    encoding: str
     delimiter: str
     names: list[str]
+    header: str
     lines: int
     units: list[str]
     rows: str
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return the content of a CSV file as a list of one table; an incomplete last line is omitted, with a remark.
+    """Return a list with one table, the content of a CSV file; lines below the last row are omitted, with a remark.
 
     If the header is repeated between the rows, one table per recording is returned: a new recording begins at a header
     after which the times do not increase.
     """
-    table, header, cut = csv_table(file)
-    remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
-    is_text = table.num_columns and pa.types.is_string(table.schema.types[0])
-    is_repeated = is_text and pa.compute.index(table[0], table.column_names[0]).as_py() >= 0
-    if not is_repeated or mapping.columns.trajectory in table.column_names:
-        return [LogTable.of(table, mapping, remarks=remarks, header=header)]
+    content = _in_utf8(file.read_bytes())
+    # A line begins after the end of another one, or after the byte order mark of an appended file.
+    header = re.compile(re.escape(_beginning(content).header.encode()) + rb"(?=[\r\n])")
+    starts = [x.start() for x in header.finditer(content)]
+    starts = [0, *[x for x in starts if content[max(x - 1, 0) : x] in (b"", b"\n", b"\r", b"\xbf")][1:]]
     tables: list[tuple[pa.Table, int]] = []
-    text, last = _beginning(file), None
-    lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
-    starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
-    for start, stop in pairwise([*starts, len(lines) + 1]):
-        # A comment line "#" is added, so that the text is never empty: `csv_table` reads the whole file for an empty
-        # text.
-        segment, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
-        t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
-        times = segment[t].drop_null().to_pylist()
-        if not times:
-            continue
-        if tables and segment.schema == tables[-1][0].schema and times[0] > last:
-            start, segment = tables[-1][1], pa.concat_tables([tables.pop()[0], segment])
-        tables.append((segment, start))
-        last = times[-1]
+    remarks: tuple[str, ...] = ()
+    last, above = None, 0
+    for start, stop in pairwise([*starts, len(content)]):
+        segment, lines, remarks = csv_table(file, content[start:stop] if len(starts) > 1 else content)
+        if len(starts) > 1:
+            lines, above = lines + above, above + len(content[start:stop].splitlines())
+            t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
+            times = segment[t].drop_null().to_pylist()
+            if not times:
+                continue
+            is_labelled = mapping.columns.trajectory in segment.column_names
+            if tables and segment.schema == tables[-1][0].schema and (is_labelled or times[0] > last):
+                lines, segment = tables[-1][1], pa.concat_tables([tables.pop()[0], segment])
+            last = times[-1]
+        tables.append((segment, lines))
     return [
-        LogTable.of(x, mapping, remarks=remarks, header=start, recording=str(k) if len(tables) > 1 else None)
-        for k, (x, start) in enumerate(tables, start=1)
+        LogTable.of(x, mapping, remarks=remarks, header=lines, recording=str(k) if len(tables) > 1 else None)
+        for k, (x, lines) in enumerate(tables, start=1)
     ]
 
 
-def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tuple[pa.Table, int, str]:
-    """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
+def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[str, ...]]:
+    """Return the table of a CSV file, the number of lines before the values, and a remark on lines below the last row.
 
-    text: beginning of the file, None: it is read from the file. rows: lines of values of the file that become the
-    table, "": all lines are used.
+    content: content of the file, or a part that begins with a header, in UTF-8; b"": the file is read.
 
-    Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
-    may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
+    Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas. Files without
+    a header are accepted if `ros2 topic echo --csv` wrote them.
     """
-    text = text or _beginning(file)
+    content = content or _in_utf8(file.read_bytes())
+    text = _beginning(content)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
@@ -103,32 +110,28 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
     def skipped(row: pa.csv.InvalidRow) -> str:
         if not COMMENT.match(row.text):
             wrong.append(row)
-        return "skip" if len(wrong) < 2 else "error"
+        return "skip" if len(wrong) <= TUNING.ending else "error"
 
     # Two forms that Arrow cannot read are replaced: several spaces that align columns, by one space, and exponents of
     # Fortran (1.0D-02), by E.
     exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
     spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
-    skipped_lines = 0 if rows else text.lines
     if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
-        rows = re.sub(exponent, "E", rows or file.read_text(text.encoding))
-        rows = re.sub(spaces, "", rows, flags=re.MULTILINE)
-    # With one thread and the system's allocator, Arrow needs less memory and frees it after use. Reading 17 MB takes
-    # 0.02 s longer.
-    encoding = "utf-8" if rows else text.encoding
+        rows = re.sub(exponent, "E", content.decode())
+        content = re.sub(spaces, "", rows, flags=re.MULTILINE).encode()
+    # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
+    # costs 0.02 s for 17 MB.
     table = pa.csv.read_csv(
-        pa.BufferReader(rows.encode()) if rows else file,
-        pa.csv.ReadOptions(
-            use_threads=False, encoding=encoding, skip_rows=skipped_lines, column_names=names or text.names
-        ),
+        pa.BufferReader(content),
+        pa.csv.ReadOptions(use_threads=False, skip_rows=text.lines, column_names=names or text.names),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
     )
-    # Only the last line may be incomplete, as after a power failure of the recorder. Any other incomplete line is an
-    # error.
+    # Only lines below the last row may be incomplete, as after a power failure of the recorder, or have no values. Any
+    # other incomplete line is an error.
     for row in wrong:
-        if not len(table) or row.number <= skipped_lines + len(table):
+        if not len(table) or row.number <= text.lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
             expected = f"{row.expected_columns}, as in the header"
             raise LogError(got, file=file, line=row.number, expected=expected)
@@ -137,25 +140,34 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
     if text.units:
         units = dict(zip(text.names, text.units, strict=False))
         table = table.replace_schema_metadata({STATED_KEY: json.dumps(units)})
-    return table, text.lines, wrong[0].text if wrong else ""
+    if not wrong:
+        return table, text.lines, ()
+    ending = "line is cut off and was" if len(wrong) == 1 else f"{len(wrong)} lines are no rows and were"
+    return table, text.lines, (f"the last {ending} left out: {wrong[0].text:.30}",)
 
 
-def _beginning(file: Path) -> Beginning:
-    """Return encoding, delimiter, column names and first rows of a CSV file, detected from its first 128 KiB."""
-    encoding, head = _decoded_head(file)
-    lines = head.lstrip("\ufeff").splitlines() or [""]
+def _beginning(content: bytes) -> Beginning:
+    """Return delimiter, column names and first rows of a CSV file (in UTF-8), detected from its first 128 KiB."""
+    lines = content[:HEAD].decode(errors="ignore").lstrip("\ufeff").splitlines() or [""]
     delimiter, cells, width = _divided(lines)
     header = _header_row(lines, cells, width)
-    names, start = cells[header], header
-    units: list[str] = []
-    if not is_number(names[0]):
-        names, start = _column_names(lines, cells, header)
-        names = names + [""] * (width - len(names))
-        units = [plain_unit(x) for x in cells[start - 1]]
-        # A line of names may contain words such as `deg`. It counts as a line of units only if more than half of its
-        # nonempty cells are units.
-        units = units if sum(map(is_unit, units)) > sum(map(bool, units)) / 2 else []
-    return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
+    if is_number(cells[header][0]):
+        return Beginning(delimiter, cells[header], lines[header], header, [], "\n".join(lines[header:]))
+    start = header + 1
+    # Between header and values there may be lines of units, joints or descriptions, and the header again.
+    while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
+        start += 1
+    texts = [k for k in range(start) if len(cells[k]) == width and (k >= header or COMMENT.match(lines[k]))]
+    units = {k: [plain_unit(x) for x in cells[k]] for k in texts}
+    # Names, and the header itself, may contain words such as `deg`.
+    stated = [k for k, x in units.items() if sum(map(is_unit, x)) > sum(map(bool, x)) / 2]
+    stated = stated if len(stated) < len(texts) else []
+    below = [k for k in range(header, start) if k not in stated]
+    names = _column_names([cells[k] for k in below])
+    names = names + [""] * (width - len(names))
+    return Beginning(
+        delimiter, names, lines[header], start, units[stated[-1]] if stated else [], "\n".join(lines[start:])
+    )
 
 
 def _divided(lines: Sequence[str]) -> tuple[str, list[list[str]], int]:
@@ -183,26 +195,20 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
     return full[previous] if previous >= 0 and is_number(cells[first][0]) else first
 
 
-def _column_names(lines: Sequence[str], cells: Sequence[list[str]], header: int) -> tuple[list[str], int]:
-    """Return the names of the columns of a CSV file, and the index of the first line of values.
+def _column_names(rows: Sequence[list[str]]) -> list[str]:
+    """Return the names of the columns of a CSV file from the cells of its header, and of the lines below it.
 
-    Between header and values there may be lines without digits, such as units, and repeats of the header. Names may be
-    in two lines: the first line has the quantities, each repeated for all joints or only above its first joint; the
-    second line has the joints.
-
-    lines, cells: text and cells of each line. header: index of the header.
+    Names may be in two lines: the first line has the quantities, each repeated for all joints or only above its first
+    joint; the second line has the joints.
     """
-    names, start = cells[header], header + 1
-    is_repeated = len(set(names)) < len(names) - 1
-    while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
-        start += 1
-    if is_repeated and start > header + 1:
-        filled = names[:1]
-        for name in names[1:]:
-            filled.append(name or filled[-1])
-        columns = zip_longest(filled, *cells[header + 1 : start], fillvalue="")
-        names = ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
-    return names, start
+    names = rows[0]
+    if len(rows) == 1 or len(set(names)) >= len(names) - 1:
+        return names
+    filled = names[:1]
+    for name in names[1:]:
+        filled.append(name or filled[-1])
+    columns = zip_longest(filled, *rows[1:], fillvalue="")
+    return ["_".join(filter(None, dict.fromkeys(column))) for column in columns]
 
 
 def _is_text(line: str, header: str, cells: Sequence[str]) -> bool:
@@ -243,21 +249,20 @@ def _joint_state_columns(cells: Sequence[str], file: Path) -> list[str]:
     return columns
 
 
-def _decoded_head(file: Path) -> tuple[str, str]:
-    """Return the text encoding of a file (UTF-8, UTF-16 or Latin-1), and its first characters."""
-    # [B] size of the head of the file, from which names, encoding, delimiter and decimal point are detected. It is as
-    # large as the largest cell that the module csv reads.
-    size = 2**17
-    with file.open("rb") as source:
-        head = source.read(size)
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return "utf-16", head.decode("utf-16", "ignore")
-    # UTF-16 without a mark of the byte order: one of the two bytes of the first character, a Latin letter, is 0.
-    if 0 in head[:2] and head[:2] != b"\0\0":
-        encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
-        return encoding, head.decode(encoding, "ignore")
+def _in_utf8(content: bytes) -> bytes:
+    """Return a text in UTF-8; it may be in UTF-16, in a character set of East Asia or Russia, or in Latin-1."""
+    encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else ""
+    # Without a mark of the byte order, the first character shows UTF-16: its other byte is 0.
+    if 0 in content[:2] and content[:2] != b"\0\0":
+        encoding = "utf-16-le" if content[1] == 0 else "utf-16-be"
     try:
         # The head of the file may end in the middle of a UTF-8 character, which the incremental decoder omits.
-        return "utf-8", codecs.getincrementaldecoder("utf-8")().decode(head, final=len(head) < size)
+        encoding or codecs.getincrementaldecoder("utf-8")().decode(content[:HEAD], final=len(content) < HEAD)
     except UnicodeDecodeError:
-        return "latin-1", head.decode("latin-1")
+        from spelgen.logs.suggest import KNOWN
+
+        # Any text can be read as Latin-1: another character set is used if it gives more words of column names.
+        heads = {x: content[:HEAD].decode(x, "ignore").lower() for x in CHARACTER_SETS}
+        words = [x for x in KNOWN if not x.isascii()]
+        encoding = max(heads, key=lambda x: sum(len(word) for word in words if word in heads[x]))
+    return content.decode(encoding, "replace").encode() if encoding else content

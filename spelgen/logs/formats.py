@@ -20,6 +20,10 @@ LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 _PYTHON = 'python -c "import {}"'
+_HDF5 = (
+    "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
+    "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
+)
 # {suffix of a file that is no log: command that converts the file to a log}; in the command, {0} is the path of the
 # file, and {1} the path without the suffix.
 CONVERT = {
@@ -38,11 +42,18 @@ CONVERT = {
         "json.dumps(x) + chr(10) for x in yaml.load_all(open('{0}'), yaml.CSafeLoader) if x)"
     )),
     ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
-    ".mat": _PYTHON.format("numpy, scipy.io; numpy.savez('{1}.npz', **scipy.io.loadmat('{0}'))"),
-    **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(
-        "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
-        "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
-    )),
+    # A .npy file of a dict is a pickle, which is loaded only with a warning.
+    ".npy with a dict": _PYTHON.format(
+        "numpy; numpy.savez('{1}.npz', **numpy.load('{0}', allow_pickle=True).item())"
+    ) + ' (only a file of a known source: pickles may contain code)',
+    # JSON has the fields of structs, as x.q; NPZ would have them as Python objects.
+    ".mat": _PYTHON.format(
+        "json, scipy.io; json.dump(scipy.io.loadmat('{0}', simplify_cells=True), open('{1}.json', 'w'), "
+        "default=lambda x: x.tolist() if hasattr(x, 'tolist') else str(x))"
+    ),
+    # MATLAB stores the columns of a matrix as rows of HDF5.
+    ".mat of version 7.3": _PYTHON.format(_HDF5.replace("x[()]", "x[()].T")),
+    **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(_HDF5)),
 }  # fmt: skip
 
 
@@ -108,10 +119,16 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
 def _conversion(path: Path) -> str | None:
     """Return the advice, for an error message, to convert a file by a command in CONVERT; None for other files."""
     suffix = path.suffix.lower()
-    # The output of `ros2 topic echo`, often saved as .txt or .log, is YAML and begins with "header:".
-    if suffix in (".txt", ".log") and path.is_file():
+    if suffix in (".txt", ".log", ".mat", ".npy") and path.is_file():
         with path.open("rb") as source:
-            suffix = ".yaml" if source.read(7) == b"header:" else suffix
+            head = source.read(128)
+        # The documents of `ros2 topic echo` are YAML in a file of any name.
+        contents = {
+            b"header:": ".yaml",
+            b"MATLAB 7.3": ".mat of version 7.3",
+            b"'descr': '|O'": ".npy with a dict",
+        }
+        suffix = next((x for text, x in contents.items() if text in head), suffix)
     command = CONVERT.get(suffix)
     # FILE replaces a path with spaces or quotation marks, which a shell would split into arguments or execute as code.
     plain = path if re.fullmatch(r"[\w./@+-]+", str(path)) else Path("FILE").with_suffix(path.suffix)

@@ -152,7 +152,7 @@ def _longest(arrays: NpzArrays) -> pa.Table:
         # skipped.
         except LogError as fault:
             faults.append(fault)
-    collect([] if shapes else faults)
+    collect([] if any(shapes.values()) else faults)
     samples = max(map(max, filter(None, shapes.values())), default=0)
     vectors = set(filter(arrays.is_vector, shapes))
     columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]

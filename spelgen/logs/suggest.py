@@ -20,9 +20,10 @@ from spelgen.errors import LogError, shortened
 from spelgen.labels import listed
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
-from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units
+from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
+from spelgen.logs.values import logged_column
 from spelgen.settings.log_mapping import CURRENTS, UNIT_NAMES, LogMapping, is_unit, mapped_unit, plain_unit
 
 WORDS = {
@@ -48,8 +49,8 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
         "ipo set soll u leader consigne заданное заданный 目标 指令 设定 目標 목표",
         "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
         "현재 실제",
-        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance interact dd ddot "
-        "dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
+        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance dist interact dd "
+        "ddot dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
         "computed model predicted pred sim simulated g c f",
     )
 )
@@ -144,7 +145,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     labels = joint_patterns(joints, names)
     columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
     if not commands:
-        columns = _with_letters(columns, table)
+        columns = _with_letters(_with_states(columns, table, len(joints)), table)
     columns_of = _by_quantity(columns, commands, len(joints))
     # A column named "load" does not count as torque here, since servos have a register with this name.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
@@ -214,6 +215,37 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     return Suggestion("\n".join([*lines, ""]), tuple(missing))
 
 
+def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) -> list[ColumnName]:
+    """Return the columns with quantities of a state [q; qd], such as x0, x1, ..., of which the names state nothing.
+
+    The last half of the state's columns are the derivatives of the first half. joints: number of joints.
+    """
+    unstated = [x for x in columns if x.number >= 0 and not x.words & (COMMANDED | OTHERS)]
+    unstated = [x for x in unstated if x.quantity in ("q", None)]
+    quantity = {}
+    for state in _complete_signals(unstated, 2 * joints).values():
+        ordered = sorted(state, key=lambda x: x.number)
+        pairs = list(zip(ordered[:joints], ordered[joints:], strict=False))
+        if len(state) == 2 * joints and _similarity(pairs, table)[0] > 0.9:
+            for q, qd in pairs:
+                quantity[q.name] = q._replace(quantity="q", words={"q"})
+                quantity[qd.name] = qd._replace(quantity="qd", words={"qd"}, number=q.number)
+    return [quantity.get(x.name, x) for x in columns]
+
+
+def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table) -> tuple[float, float]:
+    """Return the correlation of columns x with the derivatives of columns q, and the relative distance of x and q.
+
+    Both are medians over the pairs (q, x) that move; NaN if none does.
+    """
+    values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
+    moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
+    slopes = [np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving] or [np.nan]
+    return float(np.median(slopes)), float(
+        np.median([np.std(x - q) / np.std(q) for q, x in moving] or [np.nan])
+    )
+
+
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
     """Return the columns, with quantities for ambiguous names such as `t0`, `v0` and `u0`, derived from their values.
 
@@ -226,13 +258,9 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
     }
     for letter in "tvu":
         named = [k for k, x in enumerate(result) if x.words == {letter} and x.number in of_number]
-        pairs = [(of_number[result[k].number], result[k]) for k in named]
-        values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
-        moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
-        if not moving:
+        slope, distance = _similarity([(of_number[result[k].number], result[k]) for k in named], table)
+        if np.isnan(slope):
             continue
-        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving])
-        distance = np.median([np.std(x - q) / np.std(q) for q, x in moving])
         quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
         if letter != "t" and slope > 0.9:
             quantity = "qd"
@@ -265,22 +293,30 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the name with the fewest words is used.
-    nanoseconds = [x for x in columns if re.search(r"n(?:ano)?sec(?:ond)?s?$", x.name.lower())]
+    # measurement. Without a stamp, the name with the fewest words is used, or of several the most regular times.
+    nanoseconds = [x for x in columns if re.search(r"n(?:anos|(?:ano)?sec(?:ond)?s?)$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
         seconds = [x for x in columns if not (x.quantity or x.joint) and _is_rising(_numbers(table, x.name))]
     absent = ColumnName("", set(), "s")
-    clock = min(seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=absent)
+    clock = min(
+        seconds, key=lambda x: ("header" not in x.words, len(x.words), _jitter(table, x)), default=absent
+    )
     times = _numbers(table, clock.name)
     # If times are whole numbers that repeat, they are the seconds of a stamp, and its nanoseconds are in another
     # column.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
     if not nanoseconds or not is_whole:
         return clock
-    stem = re.sub(r"secs?$", "", clock.name)
+    stem = re.sub(r"sec(?:ond)?s?$", "", clock.name)
     fraction = next((x for x in nanoseconds if x.name.startswith(stem)), nanoseconds[0])
     return ColumnName(f"{clock.name} + {fraction.name}", clock.words, "s")
+
+
+def _jitter(table: pa.Table, column: ColumnName) -> float:
+    """Return the standard deviation of the time steps in a column, relative to their median."""
+    steps = np.diff(_numbers(table, column.name).astype(float))
+    return float(np.std(steps) / max(np.median(steps), 1e-300)) if steps.size else np.inf
 
 
 def _is_rising(values: np.ndarray) -> bool:
@@ -296,8 +332,9 @@ def _is_rising(values: np.ndarray) -> bool:
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
-    """Return the numbers of a column, without nulls; an empty array for a column of another type."""
-    values = table[name].drop_null() if name in table.column_names else pa.chunked_array([[]])
+    """Return the numbers of a column, or of an element of lists, without nulls; an empty array for other values."""
+    is_stored = name and stored_names(name, table.column_names)
+    values = logged_column(table, name).drop_null() if is_stored else pa.chunked_array([[]])
     is_numeric = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
     return np.asarray(values.to_numpy()) if is_numeric else np.zeros(0)
 
@@ -352,10 +389,14 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     """
     # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
     # a number or a joint.
-    for bracket in re.finditer(r"\s*[\[(]([^\])]+)[\])]", name):
-        is_other = re.search(r"[\d',]", bracket[1]) or bracket[1] in labels
-        if is_unit(plain_unit(bracket[1])) or (bracket.end() == len(name) and not is_other):
-            unit, name_without = plain_unit(bracket[1]), name.replace(bracket[0], "", 1)
+    fraction = (
+        r"[\W_](\d*\.\d+ ?[^\W\d_]+|(?:\d*\.\d+ ?)?[%‰])(?![^\W_])"  # a unit such as 0.1%, at any place
+    )
+    for bracket in re.finditer(rf"\s*[\[(]([^\])]+)[\])]|{fraction}", name):
+        text = bracket[1] or bracket[2]
+        is_other = re.search(r"[\d',]", text) or text in labels
+        if is_unit(plain_unit(text)) or (bracket.end() == len(name) and not is_other):
+            unit, name_without = plain_unit(text), name.replace(bracket[0], "", 1)
             return _column_name(name_without, labels, unit, words)._replace(name=name)
     matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
@@ -364,7 +405,7 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     # A column named `t`, or with another word for time, contains times, even if a joint has the same name.
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
-    last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
+    last = re.fullmatch(r"(.*?)[\s_.]*?((?:[^\W\d_]|°)+(?:/s|[\s_](?:per[\s_])?s)?)(?:(?!°)[\W\d_])*", bare)
     is_bare = last and (last[2].lower() in BARE or last[2] == name[:1])
     if not unit and last and not is_bare and is_unit(plain_unit(last[2])):
         bare, unit = last[1], plain_unit(last[2])
@@ -438,7 +479,11 @@ def _common(units: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:
     """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
-    steps = np.diff(_numbers(table, name))
+    times = _numbers(table, name)
+    steps = np.diff(times)
+    # Ticks of 100 ns since 1601 (Windows) or the year 1 (.NET), in years from 2000 to 2080.
+    if times.size and any(low < times[0] / 3.2e14 < low + 80 for low in (394, 1972)):
+        return "0.1 us"
     return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
 
 
@@ -505,7 +550,7 @@ def _complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozen
 
 
 def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> None:
-    """Raise LogError for positions of several arms, such as `left_q1` and `right_q1`, or `arm1/q1` and `arm2/q1`.
+    """Raise LogError for positions of several arms, such as `left_q1` and `right_q1`, or q0 to q13 of 7 joints.
 
     columns: columns of changing positions in the log `file`. joints: number of joints.
     """
@@ -523,6 +568,13 @@ def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> 
         raise LogError(
             f"positions of {len(rivals)} arms: {shortened(rivals, TUNING.listed)} are of one joint", file=file,
             expected="columns of one arm", do="remove the columns of the other arms, or write the mapping by hand",
+        )  # fmt: skip
+    unnamed = [x.name for x in signals.get(best, ()) if not x.joint]
+    if len(unnamed) >= 2 * joints:
+        got = f"{len(unnamed)} columns of positions that change: {shortened(_ranges(unnamed), TUNING.listed)}"
+        raise LogError(
+            got, file=file, expected=f"{joints}, one for each joint",
+            do="remove the columns of other joints, or write the mapping by hand",
         )  # fmt: skip
 
 

@@ -38,6 +38,8 @@ class LogTuning:
     # [Hz] Logs below this sample rate are interpolated by cubic instead of linear functions. Windows of logs at this
     # rate or below are not filtered by default.
     dense_rate: float = 50.0
+    # [1] Largest number of lines below the last row of a CSV file, such as a summary; more lines are damaged rows.
+    ending: int = 20
     # [1] Largest number of columns or times that a message lists.
     listed: int = 5
 

@@ -43,7 +43,7 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
     for name, signal in zip(layout.columns[1:], signals, strict=True):
-        values = _floats(_column(table, name), name, layout, rows)
+        values = _floats(logged_column(table, name), name, layout, rows)
         sign_bit = mapping.word("sign_bit", *signal)
         logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
@@ -111,7 +111,7 @@ def clock_start(table: pa.Table, layout: Layout) -> tuple[pa.Scalar | None, floa
     """
     first_row = table.slice(0, 1)
     times, unit = _clock(first_row, layout)
-    is_stamp = pa.types.is_temporal(_column(first_row, layout.columns[0]).type)
+    is_stamp = pa.types.is_temporal(logged_column(first_row, layout.columns[0]).type)
     if not (pa.types.is_integer(times.type) or pa.types.is_floating(times.type)):
         return None, 0.0
     # Times since 1970 would have too few digits as floating-point numbers, so their start is subtracted. A clock that
@@ -127,7 +127,7 @@ def _clock(table: pa.Table, layout: Layout) -> tuple[Column, float]:
     Raises LogError for dates beyond the range of Arrow.
     """
     name = layout.columns[0]
-    times = _column(table, name)
+    times = logged_column(table, name)
     if pa.types.is_string(times.type) or pa.types.is_large_string(times.type):
         nanoseconds = _nanoseconds(times)
         if nanoseconds is not None:
@@ -183,7 +183,7 @@ def _numbers(texts: Column) -> np.ndarray:
     return np.asarray(texts.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
-def _column(table: pa.Table, name: str) -> Column:
+def logged_column(table: pa.Table, name: str) -> Column:
     """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
     A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is a time: seconds plus nanoseconds.

@@ -35,7 +35,8 @@ NORMALISED = "normalised"
 UNIT_NAMES: dict[str, dict[str, str]] = {
     quantity: {name: unit for unit, names in units for name in names.split()}
     for quantity, units in {
-        "t": [("s", "s sec"), ("ms", "ms millis"), ("us", "us µs"), ("ns", "ns"), ("60 s", "min")],
+        "t": [("s", "s sec secs second seconds"), ("ms", "ms msec millis milliseconds"),
+              ("us", "us µs usec micros microseconds"), ("ns", "ns nsec nanos nanoseconds"), ("60 s", "min")],
         "q": [("deg", "deg degs degree degrees grad °"), ("rad", "rad"), ("mrad", "mrad"), ("0.001 deg", "mdeg"),
               ("0.01 deg", "cdeg"), ("counts", "counts ticks pulse pulses cnt inc"), ("0.016666666667 deg", "arcmin"),
               ("turns", "turns turn rev revs revolutions"), ("m", "m"), ("10 mm", "cm"), ("mm", "mm")],

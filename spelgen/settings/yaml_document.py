@@ -31,6 +31,13 @@ EXPECTED = {
     "invalid_key": "a name as key; in braces, write numbers with a decimal point, 1.5",
 }  # fmt: skip
 
+# {part of a message of PyYAML: advice about its most frequent cause}.
+YAML_ADVICE = {
+    r"'\t'": "indent by blanks, not by tabs",
+    "expected <block end>": "write a text that begins with { or [ in quotes",
+    "expected ',' or '}'": "write a text with braces in quotes",
+}
+
 Checked = TypeVar("Checked", bound=BaseModel)
 _OCTAL = re.compile("[-+]?0[0-7]+")
 
@@ -146,7 +153,8 @@ def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem:
         # Some messages of PyYAML begin with "but", since they are the second half of a sentence. The word is removed.
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
-    return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)
+    do = next((advice for text, advice in YAML_ADVICE.items() if text in problem), None)
+    return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None, do=do)
 
 
 def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
@@ -175,8 +183,15 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     location, error_type = detail["loc"], detail["type"]
     # An unknown key, the most frequent error, is mostly misspelt: the message names the most similar known key.
     if error_type == "extra_forbidden":
-        names = _group_at(group, location[:-1]).model_fields
-        return unknown_name(location, "key", str(location[-1]), names, document)
+        names, key = _group_at(group, location[:-1]).model_fields, str(location[-1])
+        error = unknown_name(location, "key", key, names, document)
+        # A key of another group is not misspelt. A key of a joint belongs to its settings or the logs, not to a fit.
+        place = _group_with(group, key)
+        if place is not None and (
+            len(location) == 1 or place.startswith(("logs", "columns", "joints")) or not place
+        ):
+            error.do = f"write it under '{place}'" if place else "write it at the left margin"
+        return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
     # Pydantic adds "[key]" to the location of an invalid key of a dict: it is removed.
@@ -193,6 +208,10 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         got = got[:57] + "..."
     error = _error_at(location, document, got)
     error.expected = expected
+    if ":" in str(location[-1:]):
+        error.do = "write a blank after the colon of a key"
+    elif isinstance(detail["input"], str) and re.match(r"[-+]?\.?\d", detail["input"]):
+        error.do = "write the number only, with a decimal point; docs/settings.md has its unit"
     return error
 
 
@@ -228,6 +247,19 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
         if key in group.model_fields:
             group = _first_group(group.model_fields[key].annotation) or group
     return group
+
+
+def _group_with(group: type[BaseModel], key: str, place: str = "") -> str | None:
+    """Return the place of the first group of settings in `group` that has a key, such as "logs"; None without one."""
+    if key in group.model_fields:
+        return place
+    for name, field in group.model_fields.items():
+        inner = _first_group(field.annotation)
+        of_joint = ": NAME" if str(field.annotation).startswith("dict") else ""
+        found = _group_with(inner, key, f"{place}: {name}{of_joint}".removeprefix(": ")) if inner else None
+        if found is not None:
+            return found
+    return None
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
