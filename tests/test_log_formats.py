@@ -840,6 +840,10 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
+    # the first message, received twice, is no header
+    lines = joint_states()
+    (tmp_path / "log.csv").write_text("\n".join([lines[0], *lines]) + "\n")
+    assert len(read_logs([tmp_path / "log.csv"], ("a", "b"))) == 1
     # columns of joints that the arm does not have, such as a gripper, are omitted
     (arm_alone,) = read_logs([tmp_path / "log.csv"], ("a",))
     assert arm_alone.q.shape == (50, 1)

@@ -45,7 +45,7 @@ class Beginning(NamedTuple):
     Attributes:
         delimiter: character between columns.
         names: names of the columns; for a file without a header, the values of its first row.
-        header: text of the header; for a file without a header, its first row.
+        header: text of the header; "" for a file without a header.
         lines: number of lines before the first row of values: comments, the header, and lines such as units.
         units: units of the columns, from a line above or below the header, in lower case; [] without such a line.
         rows: the first rows of values.
@@ -67,8 +67,8 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     """
     content = _in_utf8(file.read_bytes())
     # A line begins after the end of another one, or after the byte order mark of an appended file.
-    header = re.compile(re.escape(_beginning(content).header.encode()) + rb"(?=[\r\n])")
-    starts = [x.start() for x in header.finditer(content)]
+    header = re.escape(_beginning(content).header.encode())
+    starts = [x.start() for x in re.finditer(header + rb"(?=[\r\n])", content)] if header else []
     starts = [0, *[x for x in starts if content[max(x - 1, 0) : x] in (b"", b"\n", b"\r", b"\xbf")][1:]]
     tables: list[tuple[pa.Table, int]] = []
     remarks: tuple[str, ...] = ()
@@ -152,7 +152,7 @@ def _beginning(content: bytes) -> Beginning:
     delimiter, cells, width = _divided(lines)
     header = _header_row(lines, cells, width)
     if is_number(cells[header][0]):
-        return Beginning(delimiter, cells[header], lines[header], header, [], "\n".join(lines[header:]))
+        return Beginning(delimiter, cells[header], "", header, [], "\n".join(lines[header:]))
     start = header + 1
     # Between header and values there may be lines of units, joints or descriptions, and the header again.
     while start < len(lines) - 1 and _is_text(lines[start], lines[header], cells[start]):
