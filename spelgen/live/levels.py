@@ -54,8 +54,8 @@ def noise_levels(fit: Fit) -> NoiseLevels:
     return levels
 
 
-# These fits use one thread, like the fit of the run. With torch 2.13, the factorisation of a batch of large matrices
-# does not end if the number of threads was raised before, as at the end of a fit.
+# The number of torch's threads is 1 for all fits together. Otherwise each fit would raise it again at its end, and with
+# torch 2.13 the factorisation of a batch of large matrices in the next fit would never end.
 @threads_of_torch(1)
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation on its logs.
@@ -152,10 +152,9 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # `levels` has no noise values at first, but the limits by which samples are accepted or refused: the noise is
-    # estimated from the accepted samples.
-    # The torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, torques may
-    # exceed `limit`, for example under a payload, and are no saturation.
+    # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
+    # them. A torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, `limit` is
+    # a guess: torques above it (for example under a payload) do not count as saturated up to `TUNING.jump` times it.
     limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
@@ -178,13 +177,13 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. A
-    trial is an estimate x of the payload from several consecutive blocks, where x is the mass (k = 1), or mass and
-    first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
-    Its mean over the trials is computed for each k and each length of trials; each mean includes `prior_trials`
-    imaginary trials of the value `prior_variance`. The factor is the largest of these means, since errors that are
-    correlated over time may give a larger mean for longer trials. The degrees of freedom are the number of trials in
-    this mean, imaginary ones included.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
+    factor is found by trials: each trial estimates the payload from several consecutive blocks. The logs are without
+    payload, so the estimate x is an error, with the normalised square s = x^T P^-1 x / k; x is the mass (k = 1), or
+    mass and first moments (k = 4). The mean of s is computed for each k and each number of blocks per trial, because
+    errors are correlated over time. As a prior, each mean includes `prior_trials` imaginary trials with s =
+    `prior_variance`. The factor is the largest mean; its degrees of freedom are the number of trials in this mean,
+    including the imaginary trials.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -287,7 +286,10 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def _observed(levels: NoiseLevels, samples: Sequence[HeldOutSample]) -> np.ndarray:
-    """Return external torques, and `ContactObserver.normalised`, at T held-out samples, (2, T, n)."""
+    """Apply the momentum observer to T held-out samples.
+
+    Returns the external torques [Nm, N] and `ContactObserver.normalised` [1], stacked, (2, T, n).
+    """
     observer, drift = ContactObserver(levels, TUNING.alarms_per_minute), JointFilters.of_drift(levels.drift)
     rows = []
     for t, at, is_resumed, block in samples:
