@@ -157,5 +157,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor: the model with a disturbance observer, or any without one."""
+    """Return True if charts show a predictor: all without disturbance observer, and the model with one."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

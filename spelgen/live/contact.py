@@ -43,11 +43,11 @@ class ContactObserver:
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
-        level: Mean square of the normalised residual in about the last half second, (n,). If the level exceeds 1, the
-            variance of the residual is multiplied by the level, since residuals are larger in some motions, for example
-            if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that a
-            contact does not raise the threshold before it is detected. The squares are limited to `TUNING.level_limit`,
-            so that slow contacts raise the thresholds by a factor of at most two.
+        level: Mean square of the torque residual divided by its standard deviation, over about the last half second,
+            (n,) [1]. A level above 1 multiplies the variance of the residual: residuals are larger in some motions, for
+            example if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that
+            a contact does not raise the threshold before it is detected. The squares are limited to
+            `TUNING.level_limit`, so that slow contacts raise the thresholds by a factor of at most two.
         normalised: Excess of the external torque's magnitude over `NoiseLevels.resting_torque`, divided by the standard
             deviation of the torque residual, (n,) [1]. A joint is in contact above `NoiseLevels.thresholds`.
     """
@@ -90,7 +90,7 @@ class ContactObserver:
         return ContactState(-signal, threshold, self.touched, force)
 
     def end_block(self) -> None:
-        """Update the level of the residual at the end of a block of samples."""
+        """Update the attribute `level` (mean square of the residual) at the end of a block of samples."""
         self.level = self.level + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.level)
         self.recent = self.squares / self.count
         self.squares, self.count = np.zeros_like(self.squares), 0

@@ -255,7 +255,7 @@ class PayloadEstimate:
 
     Attributes:
         filters: the filter without a hypothesis, then the two copies, if any.
-        moved: time in motion since the start or the last change of the payload [s].
+        moved: time in motion since the first sample or the last change of the payload [s].
         changed: True if a change of the payload was accepted, until the caller sets it to False.
         misfit: mean of the normalised squared residuals of moving joints in about the last second [1].
     """

@@ -52,7 +52,7 @@ class Intake:
         bristles: break-away displacements of the K bristles of each drive.
 
     Attributes:
-        counts: {result of the check: number of samples}.
+        counts: number of samples for each result of the check, such as {"used": 120, "jump": 1}.
         bounds: Lower and upper bound of the friction state of each of K bristles, (2, n, K) [rad, m].
         aligned: q, qd and tau of the last used sample, (3, n), at the same time: q and qd are delayed if measured
             torques lag behind the motion, tau is delayed if they precede it.

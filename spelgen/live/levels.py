@@ -40,7 +40,7 @@ Folds = Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]]
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit: stored in its run folder, or estimated from its logs and then stored.
 
-    Raises RunError if they cannot be read, or if there are neither stored levels nor logs.
+    Raises RunError if stored levels cannot be read, or if there are neither stored levels nor logs.
     """
     levels = stored_levels(fit)
     if levels is None:
@@ -336,10 +336,10 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
-    # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
-    # the joints (James and Stein, 1961). This weight is at most 1 - 1 / n, so that `peak_count` is at most n `count`,
-    # the number of peaks of all n joints.
+    # The scales of the joints are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the
+    # errors, the scales are shrunk towards their mean (James and Stein, 1961). The weight of the mean is the error
+    # variance divided by the variance over the joints. It is at most 1 - 1 / n, so that `peak_count` is at most n
+    # `count`, the number of peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)

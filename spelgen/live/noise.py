@@ -125,10 +125,10 @@ class NoiseLevels(BaseModel):
         return np.stack([moving, moving + self.resting], axis=1)
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
-        """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd, (..., n).
+        """Return the additional contact threshold near standstill, (..., n) [Nm, N], at velocities qd, (..., n).
 
-        A contact threshold is the sum of this bound and a multiple of the standard deviation of the noise (see
-        `thresholds`).
+        It bounds the friction error near standstill. A contact threshold is the sum of this bound and a multiple of the
+        standard deviation of the noise (see `thresholds`).
         """
         return np.asarray(self.resting * np.exp(-np.abs(qd) / self.resting_speed))
 

@@ -71,7 +71,10 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M."""
+    """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M.
+
+    structure: zero, constant and varying entries of M.
+    """
     # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
     every_fact = facts(arm, structure)
     cells = {}
@@ -101,7 +104,7 @@ def _explanation(entry: MassEntry, every_fact: Sequence[Fact]) -> str:
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
     """Return the animated picture of an arm with the given motions.
 
-    Without motions the arm moves through its joint ranges.
+    Without motions the arm moves through its joint ranges. urdf: URDF with the shapes of the links.
     """
     shapes = scene(urdf, arm.joint_names)
     motions = motions or [_sweep(arm)]
@@ -112,7 +115,8 @@ def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) 
 def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
     """Return the animated motions of an evaluation: predicted motions, then measured motions with predicted torques.
 
-    The colours of the links show the errors of the predicted positions, or of the predicted torques.
+    The colours of the links show the errors of the predicted positions, or of the predicted torques. traces: curves of
+    the evaluation.
     """
     motions = []
     for example in traces.trajectories:

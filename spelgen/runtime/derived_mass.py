@@ -100,14 +100,14 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    If M is not clearly positive definite, it is moved towards a constant matrix C = L L^T. C is
-    ``entries`` with the nominal mean of each function (``Function.mean``) and the initial constants,
-    without armature. The result is M' = C + t (M - C), which is positive definite for all q and all
-    parameters. The factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin``
-    is below 1. Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X|
-    is an upper bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives
-    of M' are t times the derivatives of M. The zeros of M and the linear relations between entries of M
-    are valid for C, and therefore for M', too.
+    For some q and parameters M may be indefinite. The model therefore uses M' = C + t (M - C), which is
+    positive definite for all q and all parameters. C = L L^T is a constant matrix: ``entries`` with the
+    nominal mean of each function (``Function.mean``) and the initial constants, without armature. The
+    factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin`` is below 1.
+    Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X| is an upper
+    bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives of M' are t
+    times the derivatives of M. The zeros of M and the linear relations between entries of M are valid for
+    C, and therefore also for M'.
     """
 
     def __init__(
@@ -129,10 +129,9 @@ class DerivedMass(LinearMass):
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # The norm |X| of the class is the Frobenius norm of D X D, with D = diag(C)^(-1/2), divided by
-        # the smallest eigenvalue of D C D. It is an upper bound of the spectral norm of L^-1 X L^-T, with
-        # C = L L^T. `unit`, (n, n), has all factors: the Frobenius norm of the elementwise product of
-        # `unit` and X is |X| / (1 - margin).
+        # |X| of the class is computed as ||D X D||_F / (smallest eigenvalue of D C D), D =
+        # diag(C)^(-1/2). `unit`, (n, n), contains the factors of the entries of X, so that |X| / (1 -
+        # margin) is the Frobenius norm of the elementwise product of `unit` and X.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:

@@ -52,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults if neither `protocol` nor `inputs` is set; controlled motions are then simulated."""
+    """Default settings if neither `protocol` nor `inputs` is set: simulations of controlled motions."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4

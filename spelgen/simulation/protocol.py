@@ -34,7 +34,7 @@ class SimulatedLogs(list[Trajectory]):
 
     @classmethod
     def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
-        """Return the logs, of which the last `test_fraction` are test trajectories and at least one is for training."""
+        """Split logs: the last fraction `test_fraction` are test trajectories; at least one log is for training."""
         trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
         return cls(logs[:trained], logs[trained:])
 

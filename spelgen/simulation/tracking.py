@@ -70,7 +70,8 @@ def track(
     train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        # 1 / (M^-1)_jj is the inertia at joint j while all other joints move freely.
+        # The gains of a joint's controller are computed from the inertia at joint j while all other joints move freely,
+        # which is 1 / (M^-1)_jj.
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         recording = record(dynamics, friction, drives.inputs, path, settings, inertia, 2 * np.pi * bandwidth)
         log = measured(recording, settings.tracking, f"traj_{number:02d}")

@@ -189,9 +189,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # The functional `row` is M at `entry`, the only entry outside `bound`, minus a combination of the entries in
-        # `bound`, which changes like M at `entry` if joints outside `joints` move. `coefficients` are the coefficients
-        # of this combination in double precision.
+        # The functional `row` is a difference: M at `entry`, the only entry outside `bound`, minus a weighted sum of
+        # the entries in `bound`. If joints outside `joints` move, both change equally, so the difference is constant.
+        # `coefficients` are the weights of the sum in double precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0

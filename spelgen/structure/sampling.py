@@ -35,9 +35,8 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Revolute joints use the cosine and sine of q, prismatic joints the value of q; each `Position` has all three.
-        # The value is an independent random number, since it cannot be computed from elements of the prime field as an
-        # angle.
+        # A `Position` has a cosine and a sine, for revolute joints, and a value of q, for prismatic joints. The value
+        # is an independent random number: in a prime field there is no angle that belongs to a cosine and a sine.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
