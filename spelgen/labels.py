@@ -152,7 +152,7 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name for predictions of ``predictor`` that include the disturbance of a momentum observer."""
+    """Return the name of ``predictor`` with a momentum observer, whose disturbance is added to the predictions."""
     return f"{predictor} + observer"
 
 

@@ -303,7 +303,7 @@ def _observed(levels: NoiseLevels, samples: Sequence[HeldOutSample]) -> np.ndarr
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels` for the peaks of all logs.
+    """Return the distribution of the largest peaks: `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. An
     exponential distribution is fitted to the largest peaks and gives the contact thresholds. Peaks differ between logs,
@@ -326,7 +326,9 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 
 
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
-    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`, from the largest of all peaks.
+    """Fit an exponential distribution to the largest peaks; return its start, scale and number of peaks.
+
+    The keys are the fields `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     peaks: largest normalised residuals of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
@@ -348,7 +350,7 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
-    """Return the noise of the momentum observer in motion and at rest, as fields of `NoiseLevels`.
+    """Return the noise of the momentum observer in motion and at rest, as {field of `NoiseLevels`: value}.
 
     The noise variance of a joint at the velocity qd is s^2 (1 + (r exp(-|qd| / v))^2). The likelihood is maximized over
     a grid of the ratio r and the velocity scale v of the additional noise near standstill; the noise s in motion is

@@ -192,8 +192,8 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     """Return the indices of the samples at which the load changes.
 
-    These are the samples with `load_changed`, with one exception: if no payload was reported before the change, and the
-    status after it is "no payload", the two loads differ by less than the errors of the model.
+    All samples with `load_changed` are returned, with one exception: if no payload was reported before a change, and
+    the status after it is "no payload", the two loads differ by less than the errors of the model.
 
     states: estimates after each sample of a log.
     """

@@ -268,8 +268,9 @@ class DenseMass(nn.Module):
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n), see the class.
+        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n).
 
+        M is a block of the large matrix; C, U and e are defined in the class.
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
@@ -277,8 +278,9 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its unit diagonal, (..., 3 n, 3 n), and e, (..., 3 n), see the class.
+        """Return the lower triangular factor U without its unit diagonal, and the diagonal factor e.
 
+        The shapes are (..., 3 n, 3 n) and (..., 3 n). M is computed from both factors (see the class).
         raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and softplus^-1(e).
         """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)

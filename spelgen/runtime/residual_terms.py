@@ -238,8 +238,8 @@ class ResidualTerms(nn.Module):
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
 
-        It is dR/dt qd [Nm, N], with the residual term R of M, minus d/dq (``gradient``) of the residual
-        terms of 1/2 qd^T M qd - V. cache: configuration cache at q. qd: velocities, (..., n).
+        It is dR/dt qd - g [Nm, N]. R is the residual term of M, and g, from ``gradient``, is d/dq of the
+        residual terms of 1/2 qd^T M qd - V. cache: configuration cache at q. qd: velocities, (..., n).
         """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)

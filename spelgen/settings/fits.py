@@ -71,7 +71,7 @@ class GaussianPrior(Group):
         friction_compensation: Torque per velocity with which a drive compensates friction, divided by typical friction
             per typical speed. It is fitted only if the logs, or implausible masses, indicate such a torque.
         degrees_of_freedom: Not a standard deviation but a weight: in the estimate of a standard deviation, its initial
-            value counts as much as this number of fitted parameters. The standard deviation of each single body is
+            value has the weight of this number of fitted parameters. The standard deviation of each single body is
             estimated with the same weight, so that the prior of its parameters is a Student-t distribution with this
             number of degrees of freedom.
     """

@@ -290,7 +290,7 @@ class JointLog(Group):
         return self
 
 
-# Settings are immutable, so that one object serves all joints.
+# One default object is shared by all joints without settings. This is safe, because settings are immutable.
 _DEFAULT = JointLog()
 
 
@@ -330,7 +330,8 @@ class LogMapping(Group):
     @field_validator("calibration", mode="before")
     @classmethod
     def _is_by_motor(cls, content: object) -> object:
-        # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
+        # Older versions of LeRobot wrote calibrations as lists of all motors, and data in degrees. Such a calibration
+        # is an error, because data in degrees need no calibration.
         motors = content.values() if isinstance(content, dict) else ()
         if not all(isinstance(x, dict | MotorCalibration) for x in motors):
             raise ValueError(

@@ -163,10 +163,11 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield two lists of candidates for f_j that depend on ``joints`` only: single entries of M, then sums of entries.
+    """Yield two lists of candidates for a function f_j of ``joints`` only: single entries of M, then sums of entries.
 
-    A candidate is a weighted sum of the entries of M, which varies only with the positions of ``joints``. It is given
-    by its weights, (entries,), in the prime field and in double precision. Sums of few entries are first.
+    f_j is a function in the minimal form of M (see the module). A candidate is a weighted sum of the entries of M,
+    which varies only with the positions of ``joints``. It is given by its weights, (entries,), in the prime field and
+    in double precision. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.

@@ -118,10 +118,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S), see the module.
+    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: 2 S random values, (2 S,). Block ``index`` + 1, the only block in which this coordinate differs from block
-    0, gets the last S values. All other blocks get the first S values.
+    Samples consist of blocks (see the module). In block ``index`` + 1 only this coordinate differs from block 0: this
+    block gets the last S of the random ``values``, (2 S,), and all other blocks get the first S values.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))

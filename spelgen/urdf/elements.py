@@ -15,7 +15,7 @@ JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 
 
 def read_name(notes: Notes, xml: etree._Element) -> str | None:
-    """Return the name of an element; if it has none, add an error to the defects ``notes`` and return None."""
+    """Return the name of an element; if it has none, add an error to ``notes`` (list of defects) and return None."""
     return Element(notes, xml, f"<{xml.tag}>").name()
 
 
