@@ -183,8 +183,8 @@ class Estimator:
             payload = Payload("not yet", payload.log_odds, payload.limit)
         self.payload = payload
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # A payload was attached or removed. Until now the drift filter assumed a wrong payload and attributed the
-            # payload's torques to friction. It restarts from the friction scale in the state of the payload filter.
+            # A payload is reported for the first time, or no longer. Until now the drift filter assumed a wrong payload
+            # and attributed its torques to friction. It restarts with the friction scale of the payload filter.
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]

@@ -206,7 +206,10 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the estimator's drift filters with two states: friction change a (a random walk) and disturbance d."""
+        """Return the estimator's drift filters with two states: friction change a (a random walk) and disturbance d.
+
+        noise: noise of the torque residual of blocks of the drift filter.
+        """
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 

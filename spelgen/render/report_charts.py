@@ -57,7 +57,7 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of the charts of a predicted motion or a replayed log.
+    """Return the title of the charts of ``example``, a predicted motion or a replayed log.
 
     It states the relative error of a prediction, or the RMS position error of a replayed log [mrad, mm]. spec:
     specification of the model, with the types of the joints.
@@ -153,7 +153,7 @@ def mass_panels(trace: MassTrace, joint_types: Sequence[str]) -> list[Panel]:
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
     """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model.
 
-    metrics: epoch, training loss and validation loss of each epoch.
+    metrics: epoch, training loss and validation loss of each epoch. best_epoch: epoch of the best model.
     """
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T

@@ -147,7 +147,8 @@ def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shap
     """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
 
     A link without child joints has a tube to its centre of mass. The joint of the link is drawn as a drum about the
-    joint axis. name: name of the link. names: names of all drawn links. radius: radius of the tubes [m].
+    joint axis. robot: the URDF. name: name of the link. names: names of all drawn links. radius: radius of the tubes
+    [m].
     """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]

@@ -125,6 +125,8 @@ class BodyChain(nn.Module):
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return velocities of bodies and point masses (see the class) at qd, (..., n) [rad/s, m/s].
 
+        cache: configuration cache at q.
+
         Returns:
             velocities of the four point masses of each body times sqrt(mass), (..., 3, bodies, 4); twists
             of the bodies, (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies)

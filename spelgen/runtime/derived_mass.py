@@ -78,8 +78,9 @@ class ConstantMass(LinearMass):
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return M, (..., n, n), and as intermediate values the encoding of q, (..., 2 n), unchanged.
 
-        M comes from the parameter cache ``parameters``, (n, n), and is expanded to the batch of the encoding.
-        ``kinetic_vjp`` uses only the shape of the encoding, because the derivatives of M are zero.
+        M is the parameter cache ``parameters``, (n, n), expanded to the batch dimensions of ``encoded``,
+        the encoding of q. The derivatives of M are zero, so ``kinetic_vjp`` uses only the shape of the
+        encoding.
         """
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
@@ -332,7 +333,10 @@ class DenseMass(nn.Module):
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+
+        intermediates: second result of ``forward`` at q.
+        """
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)

@@ -139,11 +139,17 @@ class DenseInputDynamics(NetworkDynamics):
         return torch.diag_embed(self._gains(self.at(q)))
 
     def input_force(self, cache: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return the joint torques G(q) tau of the inputs tau, (..., n) [Nm, N]; qd has no effect."""
+        """Return the joint torques G(q) tau of the inputs tau, (..., n) [Nm, N]; qd has no effect.
+
+        cache: configuration cache at q.
+        """
         return self._gains(cache) * tau
 
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G(q) tau = force, for joint torques force, (..., n)."""
+        """Return the inputs tau, (..., n), that solve G(q) tau = ``force``, (..., n) [Nm, N].
+
+        force: joint torques. cache: configuration cache at q.
+        """
         return force / self._gains(cache)
 
 
@@ -210,7 +216,8 @@ class JointFriction(NetworkFriction):
     ) -> Tensor:
         """Return D(q, qd) times ``right``, (..., n, columns), with the dissipation matrix D, (..., n, n).
 
-        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s].
+        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s]. parameters: parameter
+        cache.
         """
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)

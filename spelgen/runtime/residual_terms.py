@@ -292,7 +292,10 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m], in which M includes the residual R(q)."""
+        """Return the configuration cache at q, (..., n) [rad, m], in which M includes the residual R(q).
+
+        prepared: cache from ``prepare``.
+        """
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache

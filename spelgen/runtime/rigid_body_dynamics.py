@@ -245,5 +245,6 @@ class RigidBodyDynamics(PortHamiltonian):
         """Return the generalized force G (tau - b) + k qd of the inputs tau, (..., n) [Nm, N].
 
         G is the input matrix, b the torque offset of the sensors, k the friction compensation of the drives.
+        cache: configuration cache at q.
         """
         return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd

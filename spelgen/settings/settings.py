@@ -267,7 +267,7 @@ def _require_joints(
 ) -> None:
     """Raise SettingsError, or SpelgenErrors for several errors, if a joint in a settings file is not among `names`.
 
-    found: (location, name) of each joint in the file.
+    found: (location, name) of each joint in the file. document: the file, for the lines in errors.
     """
     collect([unknown_name(place, "joint", x, names, document) for place, x in found if x not in names])
 

@@ -52,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Default settings if neither `protocol` nor `inputs` is set: simulations of controlled motions."""
+    """Defaults if neither `protocol` nor `inputs` is set; the simulated motions are then controlled motions."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4

@@ -200,7 +200,8 @@ def unknown_name(
 ) -> SettingsError:
     """Return the error for a name that is not among `names`; it suggests the most similar known name.
 
-    noun: "key" or "joint", for the message.
+    noun: "key" or "joint", for the message. location: keys from the root of ``document`` to the name. document: the
+    YAML file; None if the name is not from a file.
     """
     error = _error_at(location, document, f"unknown {noun} {name!r}")
     error.element, error.do = dotted(location[:-1]), suggestion(name, names)

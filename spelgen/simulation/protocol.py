@@ -46,7 +46,10 @@ class SimulatedLogs(list[Trajectory]):
 
 
 def sample_times(simulation: SimulationSettings) -> np.ndarray:
-    """Return the times of the samples of one simulated trajectory, (T,) [s], which start at 0."""
+    """Return the times of the samples of one simulated trajectory, (T,) [s], which start at 0.
+
+    simulation: settings with the duration and the sample rate.
+    """
     return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
 
 

@@ -152,14 +152,17 @@ def record(
 
 
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
-    """Return the log of a recording: low-pass filtered positions, velocities by central differences, and torques."""
+    """Return the log of a recording: low-pass filtered positions, velocities by central differences, and torques.
+
+    tracking: settings with the cutoff frequency of the filter. name: name of the log.
+    """
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
     return Trajectory(recording.t, q, np.gradient(q, recording.t, axis=0), recording.tau, name)
 
 
 def quantized(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
-    """Return positions q (T, n) or (n,) rounded to steps of the encoders."""
+    """Return positions q (T, n) or (n,), rounded to the resolution of the encoders in the settings ``tracking``."""
     return np.round(q / tracking.resolution) * tracking.resolution
 
 

@@ -148,7 +148,8 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
 
     A set is sorted first by its joint closest to the root: joints near the tip come first. Sets with the same joint
-    closest to the root are sorted by size, small sets first (see the module).
+    closest to the root are sorted by size, small sets first (see the module). spans: samples of M and the spans of its
+    changes.
     """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
@@ -204,7 +205,8 @@ def _candidates(
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
 
-    The first array has elements of the prime field, the second one the same numbers in double precision.
+    The first array has elements of the prime field, the second one the same numbers in double precision. The rows and
+    columns of the entries are ``spans.keys``.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1

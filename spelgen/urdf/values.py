@@ -136,7 +136,7 @@ class Element:
                     self.error(f"the attribute {key!r}", repr(name), "correct or remove it")
 
     def text(self, key: str) -> str | None:
-        """Return the text of an attribute; None if the attribute or the element is absent."""
+        """Return the text of the attribute ``key``; None if the attribute or the element is absent."""
         # An absent element counts as an element without attributes, so that callers need no branch for it.
         text: str | None = None if self.xml is None else self.xml.get(key)
         return text
@@ -154,7 +154,7 @@ class Element:
         return None
 
     def triple(self, key: str, default: Vector = (0.0, 0.0, 0.0)) -> Vector:
-        """Return the three numbers in an attribute, or the default if it is absent.
+        """Return the three numbers in the attribute ``key``, or ``default`` if the attribute is absent.
 
         For an unusable text, add an error and return the default.
         """
@@ -162,7 +162,7 @@ class Element:
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return the number in an attribute; None if it is absent.
+        """Return the number in the attribute ``key``; None if the attribute is absent.
 
         For an unusable text, add an error and return None.
         """
@@ -170,7 +170,7 @@ class Element:
         return values[0] if values else None
 
     def limit(self, key: str) -> float | None:
-        """Return a limit of a joint; None if it is absent, inf, nan, or at least the magnitude in ``UNLIMITED``.
+        """Return the limit in the attribute ``key``; None if it is absent, inf, nan, or at least ``UNLIMITED[key]``.
 
         For an unusable text, add an error and return None.
         """
@@ -181,7 +181,7 @@ class Element:
         return values[0] if values and abs(values[0]) < UNLIMITED[key] else None
 
     def number_in_text(self, tag: str) -> float | None:
-        """Return the number in the text of a child element, or None if it is absent.
+        """Return the number in the text of the child element ``tag``; None if the child or its text is absent.
 
         For an unusable text, add an error and return None.
         """
@@ -191,7 +191,7 @@ class Element:
         return values[0] if values else None
 
     def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
-        """Return the ``count`` finite numbers in a text.
+        """Return the ``count`` finite numbers in a text, the value of the attribute or child element ``key``.
 
         The list is empty if the text is None. It is also empty, and an error is added, if the text does not consist of
         ``count`` finite numbers. bounded: if True, magnitudes above MAX_MAGNITUDE are errors; False for limits of
@@ -224,7 +224,7 @@ class Element:
         return values
 
     def _is_unexpanded(self, text: str, key: str) -> bool:
-        """Whether a text contains a xacro expression; if it does, an error is added."""
+        """Whether a text contains a xacro expression; if it does, an error about the attribute ``key`` is added."""
         is_unexpanded = "${" in text or "$(" in text
         if is_unexpanded:
             do = "expand the file with the xacro command first"
