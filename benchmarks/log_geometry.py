@@ -224,7 +224,7 @@ def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
 
 
 def print_tables(rows: Sequence[Row]) -> None:
-    """Print the results of faults per kind and per arm, and the findings on clean logs."""
+    """Print how often faults were named, per kind of fault and per arm, and the findings on clean logs."""
     clean = [row for row in rows if row.kind == "clean"]
     for row in clean:
         if row.result != "silent":

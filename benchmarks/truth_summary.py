@@ -76,7 +76,10 @@ def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def by_cause(rows: Sequence[Row], cause: str) -> Iterator[tuple[Any, np.ndarray]]:
-    """Yield each value of a cause of `CAUSES` that occurs, with the mask (rows,) of the cases that have it."""
+    """Yield each value of a property of the cases, such as the kind of friction, with the mask (rows,) of its cases.
+
+    cause: key of `CAUSES`, whose function returns the value for a case.
+    """
     values = [CAUSES[cause](row) for row in rows]
     for value in sorted(set(values)):
         yield value, np.array([x == value for x in values])

@@ -103,7 +103,10 @@ def built(
     *,
     standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Derive one of the project's robots; return the text of its emitted module, and its structure."""
+    """Derive one of the project's robots; return the text of its emitted module, and its structure.
+
+    assume, preset, design: see `Options`. standalone: True for a module that does not import spelgen.
+    """
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
     return module_text(spec, standalone=standalone), derive(arm.chain, assume)
@@ -123,7 +126,10 @@ def random_model(
     preset: str = "hybrid",
     design: Design | None = None,
 ) -> nn.Module:
-    """Return the emitted model of one of the project's robots, with random parameters by ``randomise``."""
+    """Return the emitted model of one of the project's robots, with random parameters.
+
+    seed, deviation: see ``randomise``. preset, design: see `Options`.
+    """
     source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
     randomise(model, seed, deviation)

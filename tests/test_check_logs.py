@@ -97,7 +97,7 @@ def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
 
 @pytest.fixture(scope="module")
 def loaded_joint(loaded, log) -> int:
-    """Return the index of the joint that gravity loads most, from one check for all tests."""
+    """Return the index of the joint whose gravity torque varies most, relative to the variation of its torque."""
     joints = check_logs([log], loaded).joints
     return max(range(3), key=lambda k: joints[k].gravity.relative_deviation or 0)
 

@@ -43,7 +43,7 @@ each_variant = pytest.mark.parametrize("variant", VARIANTS)
 
 @pytest.fixture(scope="module")
 def module_of(tmp_path_factory):
-    """Return the emitted module of a variant and a robot, imported once."""
+    """Return a function that returns the emitted module of a variant and a robot, imported once."""
     folder, modules = tmp_path_factory.mktemp("contracts"), {}
 
     def module(variant, robot):

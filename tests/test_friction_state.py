@@ -1,4 +1,4 @@
-"""Friction states are exact in displacement, passive, and unaffected by encoder jitter."""
+"""Friction states depend on the displacement and not on the time steps, are passive, and ignore encoder jitter."""
 
 import numpy as np
 import pytest

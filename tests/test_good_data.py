@@ -100,7 +100,10 @@ def test_all_complete_messages_of_an_unfinished_recording_are_read(tmp_path, sha
 
 @pytest.mark.parametrize("encoding", ["cdr", "json", "protobuf"])
 def test_mcap_files_without_the_profile_of_ros_are_read_if_their_messages_are_cdr(tmp_path, encoding):
-    """Tools that join or cut MCAP files omit the profile; other recorders write joint states in other encodings."""
+    """Messages in CDR, the encoding of ROS, are read without a profile; other encodings are refused with a remedy.
+
+    Tools that join or cut MCAP files omit the profile.
+    """
     (path,) = bag_of(states(), tmp_path / "bag").glob("*.mcap")
     content = path.read_bytes()
     assert content[8 + 9 :].startswith(struct.pack("<I", 4) + b"ros2")

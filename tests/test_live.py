@@ -531,7 +531,10 @@ def test_scales_of_peaks_are_shrunk_by_their_error(levels):
 
 
 def test_thresholds_hold_in_a_log_that_differs(levels):
-    """If one of three logs has residuals twice as large, thresholds hold in a further log like it."""
+    """If one of three logs has doubled residuals, a fourth log with doubled residuals causes at most one alarm.
+
+    With thresholds from three logs of equal residuals, it causes more.
+    """
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))

@@ -177,7 +177,7 @@ def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     assert "--accept joint-zero" in error
     write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
     _, (read,) = mended(arm, error, tmp_path / "log.csv")
-    # angles that differ by a whole turn are the same zero
+    # offsets that differ by a whole turn are equal
     assert np.abs(np.angle(np.exp(1j * (read.q - log.q)))).max() < 0.1
 
 

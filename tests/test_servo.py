@@ -289,7 +289,7 @@ def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
         value, std = posterior.uncertain(servo_values(q))
         error = np.abs(value - servo_truth(servos, q))
         held += (error <= QUANTILE * std).tolist()
-        assert np.median(std / np.abs(value)) < 0.05  # relative to kp, gravity and inertia are determined
+        assert np.median(std / np.abs(value)) < 0.05  # ratios of gravity and inertia to kp are determined
     assert len(held) == 34 and np.mean(held) >= 0.9, np.mean(held)
 
 

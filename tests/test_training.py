@@ -359,9 +359,9 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Run a training without end until a signal stops it, and write its status to the file `told` next to the folder.
+    """Train until a signal stops the training; write the status of the run to the file `told` next to the run folder.
 
-    It is run in a process of its own.
+    The function is the target of a child process.
     """
     # the tests may run with SIGINT ignored, which the process inherits
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -514,7 +514,7 @@ def test_few_windows_are_taken_all_at_once():
 
 
 def test_the_line_search_turns_back_from_numbers_that_blow_up():
-    """The line search of L-BFGS shortens a step to a point at which the loss is NaN.
+    """L-BFGS shortens a step that ends where the loss is NaN, until the loss is finite.
 
     The loss is finite below x = 2, and the first step would reach x = 4.
     """

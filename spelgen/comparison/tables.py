@@ -124,7 +124,7 @@ def _medians(runs: Runs, measure: str) -> Numbers:
 
 
 def _by_error(medians: Numbers) -> Numbers:
-    """Return the same errors in ascending order; errors that are not finite are last."""
+    """Return the median errors, {model or baseline: error}, in ascending order; errors that are None are last."""
     return dict(sorted(medians.items(), key=lambda item: math.inf if item[1] is None else item[1]))
 
 

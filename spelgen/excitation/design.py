@@ -144,7 +144,11 @@ def _accelerated(
 
 
 def _joint_values(name: str, values: float | Sequence[float], arm: Chain, *, positive: bool) -> np.ndarray:
-    """Return an argument of `excite` as one number per joint, (n,). Raises SettingsError if it is invalid."""
+    """Return an argument of `excite` as one number per joint, (n,). Raises SettingsError if it is invalid.
+
+    name: name of the argument, for the error. positive: True if the numbers must be positive; a single number then
+    applies to all joints.
+    """
     count = len(arm.coordinates)
     array = np.atleast_1d(np.array(values, dtype=float))
     if positive and array.shape == (1,):
@@ -183,6 +187,9 @@ def _start(
     start: Sequence[float] | None, arm: Chain, limits: MotionBounds, collisions: Collisions | None
 ) -> np.ndarray:
     """Return the position at which the approach to the exciting motion starts, (n,) [rad, m].
+
+    start: the user's choice. None: zero for each joint whose limits allow it, the middle of the limits for the others;
+    the middle for all joints if that position has a contact. collisions: None if contacts are not checked.
 
     Raises SettingsError for an invalid position, and ArmError for a position with a contact.
     """

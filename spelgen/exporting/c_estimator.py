@@ -39,10 +39,11 @@ _ENTRIES = (
 
 
 def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFunction]:
-    """Return the C functions that only the estimator of payload and external torques calls.
+    """Return the two C functions that only the estimator of payload and external torques calls.
 
-    These functions compute the terms of the momentum balance, and payload torques. model: the model as NumPy arrays.
-    levels: noise levels; ``levels.point``, the tip in the frame of the last body, is a constant in the C code.
+    ``momentum_balance`` computes the terms of the momentum balance, ``payload_torque`` the joint torques due to a
+    payload. model: the model as NumPy arrays. levels: noise levels; ``levels.point``, the tip in the frame of the last
+    body, is a constant in the C code.
     """
     n, bodies = model.n, model.arm.bodies
     sizes = {"q": n, "qd": n, "qdd": n, "tau": n, "load": 10, "low": model.memory, "high": model.memory}
@@ -109,8 +110,8 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
     }
-    # The generated C code contains a checksum of all constants. With it, the code refuses a saved state of an estimator
-    # with other constants.
+    # The generated C code contains a checksum of all constants. A saved state of the estimator has this checksum, too:
+    # the code refuses a state that was saved with other constants.
     identity = zlib.crc32(repr(sorted((name, str(value)) for name, value in values.items())).encode())
     return {
         f"{model.name}_estimator{suffix}": render(f"estimator{suffix}.jinja", **values, identity=identity)

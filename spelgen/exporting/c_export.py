@@ -86,7 +86,7 @@ def compile_library(sources: Path | Sequence[Path], program: str, *flags: str) -
 def called_by_c(
     library: Path, functions: Sequence[CFunction], dtype: type[np.floating] = np.float64
 ) -> Called:
-    """Return a function for `check_parity`, which calls a compiled function, such as inverse_dynamics, per state.
+    """Return a function for `check_parity`. It evaluates a compiled function, such as inverse_dynamics, per state.
 
     library: shared library of the export. functions: C functions in the library. dtype: type ``real`` of the C code.
     """

@@ -68,7 +68,7 @@ class CFunction:
     Attributes:
         entry: the entry point.
         symbol: name of the C function.
-        shapes: {output: (rows,) or (rows, columns)}.
+        shapes: {output: its shape, (rows,) or (rows, columns)}.
         about: text of the comment above the function.
         signature: C declaration of the function, without a semicolon.
         definition: C definition of the function.
@@ -99,7 +99,7 @@ def write_c(model: TrainedModel, functions: Sequence[CFunction], folder: Path) -
 
 
 def c_texts(model: TrainedModel, functions: Sequence[CFunction]) -> dict[str, str]:
-    """Return the header and the source of a model as {".h": text, ".c": text}."""
+    """Return the C header and source with the given functions of a model as {".h": text, ".c": text}."""
     # The header states the number of operations of the longest function. It is an upper bound for all inputs, since the
     # code has no branches that depend on data.
     longest = max(functions, key=lambda function: function.operations)

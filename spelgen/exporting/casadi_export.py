@@ -48,11 +48,9 @@ def casadi_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> 
 def _with_residuals(entry: EntryPoint, model: TrainedModel, function: ca.Function) -> ca.Function:
     """Return a CasADi function that computes the residual terms of a model and passes them to ``function``.
 
-    A function that depends on no residual terms is returned unchanged: a pure SX function is faster than an MX function
-    that calls it.
-
-    The inputs of the result are the inputs of the entry point ``entry``. The inputs of ``function`` are these inputs,
-    then the residual terms.
+    The result has the inputs of the entry point ``entry``. ``function`` has these inputs, then the residual terms. If
+    it depends on no residual terms, it is returned unchanged: a pure SX function is faster than an MX function that
+    calls it.
     """
     needed = residuals_needed(function)
     if not needed:
@@ -91,9 +89,10 @@ def called_by_state(functions: Mapping[str, ca.Function]) -> Called:
 
 
 def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[str, ca.MX]:
-    """Return {name of a residual term, see `model_expressions`: its value as an expression in q and qd}.
+    """Return the residual terms as expressions in q and qd: {name, such as ``gravity``: expression}.
 
-    q, qd: symbols, (n, 1) each; qd: None if no term that depends on velocity is needed.
+    The names are listed in `model_expressions`. q, qd: symbols, (n, 1) each; qd: None if no term that depends on
+    velocity is needed.
     """
     residuals = model.residuals
     values = {}
@@ -119,9 +118,9 @@ def _residual_values(model: TrainedModel, q: ca.MX, qd: ca.MX | None) -> dict[st
 
 
 def _in_kinetic_energy(model: TrainedModel, qd: ca.MX) -> ca.MX:
-    """Return the coefficients c, (m, 1), of the kinetic energy 1/2 qd^T R qd = c^T r of the residual term R of M.
+    """Return the coefficients c, (m, 1), with which the kinetic energy 1/2 qd^T R qd is the product c^T r.
 
-    r, (m, 1), are the m nonzero entries in the lower triangle of R. qd: (n, 1) [rad/s, m/s].
+    R is the residual term of M; r, (m, 1), are the m nonzero entries in its lower triangle. qd: (n, 1) [rad/s, m/s].
     """
     products = []
     for row, column in model.residuals.entries:

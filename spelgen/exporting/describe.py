@@ -1,4 +1,4 @@
-"""``Trained``, a model with its arm, which every exporter gets as argument, and ``TrainedModel``, its NumPy arrays."""
+"""``Trained``, the argument of all exporters (model and arm), and ``TrainedModel``, the model as NumPy arrays."""
 
 import copy
 import keyword
@@ -348,10 +348,10 @@ def _splines(terms: ResidualTerms, weights: Tensor) -> dict[int, BSpline]:
 def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
     """Return the torque ripple of all joints: up to two elements per joint, for harmonics of joint and motor.
 
-    terms: residual terms, for the frequencies. weights: (n, 2 H), coefficients of H cosines, then of H sines. The H
-    frequencies are harmonics of a revolution of the joint, then harmonics of a revolution of the motor. An export
-    computes the harmonics k = 1, 2, ... of one frequency in sequence. Harmonics with zero amplitude are therefore
-    removed only after the last nonzero one.
+    terms: residual terms, for the frequencies. weights: (n, 2 H), coefficients of H cosines, then of H sines. The first
+    frequencies are harmonics of the joint (k per joint revolution), the others are harmonics of the motor (k per motor
+    revolution), k = 1, 2, ... An export computes all harmonics up to the last one, so a harmonic with zero amplitude is
+    removed only if all higher harmonics are zero, too.
     """
     ripple = []
     cosines, sines = map(array, weights.chunk(2, dim=-1))
@@ -363,8 +363,8 @@ def _ripple(terms: ResidualTerms, weights: Tensor) -> tuple[Harmonics, ...]:
         for block in (slice(0, regular), slice(regular, count)):
             c, s = cosines[joint, block], sines[joint, block]
             used = np.flatnonzero((c != 0) | (s != 0))
-            # Each harmonic costs computing time in the exported code, so trailing harmonics with zero amplitude are
-            # removed.
+            # The exported code computes every harmonic up to the last one, so trailing harmonics with zero amplitude
+            # are removed.
             if used.size:
                 last = used[-1] + 1
                 ripple.append(Harmonics(joint, float(frequencies[block][0]), c[:last], s[:last]))

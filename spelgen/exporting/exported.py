@@ -14,7 +14,7 @@ from spelgen.labels import printable
 if TYPE_CHECKING:
     from spelgen.exporting.describe import Trained
 
-# The README of every format states the units of the model, which are the units of every export.
+# All formats have these units, and the README of every export states them.
 UNITS = "Units: rad and Nm for revolute joints, m and N for prismatic ones"
 
 
@@ -128,8 +128,7 @@ def with_readme(
         to: name of the format.
         files: contents by file name.
         use: first line after the title, how the export is used.
-        about: conventions of the format, which are appended to the line of the README that states the units and the
-            tip.
+        about: conventions of the format. The README states them after the units and the tip, in the same line.
         summary: results of the checks, one text without a full stop each.
         example: lines of Python that run in the folder of the README.
     """

@@ -80,7 +80,7 @@ def check_mjcf(text: bytes, projection: RigidBodyProjection, states: int = TUNIN
     random = random_inputs(arm.coordinates, states)
     controls = torques = random["tau"]
     if servos is not None:
-        # The dead zone of servos is omitted, since MuJoCo's position actuators have none.
+        # The reference torques are computed without the dead zone of the servos: MuJoCo's position actuators have none.
         controls = random["u"]
         torques = servos.kp * (controls - random["q"]) - servos.kd * random["qd"]
         torques = np.clip(torques, -servos.limit, servos.limit)
@@ -135,7 +135,8 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         values["mass_matrix"].append(jacobian.T @ full @ jacobian)
         values["bias"].append(jacobian.T @ data.qfrc_bias)
         values["forward_dynamics"].append(jacobian.T @ data.qacc)
-    # In MuJoCo, mimic joints are soft constraints, so the accelerations differ from a model with exact mimic joints.
+    # In MuJoCo, mimic joints are soft constraints, and in the model they are exact. The accelerations differ and are
+    # therefore not compared.
     if model.nv > len(arm.coordinates):
         del values["forward_dynamics"]
     return {name: np.array(rows) for name, rows in values.items()}
@@ -203,7 +204,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
     is_coupled: (n,), True for a motor whose speed depends on several joints.
     """
     friction, joint = projection.friction, projection.arm.chain.coordinates[k]
-    # The torque of position servos is limited by the actuator, with the learned limit.
+    # With position servos, the learned torque limit is an attribute of the actuator, so the joint gets no limit.
     effort = joint.effort if projection.servos is None else None
     return {
         # The armature of a coupled motor is an attribute of a tendon, see `mjcf_text`.
@@ -285,7 +286,7 @@ def _add_shapes(assets: etree._Element, elements: Sequence[etree._Element], arm:
 
 
 def _geom(shape: LinkShape, assets: etree._Element) -> dict[str, object]:
-    """Return type and size of the geom of a shape as attributes; a mesh is also added to `assets`."""
+    """Return the MJCF attributes of the geom of a shape, such as type and size; a mesh is also added to `assets`."""
     if shape.mesh is None:
         sizes = {"box": [x / 2 for x in shape.size], "cylinder": [shape.size[0], shape.size[-1] / 2]}
         return {"type": shape.kind, "size": sizes.get(shape.kind, shape.size)}

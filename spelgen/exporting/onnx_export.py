@@ -109,8 +109,8 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
 def _solve_triangular(matrix: Tensor, right: Tensor, *, upper: bool, unitriangular: bool) -> Tensor:
     """Return matrix^-1 right, (..., n, columns), for a triangular matrix (..., n, n) with a unit diagonal.
 
-    It replaces torch.linalg.solve_triangular, which has no ONNX operator. The values on the diagonal are not used: all
-    calls of the runtime have ``unitriangular=True``.
+    It replaces torch.linalg.solve_triangular, which has no ONNX operator. upper: True for an upper triangular matrix.
+    The values on the diagonal are not used: all calls of the runtime have ``unitriangular=True``.
     """
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype)
     return _solve(matrix - matrix * identity + identity, right)
@@ -138,7 +138,10 @@ def _cholesky_ex(matrix: Tensor) -> _Cholesky:
 
 
 def _scalar_tensor(s: float, dtype: int = onnx.TensorProto.DOUBLE, **options: object) -> onnxscript.ir.Value:
-    """Return the ONNX constant of a number in double precision; torch's own translation would round it to float32."""
+    """Return the ONNX constant of the number s in the ONNX type ``dtype``, by default double precision.
+
+    It replaces torch's own translation, which would round the number to float32.
+    """
     value = np.array(s, dtype=onnx.helper.tensor_dtype_to_np_dtype(dtype))
     constant = onnxscript.opset18.Constant(value=onnx.numpy_helper.from_array(value))
     return cast("onnxscript.ir.Value", constant)

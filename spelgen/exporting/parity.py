@@ -59,7 +59,10 @@ TORQUE = "Nm, N"
 def entry_point(
     name: str, about: str, inputs: str, reference: Callable[..., Tensor] | None = None, **outputs: str
 ) -> EntryPoint:
-    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result."""
+    """Return an ``EntryPoint``; inputs: names, separated by blanks; outputs: unit of each result.
+
+    The other arguments are fields of the class.
+    """
     return EntryPoint(name, about, tuple(inputs.split()), outputs, reference)
 
 
@@ -140,10 +143,13 @@ class Parity:
 def require_parity(
     differences: dict[str, float], tolerance: float, states: int, reference: str = "the torch module"
 ) -> Parity:
-    """Return the differences between export and model as a ``Parity``. Raises RunError if one is above the tolerance.
+    """Return a ``Parity`` with the differences between export and model. Raises RunError if one is above the tolerance.
 
-    differences: {entry point: largest relative difference}. states, reference: number of random states and name of the
-    compared dynamics, for the summary.
+    Args:
+        differences: {entry point: largest relative difference}.
+        tolerance: largest allowed relative difference.
+        states: number of random states, for the summary.
+        reference: name of the dynamics to which the export was compared, for the summary.
     """
     for name, difference in differences.items():
         if not difference <= tolerance:  # The comparison is negated, so that NaN raises the error, too.
@@ -204,8 +210,8 @@ def check_parity(
 def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 0) -> Values:
     """Return {input of the dynamics, such as q: random values for comparisons}, (states, n) each.
 
-    The friction state z is (states, memory). The seed is fixed, so that exports are reproducible. memory: number of
-    values in the friction state z.
+    The seed is fixed, so that exports are reproducible. coordinates: joints of the arm, whose limits determine the
+    range of positions and velocities. memory: number of values in the friction state z, (states, memory).
     """
     random = np.random.default_rng(0)
     # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
@@ -216,8 +222,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "qd": 0.5 * speed * random.standard_normal(q.shape),
         "qdd": 2.0 * speed * random.standard_normal(q.shape),
         "dq": 0.05 * speed * random.standard_normal(q.shape),
-        # The standard deviation of the friction state z has the size of break-away displacements, fractions of a
-        # milliradian.
+        # The standard deviation of z is 1e-4 rad, as large as typical break-away displacements.
         "z": 1e-4 * random.standard_normal((states, memory)),
         # Forward dynamics are linear in tau, so the size of tau has no influence on the relative difference.
         "tau": 10.0 * random.standard_normal(q.shape),

@@ -57,8 +57,8 @@ class RigidBodyProjection:
         friction: viscous and Coulomb friction that approximate the model's friction.
         inputs: G at q = 0, (n, n), joint torques = G times motor torques.
         servos: position servos of the model; None for an arm under torques.
-        exact: True if the trained model consists of rigid bodies, which are used; False if rigid bodies were fitted to
-            it.
+        exact: True if the bodies are the rigid bodies of the trained model; False if they were fitted to a model of
+            another kind.
         mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
             gravity torque, divided by the RMS of the trained model.
         bodies: float64 model that consists of the rigid bodies only.
@@ -78,7 +78,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Two sentences for the user about differences from the trained model: of the rigid bodies, and of friction."""
+        """Two sentences for the user: how the rigid bodies, and how the friction, differ from the trained model."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"
@@ -94,10 +94,10 @@ class RigidBodyProjection:
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
-    """Return the rigid bodies, and viscous and Coulomb friction, that are equal to or approximate a trained model.
+    """Return the approximation of a trained model by rigid bodies with viscous and Coulomb friction.
 
-    The bodies of a rigid-body model are used without its residual terms. For other models, rigid bodies are fitted to M
-    and the gravity torque at random positions. Friction is always fitted, by least squares.
+    A rigid-body model keeps its bodies, without its residual terms. For other models, rigid bodies are fitted to M and
+    the gravity torque at random positions. Friction is always fitted, by least squares.
     """
     # The model is copied and converted to double precision, so that the user's model is not changed.
     model = copy.deepcopy(model).double().cpu().requires_grad_(False)
@@ -176,8 +176,8 @@ def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     torques = model.friction_torque(positions, qd).numpy()  # torques: (positions, speeds, n)
     rows = []
     for joint, speed in enumerate(speeds.T):
-        # Torques are multiplied by the sign of the velocity. Friction that opposes the motion is then positive in both
-        # directions, as `nnls` requires, whose coefficients are non-negative.
+        # The torques are multiplied by the sign of the velocity: friction that opposes the motion is then positive in
+        # both directions. `nnls` returns only non-negative coefficients.
         torque = torques[..., joint] * np.sign(speed)
         columns = np.stack([np.abs(speed), speed > 0, speed < 0], axis=-1)
         (viscous, forward, backward), _ = nnls(columns, torque.mean(axis=0))

@@ -131,9 +131,10 @@ class RigidBodies:
         return momentum, gradient
 
     def _accumulate(self, wrenches: list[Wrench]) -> None:
-        """Add the wrenches of all bodies that a body carries to its own wrench, for all bodies, in place.
+        """Add the wrench of each body to the wrench of its parent, from the tip to the base, in place.
 
-        wrenches: one per body, in the frame of the body, parents first.
+        Each result is the sum over a body and all bodies that it carries. wrenches: one per body, in the frame of the
+        body, parents first.
         """
         for index in reversed(range(len(wrenches))):
             parent = self.bodies[index].parent
@@ -154,8 +155,8 @@ def mass_and_potential(model: TrainedModel, q: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return M, (n, n), and potential energy, (1, 1) [J], of rigid bodies at q, (n, 1), by ``structure.recursion``."""
     positions = []
     for joint, base in enumerate(base_denominators(model.arm)):
-        # `base` is chosen such that angles of mimic joints are integer multiples of q / `base`: their cosines and sines
-        # are then polynomials in cos(q / `base`) and sin(q / `base`).
+        # All angles of mimic joints are integer multiples of q / `base`: their cosines and sines are polynomials in
+        # cos(q / `base`) and sin(q / `base`).
         angle = q[joint] / base
         positions.append(Position(ca.cos(angle), ca.sin(angle), q[joint]))
     result = energies(model.arm, positions, model.inertias.tolist(), float)

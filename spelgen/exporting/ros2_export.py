@@ -59,10 +59,10 @@ def export_ros2(trained: Trained) -> Exported:
 
 
 def _missing_part(trained: Trained) -> tuple[str, str] | None:
-    """Return (part, reason): the part that the package cannot have, and why; None if it has all parts.
+    """Return the part that the package cannot contain, "controller" or "estimator", and the reason.
 
-    The part is "controller" or "estimator". Without "controller" there is no estimator either, since it is part of the
-    controller.
+    Return None if it contains all parts. The estimator is part of the controller: without the controller, it is absent,
+    too.
     """
     model = trained.described
     if model.servos is not None or not model.actuated.all():

@@ -45,7 +45,7 @@ def export_torch(trained: Trained) -> Exported:
 
 
 def prepared(trained: Trained) -> PreparedModel:
-    """Return a copy of the model from which torch and ONNX programs are made.
+    """Return a copy of the model, the source of torch and ONNX programs.
 
     It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
     """
@@ -99,8 +99,8 @@ def example_lines(
         model: model that was exported.
         names: names of the programs.
         imports: import statements.
-        run: expression for the result of the program `name` for the arguments `inputs`.
-        zeros: format string for an array of zeros, with its dimensions and the name of its type.
+        run: Python expression that calls a program; its variables are `name` (of the program) and `inputs` (arguments).
+        zeros: format string for an array of zeros, such as "np.zeros(({}), np.{})", for dimensions and number type.
     """
     number = _number_type(model)
     lines = [*imports, "", "", "def run(name, **inputs):", f"    return {run}", "", ""]
@@ -126,7 +126,7 @@ def _saved(program: torch.export.ExportedProgram) -> bytes:
 
 
 def _called_by_torch(files: dict[str, bytes], model: PreparedModel) -> Called:
-    """Return a function for `check_parity`, which loads and evaluates the saved programs for arrays of states."""
+    """Return a function for `check_parity`. It loads a saved program and evaluates it for arrays of states."""
     # The saved files are loaded, so that the parity check includes saving and loading.
     programs = {name: torch.export.load(io.BytesIO(content)).module() for name, content in files.items()}
 

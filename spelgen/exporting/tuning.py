@@ -30,7 +30,7 @@ class ExportTuning:
     ridge: float = 1e-8
     # [1] Number of random positions at which viscous and Coulomb friction are fitted to the friction of a model.
     friction_positions: int = 32
-    # [1] MuJoCo's solimpfriction: the stiffest values, since a loaded joint at rest creeps with the default.
+    # [1] MuJoCo's solimpfriction, its stiffest values: with the default, a loaded joint at rest slips slowly.
     friction_impedance: tuple[float, ...] = (0.9999, 0.9999, 0.001, 0.5, 2.0)
     # [1] Number of speeds per direction, from 2 % to 100 % of a joint's nominal speed, at which friction is
     # fitted.

@@ -33,8 +33,8 @@ class RunOptions:
         force: replace a run in the folder.
         progress: show the progress on stderr.
         mapping: names and units of the columns of the logs; the run folder gets a copy.
-        notes: diagnostics of the caller, for example of reading the logs; they are reported with the diagnostics of the
-            fit.
+        notes: diagnostics that the caller has already, for example from reading the logs; the fit reports them with its
+            own diagnostics.
         began: start of the time limit, as a value of `time.monotonic` [s]; None: the call of `fit`.
     """
 
@@ -78,7 +78,7 @@ class FitRequest:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedLogs:
-    """Properties of the checked logs that are written to the run folder.
+    """Properties of the checked logs, which the run folder stores.
 
     Attributes:
         preprocessing: filter, gaps and delay, with all automatic values resolved.
@@ -203,7 +203,10 @@ class Validation:
         self.probe = data.training[:: -(-len(data.training) // TUNING.probe_windows)].to(device)
 
     def loss(self, substeps: int) -> float:
-        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges."""
+        """Return the dimensionless `rollout_loss` of the validation windows; infinite if a rollout diverges.
+
+        substeps: number of integration steps per sample interval.
+        """
         total = 0.0
         try:
             with torch.no_grad():

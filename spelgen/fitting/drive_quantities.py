@@ -69,7 +69,7 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
     The coefficients are the slope and the intercept of a straight line, fitted by least squares to the friction torque
     at speeds up to the typical speed of each drive (`friction.speed`). The friction torque is averaged over random
     positions. The friction torque depends on the gravity load and on the friction factor of residual terms. Load and
-    factor are computed once, from the argument ``model``, and are then the same for all models.
+    factor are computed once, for the argument ``model``; the returned function uses them for every model.
     """
     rng, joints = np.random.default_rng(0), model.spec.joints
     deviations = rng.uniform(-1.0, 1.0, (32, model.n)) * [x.half_range for x in joints]

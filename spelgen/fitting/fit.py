@@ -238,10 +238,10 @@ def objective_of(request: FitRequest) -> Objective:
 
 
 def default_objective(model: ArmModel, rates: Rates) -> str:
-    """Return the name of the default objective for a model and its logs.
+    """Return the name of the default objective for a model and for the sample rates of its logs.
 
     The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
-    for accelerations, and otherwise "rollout".
+    for accelerations, and otherwise "rollout". rates: function that returns the sample rates of the logs.
     """
     if model.input_quantity == "position":
         return "servo"
@@ -268,8 +268,8 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        # Rigid bodies start with the parameters of the URDF, and need no regularizer towards the URDF. It is therefore
-        # off by default; an objective that the user chose keeps the default of its options.
+        # The parameters of rigid bodies start at the values of the URDF and need no regularizer towards the URDF, so
+        # the default of its weight is zero. An objective that the user chose has its own default.
         if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)

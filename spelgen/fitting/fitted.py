@@ -183,7 +183,7 @@ class Fit:
         return float(np.mean(scores))
 
     def save(self, folder: Path | str, *, force: bool = False) -> Path:
-        """Write the run folder that `spelgen train` writes; return its path.
+        """Write the same run folder as `spelgen train`; return its path.
 
         Raises RunError if there is a run in the folder, unless ``force``.
         """
@@ -231,7 +231,7 @@ class Fit:
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:
-    """Return the specification of a model that was loaded from a run folder. Raises RunError if it has none."""
+    """Return the specification of a model, which a run folder must contain. Raises RunError if the model has none."""
     if isinstance(model, ArmModel):
         return model.spec
     raise RunError(

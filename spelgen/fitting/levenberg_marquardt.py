@@ -76,9 +76,9 @@ class SolverState(Generic[Parameters]):
 class SolverResult(Generic[Parameters]):
     """Last iterate and reason of termination.
 
-    normal_equations: the latest computed normal equations. If the solver ended because no further step was accepted,
-    they are computed at the last iterate. If it ended directly after an accepted step (small decrease of the cost,
-    maximum number of steps), they are computed at the iterate before this step.
+    normal_equations: the latest computed normal equations. They are at the last iterate if the solver ended because no
+    further step was accepted. If it ended directly after an accepted step (small decrease of the cost, maximum number
+    of steps), they are at the iterate before this step.
     """
 
     state: SolverState[Parameters]
@@ -122,7 +122,10 @@ def initial_state(
     damping: float = TUNING.initial_damping,
     steps: int = 0,
 ) -> SolverState[Parameters]:
-    """Return the state of the solver at x: the residual and the cost are computed here."""
+    """Return the state of the solver at x, with the residual and the cost at x.
+
+    damping: damping of the next step. steps: number of accepted steps so far, including earlier calls of the solver.
+    """
     residual = problem.residual(x)
     return SolverState(x, residual, problem.cost(x, residual), damping, steps)
 

@@ -107,7 +107,7 @@ def new_record(request: FitRequest, config: FitConfig, prepared: PreparedLogs) -
         mapping=options.mapping or LogMapping(input=model.input_quantity),
         device=options.device,
         threads=options.threads,
-        # Only warnings about logs and links are recorded. Diagnostics of the run are about the command and do not
+        # Only warnings about logs and links are recorded. Diagnostics at "run" are about the command and do not
         # describe the model.
         warnings=[f"{note.where}: {note.message}" for note in notes if note.where != "run"],
     )

@@ -76,7 +76,8 @@ class MiniBatchAdamW(WindowOptimizer):
     ) -> None:
         self._parameters, matrices = _trainable(model)
         self._batch, self._generator = batch, generator
-        # Constants of friction and mass are few and have physical units: decay would bias them towards zero.
+        # Vectors have no weight decay. They contain the constants of friction and mass, which have physical units:
+        # weight decay would bias them towards zero.
         vectors = [parameter for parameter in self._parameters if parameter.dim() <= 1]
         self._optimizer = torch.optim.AdamW(
             [
@@ -101,7 +102,7 @@ class MiniBatchAdamW(WindowOptimizer):
         return mean if math.isfinite(mean) else math.nan
 
     def _step(self, loss: Loss, windows: Windows) -> Tensor | float:
-        """Take a step and return the loss before the step, (); NaN if this loss or the gradient is not finite."""
+        """Take a step on a batch; return the loss before it, (), or NaN if this loss or the gradient is not finite."""
         self._optimizer.zero_grad()
         try:
             value = loss(windows)
@@ -154,10 +155,10 @@ class LBFGS(WindowOptimizer):
         return self.minimise(lambda: [loss(windows)], steps)
 
     def minimise(self, summands: Summands, steps: int) -> float:
-        """Minimise a sum of losses plus the class's penalty; return the final sum, NaN if no evaluation was finite.
+        """Minimise a sum of losses plus the penalty of the weight decay; return the sum at the end.
 
-        The returned sum does not include the penalty. Only one summand at a time is in memory with its graph of
-        derivatives. steps: maximum number of evaluations of the sum.
+        The result does not include the penalty; it is NaN if no evaluation was finite. Only one summand at a time is in
+        memory with its graph of derivatives. steps: maximum number of evaluations of the sum.
         """
         group = self._optimizer.param_groups[0]
         group["max_iter"], group["max_eval"] = steps, steps

@@ -161,7 +161,7 @@ class Posterior:
 
     @cached_property
     def bodies(self) -> tuple[Interval, ...]:
-        """95 % intervals of the masses [kg] and first moments [kg m] that are base parameters by themselves."""
+        """95 % intervals of the masses [kg] and first moments [kg m] that are identifiable individually."""
         pairs = zip(self._base[0], self.base_parameters, strict=True)
         return tuple(replace(x, positive=name[0] == "m") for name, x in pairs if name in self._first_moments)
 

@@ -135,7 +135,7 @@ class TrainingProgress:
         self._end_stage()
 
     def note(self, diagnostic: Diagnostic) -> None:
-        """Print a diagnostic above the bar."""
+        """Print a diagnostic above the progress bar."""
         if self._show:
             text = str(diagnostic)
             self._console.print("".join(c if c.isprintable() else "?" for c in text), markup=False)

@@ -107,13 +107,12 @@ def position_difference(predicted: Tensor, measured: Tensor, joint_types: Sequen
     """Return predicted minus measured positions, (..., n) [rad, m]; for revolute joints wrapped to +-pi.
 
     For a revolute joint, the magnitude of the wrapped difference is the geodesic distance of the two rotations on
-    SO(3). The loss (eq. 8) of the paper whose model is the preset `spel` uses this distance; here it is computed
-    without matrices.
+    SO(3), which Wang et al. (Sci Rep 15:33179, 2025, eq. 8) use in their loss.
     """
     revolute = torch.tensor([kind == "revolute" for kind in joint_types], device=predicted.device)
     difference = predicted - measured
-    # The number of turns between both positions is constant for the gradient: the derivative of the wrapped difference
-    # with respect to the predicted position is one.
+    # `turns`, the number of turns between both positions, is constant for the gradient, so the derivative of the
+    # wrapped difference with respect to the predicted position is one.
     turns = torch.round(difference.detach() / (2 * math.pi))
     return difference - 2 * math.pi * torch.where(revolute, turns, 0.0)
 
@@ -185,8 +184,8 @@ def rollout_loss(
     """Return the mean square of `rollout_errors`, a dimensionless scalar.
 
     If the predicted state remains the initial state, the loss is 1. All joints and samples have the same weight, since
-    the errors are divided by ``scales``. The loss (eq. 8) of the paper whose model is the preset `spel` sums the same
-    errors without scales, in rad^2 and rad^2/s^2.
+    the errors are divided by ``scales``. Wang et al. (Sci Rep 15:33179, 2025, eq. 8) sum the same errors without
+    scales, in rad^2 and rad^2/s^2.
     """
     return rollout_errors(model, windows, scales, substeps, solver).square().mean()
 
@@ -227,7 +226,10 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:
-    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges."""
+    """Return `rollout_errors`, (W, K-1, 2n), without gradients; a single NaN, (), if a window diverges.
+
+    scales, substeps: as in `rollout_errors`.
+    """
     try:
         with torch.no_grad():
             return rollout_errors(model, windows, scales, substeps)
@@ -254,7 +256,8 @@ def choose_substeps(model: ArmModel, windows: Windows, scales: LossScales, start
     """Return a number of rk4 steps per sample interval that makes the integration error small.
 
     The number is the first of start, 2 start, 4 start, ... with an `integration_error` below
-    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger.
+    `TUNING.integration_fraction`. The search ends at `TUNING.max_substeps` even if the error is larger. windows,
+    scales: training windows on which the error is measured, and divisors of the errors of q and qd.
     """
     substeps, coarse = start, probed(model, windows, scales, start)
     while substeps < TUNING.max_substeps:

@@ -155,15 +155,15 @@ class RolloutObjective(MomentumObjective):
         return max(1, min(self.epoch_steps, int(remaining / self._step_seconds)))
 
     def _rate(self, ahead: int = 0) -> float:
-        """Return the learning rate of the step that follows after ``ahead`` more steps; 0: of the next step."""
+        """Return the learning rate of the step after ``ahead`` further steps; for ``ahead`` = 0, of the next step."""
         fraction = (self._done(ahead) - self.stage_from) / (self._stage_end - self.stage_from)
         return self.learning_rate_factor * self.learning_rate(fraction)
 
     def _done(self, ahead: int = 0) -> float:
-        """Return the progress of the fit, 0 to 1: the larger one of two fractions.
+        """Return the progress of the fit, 0 to 1.
 
-        One is the fraction of all steps that is completed after ``ahead`` more steps, the other is the elapsed fraction
-        of the time limit.
+        It is the larger one of two fractions: all optimizer steps that are completed after ``ahead`` more steps,
+        divided by the number of steps of the fit, and the elapsed time divided by the time limit.
         """
         # The elapsed fraction of the time limit is included, so that the learning-rate schedule also ends with the
         # time limit.

@@ -37,10 +37,10 @@ class Record(BaseModel):
     Attributes:
         config: the options that apply to the model; the type depends on the objective.
         joints: names in the order of q.
-        validation_fraction: None if validation logs were given.
+        validation_fraction: fraction of the logs for validation; None if validation logs were given.
         data_digest: SHA-256 of all numbers of the logs.
         training, validation: names of the trajectories.
-        fingerprints: name of each recording, and the first numbers of its fingerprint (see `Trajectory`).
+        fingerprints: {name of a recording: hashes of its samples}; the hashes show whether a test log was also fitted.
         scales: divisors of the errors in the validation loss.
         mapping: names and units of the columns of the logs.
         servo: parameters of position servos with intervals; None unless a fit of servos has finished.
@@ -76,7 +76,7 @@ class Record(BaseModel):
     @field_validator("config", mode="before")
     @classmethod
     def _of_the_objective(cls, options: object, info: ValidationInfo) -> object:
-        """Return the options of a fit as an object of the configuration class of the fit's objective."""
+        """Return the options of a fit as an object of the class of the fit's objective, for example `TorqueFit`."""
         # `info.data` has no objective if the objective is invalid. pydantic reports the invalid objective, so the
         # options need no check.
         if "objective" not in info.data:
@@ -189,7 +189,7 @@ class Epoch(BaseModel):
 def require(schema: type[Schema], content: object, file: Path, line: int | None = None) -> Schema:
     """Return the content of a file as an object of the schema.
 
-    Raises RunError if a key is absent or has another type.
+    line: line of the content in the file, for the error. Raises RunError if a key is absent or has another type.
     """
     try:
         return schema.model_validate(content)

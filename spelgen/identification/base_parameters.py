@@ -2,8 +2,8 @@
 
 The combinations of inertial parameters are computed exactly by `structure.base_parameters`, so that their names and
 order are the same in every command. The combinations with friction and drives are computed numerically from the
-regressor at random states: a column in the span of the preceding columns is regrouped into these (Gautier and Khalil,
-IEEE T-RA 6:368, 1990).
+regressor at random states: a column in the span of the preceding columns is regrouped into the preceding columns
+(Gautier and Khalil, IEEE T-RA 6:368, 1990).
 """
 
 from dataclasses import dataclass
@@ -94,8 +94,8 @@ def base_parameters(arm: Chain, friction: FrictionModel, motors: np.ndarray | No
 def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, count: int) -> np.ndarray:
     """Return the regressor (E, count) of all parameters at random states of the arm: E equations of torques.
 
-    There are more than twice as many equations as parameters. count: number of parameters. motors: (n, n) matrix from
-    joint speeds to drive speeds; None: identity.
+    There are more than twice as many equations as parameters. friction: the friction model, whose columns are last.
+    motors: (n, n) matrix from joint speeds to drive speeds; None: identity. count: number of parameters.
     """
     n = len(arm.coordinates)
     # `shape`: random states for at least twice as many equations as parameters
@@ -109,7 +109,8 @@ def _columns(arm: Chain, friction: FrictionModel, motors: np.ndarray | None, cou
 def _sum(row: np.ndarray, first: int, names: tuple[str, ...]) -> str:
     """Return the formula of a base parameter, such as ``Izz1 + m2 + 0.1 hx2``.
 
-    row: (K,) coefficients of the parameters. first: index of the first term, whose coefficient is 1.
+    row: (K,) coefficients of the parameters. first: index of the first term, whose coefficient is 1. names: (K,) names
+    of the parameters.
     """
     text = names[first]
     for k in np.flatnonzero(row):

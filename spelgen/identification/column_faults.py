@@ -39,7 +39,10 @@ class WrongOrder(Fault):
         self._rows, self._starts = rows, starts
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques with the columns of two joints exchanged, for all pairs."""
+        """Yield, for each pair of joints, the least-squares fit of the log's torques with their columns exchanged.
+
+        The other corrections in `base` remain.
+        """
         return map(problem.fit, self._swapped(base.hypothesis))
 
     def _swapped(self, base: Hypothesis) -> Iterator[Hypothesis]:
@@ -106,8 +109,8 @@ class WrongScale(Fault):
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
     All subclasses share the method `joint_keys`, which converts the factors to settings. The setting `sign` reverses
-    both the motion and the torque of a joint. If only the motion is wrong, the setting `gain` of the torque is
-    therefore negated, too.
+    both the motion and the torque of a joint. If only the motion is wrong, the setting `gain` of the torque is negated,
+    too, so that the torque keeps its sign.
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
@@ -128,9 +131,10 @@ class WrongScale(Fault):
     def _scaled_by(
         self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
     ) -> Iterator[HypothesisFit]:
-        """Yield, for each array of `factors`, the least-squares fits of the log's torques with scaled signals.
+        """Yield least-squares fits of the log's torques with scaled signals, one or two fits per array of `factors`.
 
-        Rows of an array (2, n) are factors on the motion and on the torques in the hypothesis of the fit `base`.
+        An array (2, n) has the factors on the motion, then the factors on the torques. They multiply the scales that
+        the hypothesis of the fit `base` has.
         """
         reading = base.hypothesis
         for factor in factors:
@@ -222,9 +226,9 @@ class TorqueSense(WrongScale):
 class TorqueUnit(WrongScale):
     """Kind of fault of a log: torques in another unit, with a factor of at least 5.
 
-    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`). A
-    candidate need not lower the cost much, unlike other faults: the fit without it may explain torques that are too
-    small with bodies that are too light.
+    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`).
+    Unlike other faults, another unit is accepted even if it hardly lowers the cost: without it, bodies that are too
+    light may explain torques that are too small.
     """
 
     code = "torque-unit"
@@ -245,7 +249,8 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        The fits with separate factors of the joints are yielded, too.
+        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints. The
+        other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -276,8 +281,12 @@ class TorqueUnit(WrongScale):
 
         The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
         the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
-        little. They are therefore accepted only if (1) the cost falls significantly, although each factor is rare, (2)
-        each factor is determined, and (3) the relative residual of each joint is small.
+        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
+        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
+        joint is small.
+
+        lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
+        factors. has_gravity: True if gravity torques in the log gave a candidate.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau
@@ -303,7 +312,8 @@ class TorqueUnit(WrongScale):
             if not changed.any() or not (changed | (factors == 1)).all():
                 continue
             fit = fitted(factors)
-            # A factor is determined if factors of another unit fit worse; errors of masses are as large as this bound.
+            # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
+            # masses may change it by less than this factor.
             steps = [
                 GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
             ]
@@ -346,10 +356,11 @@ class TorqueUnit(WrongScale):
 
 
 def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for ratios of the gravity in logged torques to the URDF's gravity torque that show another unit.
+    """Return True for ratios that are explained by another unit of torques, and not by wrong inertials of the URDF.
 
-    Wrong inertials do not explain a ratio whose magnitude is at least `GEOMETRY.other_unit`, or at most its inverse.
-    factor: a ratio, or an array of ratios; the result has the same shape.
+    A ratio is the gravity torque in the log divided by the URDF's gravity torque. Its magnitude shows another unit if
+    it is at least `GEOMETRY.other_unit`, or at most the inverse. factor: a ratio, or an array of ratios; the result has
+    the same shape.
     """
     return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
 
@@ -389,8 +400,8 @@ class PositionUnit(WrongScale):
         Args:
             factors: candidates for the factors of all joints of a type, (2, n) each.
             joints: indices of the joints whose factor is also optimised separately.
-            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
-                a fault, and no setting is advised for it.
+            open_fault: fault that replaces this one if the log does not determine the factor. None: this object is such
+                a fault; it advises the user to specify the unit or the gear ratio.
         """
         super().__init__(factors)
         self._joints, self._open_fault = joints, open_fault
@@ -399,7 +410,7 @@ class PositionUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with other units of all joints, and with the best factor of each single joint.
 
-        The factor of a joint whose unit `base` already changes remains.
+        A single joint is omitted if the hypothesis of `base` already changes its unit.
         """
         yield from super().fits(problem, base)
         # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
@@ -422,8 +433,9 @@ class PositionUnit(WrongScale):
             factors[:, joint] = sense * np.exp(exponent), torque_sense * np.exp(-power * exponent)
             return problem.fit(base.hypothesis.changed(fault, scale=scale * factors))
 
-        # Forms (sense of the motion, sense of the torque, power): the torque of the joint (power 0), of either sense
-        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        # A form is (sense of the motion, sense of the torque, power of the factor by which the torque is divided).
+        # Power 0: the logged torque is the torque of the joint, of either sense if the motion is reversed. Power 1: it
+        # is the torque of the motor, which the gear multiplies.
         forms = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
         # the motion ranges over at least 0.05 rad or m, and at most two turns
         exponents = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
@@ -434,8 +446,8 @@ class PositionUnit(WrongScale):
             lambda x: fitted(x, form).cost,
             bounds=(start - 0.15, start + 0.15), method="bounded", options={"xatol": 0.002},
         )  # fmt: skip
-        # The factor is undetermined if a factor that is 10 % larger or smaller explains the log about equally well, or
-        # if another form does.
+        # The log does not determine the factor if a factor that is 10 % larger or smaller, or another form, explains
+        # the log about equally well.
         sides = [fitted(best.x + change, form).cost for change in (-0.1, 0.1)]
         sides += np.delete(costs.min(axis=0) - GEOMETRY.ambiguous + GEOMETRY.right_angle, column).tolist()
         fault = self if min(sides) > best.fun + GEOMETRY.right_angle else self._open_fault or self

@@ -38,7 +38,7 @@ class ZeroOffset(Fault):
         """Yield the least-squares fit with the best zero offset of a joint, if it lowers the torque residual enough.
 
         Offsets as small as calibration errors are omitted. A multiple of 90 degrees is preferred to the offset of
-        minimum cost if its cost is about equal.
+        minimum cost if its cost is about equal. The other corrections in `base` remain.
         """
         reading, unit = base.hypothesis, np.eye(len(base.hypothesis.offset))[joint]
         min_offset = GEOMETRY.min_angle if is_revolute else GEOMETRY.min_shift
@@ -49,8 +49,9 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # The descent ends at a step below `smallest`. From the unchanged zero, this is `min_offset`: a smaller offset
-        # is only a calibration error. From a multiple of 90 degrees, it is smaller, so that the offset is accurate.
+        # The descent ends at a step below `smallest`. If it starts at the unchanged zero, `smallest` is `min_offset`: a
+        # smaller offset is only a calibration error. If it starts at a multiple of 90 degrees, `smallest` is less, so
+        # that the offset is accurate.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -64,8 +65,8 @@ class ZeroOffset(Fault):
         # determine which of the two is right: both are candidates.
         if not candidates or abs(offset - right)[0] > GEOMETRY.serious_angle:
             candidates.append(problem.fit(shifted(offset.round(4))))
-        # An offset must also lower the torque residual (misfit), and not only the prior term: otherwise it only
-        # replaces a change of the masses, whose values in the URDF are uncertain.
+        # An offset must lower the torque residual (misfit). If it lowers only the prior term, it only replaces a change
+        # of the masses, whose values in the URDF are uncertain.
         for fit in candidates:
             change = (fit.hypothesis.offset - reading.offset)[joint]
             if abs(change) >= min_offset and fit.misfit <= base.misfit - GEOMETRY.needed / 2:
@@ -93,7 +94,7 @@ class ZeroOffset(Fault):
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all zero offsets may be errors of the URDF, since they are small; else ""."""
+        """Return the code of a warning if all zero offsets are as small as errors of a URDF; else "", for an error."""
         shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
         is_revolute = np.array(correction.arm.joint_types) == "revolute"
         bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
@@ -199,7 +200,7 @@ class Gravity(Compensation):
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if gravity is tilted little, as for an arm mounted slightly askew; else ""."""
+        """Return the code of a warning if gravity is tilted no more than by mounting errors; else "", for an error."""
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

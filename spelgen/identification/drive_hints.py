@@ -145,7 +145,8 @@ class DriveProblem:
     def with_hysteresis(self) -> DriveProblem:
         """Return the least-squares problem with the deflections of bristles as additional columns of the regressor.
 
-        Its dry friction depends on the past motion. The columns are after the columns of the bodies.
+        The dry friction of this problem depends on the past motion. The new columns are after the columns of the
+        bodies.
         """
         drives = len(FRICTION.effects) * len(self.size) + 1
         bristles = bristle_columns(self.samples.bent, self.speeds)
@@ -237,7 +238,7 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
 
 
 def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coupling:
-    """Return the coupling `start` with the ratio of minimum cost, between half and twice its ratio.
+    """Return the coupling `start` with the ratio of minimum cost, between half and twice the ratio of `start`.
 
     A fraction of small integers near the minimum is preferred if its cost is at most 2 % higher.
     """

@@ -65,8 +65,8 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     stateful = coarse.with_hysteresis()
     unchanged = coarse.fit(problem.unchanged)
     fits = [unchanged]
-    # At most three corrections are combined, where any permutation of the columns is one correction: more corrections
-    # could explain any log.
+    # At most three corrections are combined; a permutation of the columns counts as one. More corrections could explain
+    # any log.
     for _ in range(3):
         base = min(fits, key=RANK)
         # If a log has two faults, the best single correction may be wrong. Further corrections are therefore added to
@@ -76,7 +76,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, stateful, _corrected(coarse, stateful, faults, start), start)
         better = min(tried, key=RANK)
-        # To save time, permutations of all joints and long drifts of delays are searched only if no single correction
+        # Permutations of all joints and long drifts of delays take time. They are searched only if no single correction
         # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
         # wrong signals.
         is_wrong = (
@@ -132,7 +132,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         reduced = [x for x in remaining if x != worst]
         without = errors(reduced)
         usual = np.mean([without[x] for x in reduced], axis=0)
-        # The others must agree with each other: recordings that all have the same fault contradict each other, too.
+        # No recording is reported if the others contradict each other, too: then the fault may be in all recordings.
         is_worse = (without[worst] > GEOMETRY.unexplained) & (without[worst] > GEOMETRY.deviation * usual)
         if not is_worse.any() or usual.mean() > GEOMETRY.explained:
             break
@@ -143,10 +143,10 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
 def _corrected(
     problem: GeometryProblem, stateful: GeometryProblem, faults: Sequence[Fault], base: HypothesisFit
 ) -> list[HypothesisFit]:
-    """Return fits of `problem` under the hypotheses with one more corrected fault than the hypothesis of `base`.
+    """Return fits of `problem` under hypotheses that correct one more fault than the hypothesis of `base` does.
 
     stateful: `problem` with a friction model with hysteresis. Continuous quantities of a hypothesis, such as a zero
-    offset, are optimised in `stateful`: without hysteresis the optimum compensates errors of the friction model.
+    offset, are optimised in `stateful`: without hysteresis, the optimum would compensate errors of the friction model.
     """
     fits, start = list[HypothesisFit](), stateful.fit(base.hypothesis)
     for fault in faults:
@@ -166,11 +166,11 @@ def _weighed(
     under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
 
     Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
-    and b the decrease in fits with hysteresis. For right hypotheses b shows the whole decrease, but for wrong ones it
-    is larger, too: on recorded arms they have b up to 32 and a up to 17. A wrong hypothesis may also have a large a and
-    a small b, since it explains the friction that the model without hysteresis lacks. The decrease is therefore a,
-    limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a, b):
-    hysteresis resembles a delay, so such a hypothesis must lower both costs.
+    and b the decrease in fits with hysteresis. For a right hypothesis, b is the whole decrease. For a wrong hypothesis,
+    b may also be larger than a: on recorded arms, b is up to 32 and a up to 17. A wrong hypothesis may also have a
+    large a and a small b, since it explains the friction that the model without hysteresis lacks. The decrease is
+    therefore a, limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a,
+    b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.

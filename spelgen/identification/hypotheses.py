@@ -1,7 +1,7 @@
 """Hypotheses about a log: joint, scale, zero and delay of its columns, the direction of gravity, and kinds of faults.
 
-A subclass of `Fault` holds all that concerns a kind of fault: the hypotheses to test, the sentence about the fault, and
-the settings that correct it. `kinds_of_faults` in `spelgen.identification.geometry_search` lists all kinds.
+A subclass of `Fault` defines a kind of fault: the hypotheses to test, the sentence about the fault, and the settings
+that correct it. `kinds_of_faults` in `spelgen.identification.geometry_search` lists all kinds.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Hypothesis:
 
     @property
     def motion_key(self) -> tuple[bytes, Vector3]:
-        """Key under which the regressor of the hypothesis is cached, since it depends only on motion and gravity."""
+        """Key of the cached regressor of the hypothesis, which depends only on the corrected motion and on gravity."""
         arrays = (self.source[0], self.scale[0], self.offset, self.delay[0], self.drift[0])
         return b"".join(x.tobytes() for x in arrays), self.gravity
 
@@ -198,11 +198,11 @@ class Fault(ABC):
         needed: smallest decrease of the cost with which a hypothesis is accepted.
         evidence: sentence with the evidence for the fault; "" if the evidence is the torque residual.
         advice: remedy of a fault that no setting corrects.
-        is_optimised: True if quantities of the hypotheses, such as a zero offset, are optimised with a friction model
-            with hysteresis.
+        is_optimised: True for faults with a continuous quantity, such as a zero offset. The quantity is optimised with
+            a friction model that has hysteresis.
 
-    Methods with an argument `correction` return texts or settings for the hypothesis `correction.hypothesis`, which has
-    a fault of this kind.
+    The argument `correction` of a method contains a hypothesis with a fault of this kind (`correction.hypothesis`). The
+    method returns the text or the settings for this hypothesis.
     """
 
     code: str
@@ -251,5 +251,8 @@ class Fault(ABC):
         return {}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if `correction` is as small as errors of a URDF or mounting; "" for an error."""
+        """Return the code of a warning; "" if the fault is an error.
+
+        A fault is only a warning if `correction` is as small as errors of a URDF or of the mounting.
+        """
         return ""

@@ -216,8 +216,9 @@ class _Equations:
 def _jackknife(products: np.ndarray, solution: Solution, combination: np.ndarray) -> np.ndarray:
     """Return the standard deviations (r,) of base parameters from a jackknife over blocks of samples.
 
-    See `jackknife_covariance`. products: (B, K + 1, K + 1) weighted Gram matrices of regressor and torque per block of
-    samples. combination: (r, k) coefficients of the k fitted parameters in each of the r base parameters.
+    See `jackknife_covariance`. solution: least-squares fit to all blocks. products: (B, K + 1, K + 1) weighted Gram
+    matrices of regressor and torque per block of samples. combination: (r, k) coefficients of the k fitted parameters
+    in each of the r base parameters.
     """
     columns = solution.columns
     curvature, target = products[:, columns[:, None], columns], products[:, columns, -1]

@@ -64,13 +64,13 @@ class Solution:
     def deviations(self, products: np.ndarray, errors: np.ndarray, combination: np.ndarray) -> np.ndarray:
         """Return the standard deviations (k,) of k linear combinations of the fitted parameters.
 
-        The sandwich estimator is valid even if the weights are not the inverse standard deviations of the errors
-        (White, Econometrica 48:817, 1980).
+        The sandwich estimator V M V, with V = `covariance`, M = sum over joints j of (s_j w_j^2)^2 Y_j^T Y_j and the
+        regressor Y_j, is valid even if the weights w_j are not the inverse standard deviations of the errors (White,
+        Econometrica 48:817, 1980).
 
         Args:
             products: (n, K + 1, K + 1) Gram matrices of the K regressor columns and the torque, per joint.
             errors: (n,) s_j w_j^2, with the standard deviation s_j of the torque error and the weight w_j of joint j.
-                The middle factor of the sandwich is the sum over j of (s_j w_j^2)^2 Y_j^T Y_j, with the regressor Y_j.
             combination: (k, r) coefficients of the r fitted parameters (`columns`) in each of the k combinations.
         """
         effects = combination @ self.covariance

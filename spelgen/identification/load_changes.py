@@ -50,7 +50,7 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
         for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
-            # The first recording is part of every group; only its first change is returned.
+            # The first recording is part of every group of recordings; of its several changes, the first is returned.
             changes.setdefault(change.recording, change)
     return list(changes.values())
 

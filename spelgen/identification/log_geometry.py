@@ -113,7 +113,10 @@ class GeometryProblem:
         return extended
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
-        """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint."""
+        """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint.
+
+        For example, `signs` restores the signs of torques that were logged as magnitudes.
+        """
         other, values = copy(self), self.samples.values.copy()
         values[:, :, 3] *= signs[..., None]
         other.samples = self.samples._replace(values=values)
@@ -251,7 +254,10 @@ class GeometryProblem:
         return solution(matrix, vector), inverse(matrix)
 
     def _linearized(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`."""
+        """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`.
+
+        columns: (S, n, D) derivative of the torque residual with respect to the D quantities.
+        """
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
         weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
@@ -377,7 +383,7 @@ def _joint_step(
     """
     count, coupling = len(x), weights[:, None] * products
     scale = weights * gains
-    # The ridge keeps the gain of a joint without load: the gain is then confounded with friction.
+    # The factor 1 + 1e-6 is a ridge: it keeps the gain of a joint without load, which is confounded with friction.
     power = scale * (products @ x) * (1 + 1e-6) + 1e-30
     whole = np.block([[matrix, coupling.T], [coupling, np.diag(power)]])
     step = solution(whole, np.append(vector, scale * agreement))
@@ -436,8 +442,8 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # The standard deviations of the prior are 50 %: for the mass, of the mass; for the centre of mass, of the body's
-    # extent; for the inertia tensor, of mass times squared radius of gyration.
+    # The standard deviations of the prior are half of these values: of the mass, of the body's extent (for the centre
+    # of mass), and of mass times squared radius of gyration (for the inertia tensor).
     return 0.5 * root
 
 

@@ -26,8 +26,8 @@ from spelgen.logs.dynamics_samples import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-# [samples at 100 Hz] Times around a sample at which signals are kept for it: every 20 ms, which determines signals of
-# the filter's bandwidth.
+# [samples at 100 Hz] Times around a sample at which signals are stored for it: every 20 ms. The signals are low-pass
+# filtered, so that they can be interpolated between these times.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 # [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
 ENDS = 3
@@ -57,7 +57,10 @@ class MotionSamples(NamedTuple):
     def of(
         cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
     ) -> MotionSamples:
-        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples."""
+        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples.
+
+        recording: index of the recording that contains the samples.
+        """
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         numbers = np.full(len(q), recording)
         return cls(values, np.zeros((*q.shape, 0)), np.sign(qd), np.zeros(len(q)), numbers)
@@ -123,10 +126,10 @@ def joined_samples(samples: Sequence[MotionSamples]) -> MotionSamples:
 
 @cache
 def interpolation() -> CubicSpline:
-    """Return a function of the time [s] after a sample, whose results are weights (E,) for cubic interpolation.
+    """Return a function of the time t [s] after a sample; its results are weights (E,) for cubic interpolation.
 
-    The sum of the weights times a signal's values at the E times `OFFSETS` around the sample is the cubic spline
-    through these values, evaluated at this time.
+    The signal at t is the sum of the weights times the signal's values at the E times `OFFSETS` around the sample. It
+    is the value of the cubic spline through these values.
     """
     return CubicSpline(OFFSETS / FREQUENCY, np.eye(len(OFFSETS)))
 
@@ -134,8 +137,9 @@ def interpolation() -> CubicSpline:
 class DriveLog:
     """Collector of a bounded number of samples from successive trajectories, for the detection of delays and couplings.
 
-    Whenever it has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there are many
-    trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes minutes.
+    Whenever the collector has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there
+    are many trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes
+    minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
@@ -181,7 +185,7 @@ class DriveLog:
         self._every *= 2
 
     def _shifted(self, samples: DynamicsSamples, start: float) -> MotionSamples:
-        """Return every k-th of the samples in motion (k = `_every`), with the signals at the times `OFFSETS` around it.
+        """Return every k-th of the samples in motion (k = `_every`), each with its signals at the times `OFFSETS`.
 
         start: time from the start of the recording to the first of `samples` [s].
         """

@@ -174,7 +174,8 @@ class JointClock(Fault):
             )
             is_clock = abs(delays[1] - delays[0]) >= GEOMETRY.min_delay
             is_clock &= bool(np.abs(best.hypothesis.drift).max() <= GEOMETRY.clock_error)
-            # No setting corrects a clock, so the finding must be certain: the mean residual of the joints must fall.
+            # No setting corrects signals with the times of another clock: the user can only record again. The finding
+            # must be certain, so the mean residual of the joints must fall, too.
             is_certain = best.errors.mean() < GEOMETRY.lower * base.errors.mean()
             if is_clock and is_certain and _explains_more(problem, base, best):
                 yield best

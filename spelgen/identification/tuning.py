@@ -28,9 +28,9 @@ class DriveHintTuning:
 
     # [1] Number of blocks of time in the cross-validation; each block is held out once.
     blocks: int = 10
-    # [1] A coupling is accepted if its squared residual is below this fraction of the squared residual without the
-    # coupling and, in each block, below this fraction of the squared torque. For the coupled wrist joints of a Staubli
-    # TX40 these fractions are 0.05 and 0.03.
+    # [1] A coupling is accepted if the squared residual with it is below this fraction of the squared residual without
+    # it and, in each block, below this fraction of the squared torque. For the coupled wrist joints of a Staubli TX40
+    # these fractions are 0.05 and 0.03.
     coupling_gain: float = 0.5
     # [s] Longest delay of the torques of all joints. It covers the delays of loggers and field buses; a longer apparent
     # delay may be due to friction.
@@ -81,37 +81,40 @@ class LogGeometryTuning:
     explained: float = 0.05
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
-    # [1] Smallest squared torque residual of a recording with a fault of its own, divided by the squared residual of
-    # the other recordings, to which the model is fitted.
+    # [1] A recording has a fault of its own if its squared torque residual is larger than this multiple of the squared
+    # residual of the other recordings, to which the model is fitted.
     deviation: float = 5.0
-    # [1] Relative residual variance of a joint above which a hypothesis does not explain its torque, so that its
-    # correction is not advised. With the right correction, logs of recorded arms have at most 0.07 in the mean of the
-    # joints, and at most 0.27 at a joint whose torque is mostly friction.
+    # [1] A hypothesis does not explain the torques if the relative residual variance is above this value, at a joint
+    # and in the mean of the joints that the hypothesis affects. With the right correction, logs of recorded arms have
+    # at most 0.07 in the mean of all joints, although up to 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
-    # [1] Relative residual variance of the unchanged log above which its torques are no joint torques.
+    # [1] If the relative residual variance of the unchanged log is above this value, its torques are probably no joint
+    # torques.
     no_torque: float = 0.6
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.
     load: float = 0.5
-    # [m] Standard deviation of the distance of this load's centre of mass from the origin of the last body.
+    # [m] Standard deviation of the distance of the centre of mass of such a tool or load from the origin of the last
+    # body.
     load_distance: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
     # [1] Largest number of samples for the final comparison of the best hypotheses.
     confirming_samples: int = 800
-    # [rad] Zero offsets below this bound are calibration errors.
+    # [rad] Zero offsets below this bound are calibration errors and are not reported.
     min_angle: float = 0.09
-    # [rad] Tilts of the base below this bound are errors of the mounting.
+    # [rad] Tilts of the base below this bound are errors of the mounting and are not reported.
     min_tilt: float = 0.06
-    # [m] Zero offsets of prismatic joints below this bound are calibration errors.
+    # [m] Zero offsets of prismatic joints below this bound are calibration errors and are not reported.
     min_shift: float = 0.01
-    # [s] Delays of single joints below this bound are ascribed to friction, whose apparent delay is up to 30 ms.
+    # [s] Delays of single joints below this bound are not reported: friction causes an apparent delay of up to 30 ms.
     min_delay: float = 0.03
     # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
     delay_start: float = 0.06
     # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
-    # [1] Largest relative error of a clock; a larger one explains other errors, such as friction of slow motions.
+    # [1] Largest relative error of a clock's rate. A larger error is rejected, since it would explain other errors of
+    # the model, such as friction of slow motions.
     clock_error: float = 0.05
     # [1] A delay is accepted if the squared residual of a joint with the delay is below this fraction of its value
     # without delay; wrong delays have fractions from 0.78 on, on recordings of seven arms.
@@ -121,10 +124,10 @@ class LogGeometryTuning:
     unsigned_gain: float = 0.4
     # [1] Increase of the cost up to which a multiple of 90 degrees is preferred to the angle of minimum cost.
     right_angle: float = 3.0
-    # [rad] Zero offsets and tilts of the base below this bound give warnings, not errors.
+    # [rad] Zero offsets and tilts of the base up to this bound are reported as warnings, larger ones as errors.
     serious_angle: float = 0.17
-    # [m] Zero offsets of prismatic joints below this bound give warnings: a link of 0.3 m, tilted by `serious_angle`,
-    # has its end displaced by this distance.
+    # [m] Zero offsets of prismatic joints up to this bound are reported as warnings, larger ones as errors. A link of
+    # 0.3 m, tilted by `serious_angle`, has its end displaced by this distance.
     serious_shift: float = 0.05
 
 

@@ -248,7 +248,7 @@ def _decoded_head(file: Path) -> tuple[str, str]:
         head = source.read(size)
     if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16", head.decode("utf-16", "ignore")
-    # Without a mark of the byte order, the first character shows UTF-16: its other byte is 0.
+    # UTF-16 without a mark of the byte order: one of the two bytes of the first character, a Latin letter, is 0.
     if 0 in head[:2] and head[:2] != b"\0\0":
         encoding = "utf-16-le" if head[1] == 0 else "utf-16-be"
         return encoding, head.decode(encoding, "ignore")

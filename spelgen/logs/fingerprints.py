@@ -12,7 +12,10 @@ RUN = 4
 
 
 class Fingerprints:
-    """Fingerprints of recordings by name."""
+    """Collection of fingerprints, which finds the recording of which another recording is a copy or a part.
+
+    A fingerprint is the result of `smallest_hashes`. Recordings are identified by their names.
+    """
 
     def __init__(self) -> None:
         self._recordings: dict[str, Collection[int]] = {}

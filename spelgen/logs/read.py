@@ -92,7 +92,7 @@ def _read(
     Args:
         paths, role: see `read_logs`.
         source: joints of the logs, and the mapping of their columns.
-        segments: empty collector of the rows of the files; its argument is the memory limit.
+        segments: empty collector of the rows of the files, made with the memory limit.
         joint_types: types of the joints, for the check of the units in the mapping.
     """
     collect(source.mapping.misfits(source.joints, source.joint_types or joint_types))

@@ -113,8 +113,8 @@ class LogSegments:
     def _selected(self, pieces: list[Piece], row_bytes: int) -> list[Piece]:
         """Return the segments to keep of `pieces`, the segments of a table.
 
-        If the limit of memory is exceeded, `every` is doubled (one of `every` segments is kept), and every second one
-        of the segments that were collected before is removed. row_bytes: memory of one row of the table [B].
+        One of `every` segments is kept. If the kept segments of all tables would exceed `kept_bytes`, `every` is
+        doubled, and every second segment of the earlier tables is removed. row_bytes: memory of one row [B].
         """
         while True:
             selected = pieces[-self._count % self.every :: self.every]

@@ -143,7 +143,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     gear = abs(signals.factor)
     if is_far and is_known and not signals.is_whole and np.abs(signals.q).max() < TURNS * gear:
-        # Any other ratio is possible at the motor of a gear. The correlation shows how exact the measured ratio is.
+        # If q is measured at the motor of a gear, any ratio of dq/dt to qd is possible. The correlation shows how exact
+        # the measured ratio is.
         keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
         if signals.factor < 0:
             # The setting `sign` also reverses the torque, which is assumed to have the sense of the velocity.

@@ -28,7 +28,10 @@ Weights = tuple[tuple[int, int, Fraction], ...]
 
 
 def row_of(weights: Weights, n: int) -> np.ndarray:
-    """Return the lower triangle of a sparse symmetric (n, n) matrix as a vector (n(n+1)/2,), row after row."""
+    """Return the lower triangle of a sparse symmetric (n, n) matrix as a vector (n(n+1)/2,), row after row.
+
+    weights: (row, column, value) of each element of the lower triangle that is not zero.
+    """
     row = np.zeros(n * (n + 1) // 2)
     for i, j, value in weights:
         row[i * (i + 1) // 2 + j] = float(value)

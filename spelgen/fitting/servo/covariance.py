@@ -16,9 +16,8 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
     """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
 
     The fit determines the covariance of k parameters. The derivatives of the K parameters of the model with respect to
-    these k parameters give the covariance (K, K). Users of the result multiply standard deviations by 1.96. The
-    covariance is therefore scaled such that this product is half the width of the 95 % interval of Student's t
-    distribution.
+    these k parameters give the covariance (K, K). The covariance is scaled such that 1.96 standard deviations are half
+    the width of the 95 % interval of Student's t distribution.
 
     Two covariances are added: the variance of kd, armature and friction due to errors of the friction model
     (`ServoTuning.model_deviation`), and the prior covariance of the body parameters orthogonal to the directions that

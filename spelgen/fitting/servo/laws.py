@@ -1,7 +1,7 @@
 """Selection of the joints that have a dead zone: fits with and without a dead zone are compared.
 
 Each joint is fitted twice, from initial parameters with and without a dead zone. The dead zone is kept if it lowers the
-joint's negative log posterior by more than significance^2 / 2. Load, delay and the weights of the errors are fixed at
+joint's negative log posterior by more than significance^2 / 2. Load, delay and the scale of the errors are fixed at
 the preceding fit in both fits, so that the joints are independent.
 
 A single linearized fit does not suffice at joints without gravity load. There, a dead zone and dry friction both cause
@@ -31,7 +31,7 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
     problem = problem.reweighted(x)
     without, costs_without = _joint_minima(problem, x)
     with_zones, costs_with = _joint_minima(problem, with_dead_zones(problem, x, TUNING.dead_zone_fraction))
-    # A cost with a dead zone is NaN or infinite if a rollout diverged: no dead zone is then selected. Costs without a
+    # If a rollout with a dead zone diverged, the cost is NaN or infinite, and no dead zone is selected. Costs without a
     # dead zone are finite, since the rollouts at x are finite.
     better = costs_with + TUNING.significance**2 / 2 < costs_without
     joints, active = torch.where(better, with_zones.joints, without.joints), x.active.clone()
@@ -40,10 +40,10 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return parameters x, in which small dead zones are set to zero and no longer fitted.
+    """Return x with small dead zones set to zero and excluded from the fit.
 
-    A dead zone is small if its parameter, half its width [rad, m], is below `TUNING.min_dead_zone`. The resolution of
-    encoders is similar to this bound, so that smaller dead zones cannot be measured.
+    A dead zone is small if half its width [rad, m], the parameter, is below `TUNING.min_dead_zone`. This bound is about
+    the resolution of encoders: smaller dead zones cannot be measured.
     """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
@@ -72,9 +72,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`, or after a step
-        # with a damping of at least 1 that does not lower it: with more damping, the decrease would be negligible.
-        active &= torch.where(better, costs - candidate_costs >= TUNING.min_decrease, damping < 1.0)
+        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`.
+        active &= ~better | (costs - candidate_costs >= TUNING.min_decrease)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
         costs = torch.where(better, candidate_costs, costs)

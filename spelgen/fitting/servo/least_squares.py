@@ -26,8 +26,7 @@ from spelgen.fitting.servo.windows import ServoWindows, body_load
 def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
     """Set kp, kd, armature, friction and offset of the model by linear regression of the command error u - q.
 
-    u - q, commanded minus measured position, is linear in the ratios of these parameters to kp (see the top of this
-    module).
+    u is the commanded, q the measured position. See the top of this module for the equation.
     """
     delay = 1 / windows.rate
     model.servo.delay.fill_(delay)

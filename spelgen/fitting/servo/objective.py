@@ -128,7 +128,10 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Take a last Gauss-Newton step, with half the integration step length; set `results` and the checkpoint."""
+        """Take a last Gauss-Newton step from x, with half the integration step length.
+
+        Its result is written to `results` and to the checkpoint.
+        """
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
@@ -152,8 +155,7 @@ class ServoObjective(Objective):
         if len(self._iterates) == OUTER_ITERATIONS - 1:
             rollouts = replace(rollouts, windows=self._windows)
             rollouts = rollouts.linearized(x, self._windows.motion())
-        # The first outer iteration uses half the integration steps, which is accurate enough for it; the others use all
-        # of them.
+        # The first outer iteration needs less accuracy and uses half the integration steps; the others use all of them.
         elif self._iterates:
             rollouts = replace(rollouts, windows=replace(rollouts.windows, steps=self._windows.steps))
         if self._iterates:

@@ -1,4 +1,4 @@
-"""Posterior of a fit to positions under position servos, which determine damping, friction, ... only relative to kp."""
+"""Posterior of a fit to positions under position servos: damping, friction, ... are determined only relative to kp."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -41,8 +41,8 @@ class ServoPosterior(Posterior):
     def scale_joint(self) -> str | None:
         """Name of the joint whose kp divides the base parameters; None if a kp is known.
 
-        Of all joints, this joint gives quotients with the smallest median of the relative standard deviations. If a kp
-        is known, the base parameters themselves are determined and not divided.
+        Of all joints, the ratios (base parameter / kp) of this joint have the smallest median relative standard
+        deviation. If a kp is known, the base parameters themselves are determined and not divided.
         """
         return None if self._scale_index is None else self.model.joint_names[self._scale_index]
 

@@ -85,10 +85,9 @@ class ServoSolution:
 def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters, ServoSolution]:
     """Take one Gauss-Newton step from x; return the parameters, their normal equations and their covariance.
 
-    x is the result of a fit with longer integration steps than ``problem`` has. The step is therefore an estimate of
-    the integration error of x, and its outer product is added to the covariance. The normal equations are computed at
-    x, and extrapolated to the end of the step. If the step raises the cost, x is
-    returned.
+    x is the result of a fit with longer integration steps than ``problem`` has. The step s is therefore an estimate of
+    the integration error of x, and s s^T is added to the covariance. The normal equations are computed at x and
+    extrapolated to x + s. The returned parameters are x + s, or x if the step raises the cost.
     """
     # The dead zones of all joints are free parameters here: if they were fixed at zero, the covariance of dry friction
     # would be too small.
@@ -192,12 +191,13 @@ def ratios_with_deviations(
 
 
 def servo_record(problem: ServoProblem, solution: ServoSolution, x: ServoParameters, steps: int) -> Content:
-    """Return the record of a fit for config.json: delay [s], RMS errors [rad, m], and per joint kp and ratios to kp.
+    """Return the record of a servo fit for config.json: delay [s], RMS errors [rad, m], and parameters of each joint.
 
-    The ratios are the keys of `RATIOS`, each with its 95 % interval. The key "determined" of a ratio is True if the
-    upper end of its interval is below `ServoTuning.max_factor` times the ratio. For dry friction and the dead zone, the
-    logs must also distinguish one from the other (see `identifiable`). x: fitted parameters. steps: number of
-    Levenberg-Marquardt steps of the fit.
+    The parameters of a joint are kp and the quantities of `RATIOS`, such as kd / kp, each with its 95 % interval. The
+    entry "determined" of a quantity is True if the upper end of the interval is below `ServoTuning.max_factor` times
+    its value. Dry friction / kp and dead zone must also be distinguishable from each other (see `identifiable`).
+
+    x: fitted parameters. steps: number of Levenberg-Marquardt steps of the fit.
     """
     return {
         "delay": {"value": x.delay, "half": solution.quantile * float(solution.covariance[-1, -1].sqrt())},

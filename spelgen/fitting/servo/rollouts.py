@@ -69,11 +69,11 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions, and velocities and accelerations from rollouts with the parameters x.
+        """Return measured positions with velocities and accelerations from rollouts at x, at midpoints between samples.
 
-        Velocities and accelerations are sums of the derivatives of the predicted positions and the smoothed derivatives
-        of the measured minus the predicted positions. Smoothed derivatives of the measured positions would attenuate
-        fast motion (see `ServoWindows.motion`).
+        The velocities are derivatives of the predicted positions, plus smoothed derivatives of the difference (measured
+        minus predicted position). The accelerations are computed in the same way. Smoothed derivatives of the measured
+        positions would attenuate fast motion (see `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

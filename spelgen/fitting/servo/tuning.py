@@ -41,7 +41,8 @@ class ServoTuning:
     # [1] Largest number of directions of the body parameters that are fitted: the directions with the largest effect on
     # gravity. Other directions remain at the prior mean.
     body_directions: int = 6
-    # [1] Smallest effect of a fitted direction of the body parameters on gravity, relative to the largest effect.
+    # [1] A direction of the body parameters is fitted only if its effect on gravity is at least this fraction of the
+    # largest effect.
     min_effect: float = 1e-3
     # [1] Prior standard deviation of a parameter that is not fitted. The deviation is practically zero, so the
     # parameter is constant.
@@ -58,8 +59,8 @@ class ServoTuning:
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
     max_step: float = 1.0
-    # [1] Number of samples at whose positions the effect of body parameters on gravity is computed, which determines
-    # the fitted directions (`body_directions`).
+    # [1] Number of samples at whose positions the effect of body parameters on gravity is computed. The fitted
+    # directions (`body_directions`) have the largest effect.
     gravity_samples: int = 2000
 
     # Constants of the outer iterations and their convergence (`servo.objective`).
@@ -85,14 +86,14 @@ class ServoTuning:
 
     # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
-    # [1] Half the initial dead zone, as a fraction of the static error, dry friction / kp plus half the dead zone.
+    # [1] Half the width w of the initial dead zone, as a fraction of the static error, dry friction / kp + w / 2.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
     # with a dead zone and the fit without.
     joint_steps: int = 6
-    # [1] Smallest significance of a selected dead zone, in standard deviations.
+    # [1] Smallest significance z of a selected dead zone: the dead zone must lower the cost by more than z^2 / 2.
     significance: float = 4.0
-    # [rad, m] Smallest value of half a dead zone; for comparison, the step of a 12-bit encoder is 1.5e-3 rad.
+    # [rad, m] Dead zones of a smaller half width are set to zero. The step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
     # Constants of the intervals and the identifiability of the fitted parameters (`servo.report`).
@@ -121,9 +122,9 @@ class ServoTuning:
     # [1] The initial kp is computed from the coefficient of gravity only if it differs from the nominal kp by less than
     # this factor; otherwise kp / nominal kp is the median of the other joints.
     kp_range: float = 20.0
-    # [1] Smallest initial dry friction, as a fraction m of nominal friction. The smallest initial kd/kp is m^2 s, 5 %
-    # of 0.05 s (`ModelTuning.servo_lag`). The smallest initial armature/kp is m^3 s^2, 5 % of 0.0025 s^2 = 1 / (20
-    # rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
+    # [1] Lower bound m of three initial values: dry friction is at least m times nominal friction, kd/kp at least m^2 =
+    # 0.0025 s, and armature/kp at least m^3 = 0.000125 s^2. The last two are 5 % of 0.05 s (`ModelTuning.servo_lag`)
+    # and of 1 / (20 rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
     min_friction: float = 0.05
     # [s] Largest delay of linear servos.
     max_delay: float = 0.4

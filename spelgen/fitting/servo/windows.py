@@ -80,8 +80,8 @@ class ServoWindows:
         for number in range(len(names)):
             windows = np.flatnonzero(log_numbers == number)
             blocks[windows] += np.arange(len(windows)) * segments // len(windows)
-        # Blocks are renumbered without gaps, since a log with fewer windows than segments has segments, that is blocks,
-        # without windows.
+        # A log with fewer windows than segments has segments without windows. The blocks are therefore renumbered
+        # without gaps.
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:

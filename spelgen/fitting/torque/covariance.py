@@ -53,7 +53,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
     intervals of the posterior covariance contain only 93 % and 89 %.
 
     The held-out residual of a block is computed without another fit: it is residual - J step, with the Jacobian J of
-    the block and the Newton step of the parameters for the removal of the block.
+    the block. The step is the change of the parameters if the block is omitted, by one Newton step.
     """
     problem, x, free = estimate.problem, estimate.state.x, estimate.problem.free
     model, change = problem.jacobian.model, problem.jacobian.theta_jacobian(x)
@@ -81,7 +81,7 @@ def jackknife(estimate: TorqueEstimate) -> Jackknife:
 
 
 def _products(jacobian: TorqueJacobian, x: torch.Tensor) -> torch.Tensor:
-    """Return the Gram matrix of the columns [J, residual] of each joint, (n, K + 1, K + 1), at parameters x (K,).
+    """Return the Gram matrix of the columns of [J, residual] for each joint, (n, K + 1, K + 1), at parameters x (K,).
 
     J (T, K) is the Jacobian of the modelled torque with respect to theta, which is x with inertial parameters in place
     of log-Cholesky parameters (see `TorqueJacobian.joint_rows`). residual: torque residual (T,) of the joint.

@@ -49,13 +49,14 @@ class FitComparison(NamedTuple):
     """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
     Attributes:
-        fit, regression: mean squared error of held-out blocks divided by the variance of the torque, averaged over
-            joints, of the returned model and of the regression.
+        fit: error of the returned model: mean squared error of held-out blocks divided by the variance of the torque,
+            averaged over joints.
+        regression: the same error of the ridge regression.
         behind: True if the regression is significantly better than the fit.
-        replaced: None if the initial guess of the fit was the URDF. Otherwise the initial guess was the result of the
-            regression, and `replaced` is the error of the rejected fit from the URDF, which is larger than `fit`.
-        discarded: None if the returned model is a fit. Otherwise the returned model is the model before the fit, since
-            the logs do not support a fit, and `discarded` is the error of the fit, which is not smaller than `fit`.
+        replaced: error of a fit from the URDF that was replaced by a better fit from the result of the regression; None
+            if the returned fit started at the URDF.
+        discarded: error of a fit that was discarded, since the model before the fit has no larger error; this model is
+            then returned. None if a fit is returned.
     """
 
     fit: float
@@ -169,8 +170,8 @@ def _staged_fit(
 ) -> _StagedFit:
     """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
 
-    adapt, max_error: purpose of the fit, and upper bound of the root mean square torque error, (n,) [Nm, N] (see
-    `TorqueProblem`). prior: standard deviations of the prior.
+    prior: standard deviations of the prior. adapt: group of parameters to estimate; None: all parameters. max_error:
+    upper bound of the root mean square torque error, (n,) [Nm, N] (see `TorqueProblem`).
     """
     jacobian = TorqueJacobian(model, samples.subsampled(TUNING.initial_samples))
     estimate, selected = _run_stages(TorqueProblem.of(jacobian, prior, adapt, max_error), samples)
@@ -191,7 +192,7 @@ def _compared_fit(
     third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
     returned. If its nMSE (error divided by the variance of the torque) is above `TUNING.unsupported`, and its error is
     not below the error of the model before the fit, the model before the fit is returned. The returned parameters are
-    written to the model.
+    written to the model. prior: initial standard deviations of the prior.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
@@ -246,7 +247,7 @@ def _compared_fit(
 def _unfitted(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, blocks: Sequence[TorqueSamples]
 ) -> _StagedFit:
-    """Return the current parameters of a model as an estimate with the covariance of the prior.
+    """Return the model before a fit, as a result to which fits are compared; the covariance is the prior's.
 
     blocks: contiguous blocks of `samples`, for which the squared errors are computed.
     """

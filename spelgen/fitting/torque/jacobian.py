@@ -51,8 +51,8 @@ class _RegressorBlock(NamedTuple):
 class ResidualSamples(NamedTuple):
     """T samples with the torque residual of the model and the friction torque of its drives, all (T, n).
 
-    q, qd, qdd: positions, velocities, accelerations [rad, m, s]. torque_residual: measured minus modelled joint torque
-    [Nm, N]. friction: friction torque of the drives [Nm, N].
+    q, qd, qdd: positions [rad, m], velocities and accelerations (per s and s^2). torque_residual: measured minus
+    modelled joint torque [Nm, N]. friction: friction torque of the drives [Nm, N].
     """
 
     q: torch.Tensor
@@ -102,7 +102,7 @@ class TorqueJacobian:
         return joint_torque(self.model, self.samples.columns).std(dim=0)
 
     def squared_residual(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the sum of the squared torque residual per joint, (n,) [Nm^2, N^2].
+        """Return, per joint, the sum of the squared torque residuals at the parameters x (K,): (n,) [Nm^2, N^2].
 
         For a joint with eliminated terms, the sum includes the penalty of their weights. If motor gains are trained,
         the residual is scaled to the initial gains (see `logged_scale`): otherwise gains near zero would make it small.
@@ -240,11 +240,10 @@ class TorqueJacobian:
     def curved_step(self, x: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the parameters (K,) after a step (K,) from x along a curve: a candidate of the solver.
 
-        The torque is linear in inertial parameters, armatures and friction coefficients, so a straight line in these
-        quantities is better than one in x. x contains log-Cholesky parameters of bodies, which are moved along such a
-        line (see `step_in_inertial_parameters`), and the logarithms of armatures and friction coefficients c. A step
-        s > 0 of log c changes c to c (1 + s), on such a line, too. A step s < 0 changes c to c exp(s), as x + step
-        does, since c (1 + s) could be negative.
+        The torque is linear in the inertial parameters of the bodies, and in armatures and friction coefficients c, but
+        x contains log-Cholesky parameters and log c. The curve is a straight line in the quantities in which the torque
+        is linear. For the bodies see `step_in_inertial_parameters`. A step s > 0 of log c changes c to c (1 + s). A
+        step s < 0 changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

@@ -96,7 +96,7 @@ class JointFunction:
         """Return the part of the torque residual (T,) [Nm, N] that weights (P,) explain at the samples `rows`.
 
         For a torque it is the term's torque, without the part that rigid bodies and friction would absorb (`features`).
-        For a friction factor it is the change of the friction torque if the current factor is 1.
+        For a friction factor f(weights) it is (f - 1) times the friction torque.
         """
         features = self.features[rows]
         if self.friction is None:

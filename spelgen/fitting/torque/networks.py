@@ -132,9 +132,11 @@ def _fit_network(
     """Fit a network; return the relative reduction of the squared held-out error, None if the network is rejected.
 
     The network is fitted to the first half of the samples, and accepted if it significantly lowers the error on the
-    last half. An accepted network is refitted to all samples; a rejected one has its initial weights. samples: samples
-    whose torque residual is the target for the sum of all residual terms; the other terms are fixed.
-    correlation_length: number of samples per independent error.
+    last half. An accepted network is refitted to all samples; a rejected one has its initial weights. The other
+    residual terms are fixed.
+
+    samples: samples with the torque residual of the model without residual terms. correlation_length: number of samples
+    per independent error.
     """
     initial, residual = copy.deepcopy(network.state_dict()), _remaining_residual(model, samples)
     noise = rms_per_joint(residual)

@@ -1,10 +1,10 @@
 """Parameters of rigid bodies, drives and friction, which a fit to torques estimates, as one vector x (K,).
 
-The prior of x is Gaussian with the values before the fit as its mean. Inertial parameters of different links are
-independent. Armatures and friction are not: their initial values are derived from the effort limits of the drives,
-whose errors are similar at all joints, for example if all limits are torques before the gear. Such a parameter is
-therefore the product of a factor common to all joints and a factor of the single joint; the common factor has the
-larger standard deviation.
+The prior of x is Gaussian with the values before the fit as its mean. Errors of inertial parameters are independent
+between links. Errors of armatures and of friction are correlated between joints: the initial values are derived from
+the effort limits of the drives, which may all be wrong by a similar factor, for example if they are torques before the
+gear. Such a parameter is therefore the product of a factor common to all joints and a factor of the single joint; the
+common factor has the larger standard deviation.
 """
 
 from __future__ import annotations
@@ -113,15 +113,15 @@ def joint_torque(model: ArmModel, samples: SampleBlock) -> torch.Tensor:
 
 
 def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float) -> float:
-    """Correct initial values of trained motor gains that are wrong by a large factor; return their prior width.
+    """Correct initial motor gains that are wrong by a large factor; return the prior width of all trained gains.
 
     Settings without `gear` have the initial gain 1, but a current in A may have a gain of 100 Nm/A. For each joint, the
     measured torque (logged torque times initial gain) is regressed on the rigid-body torque of the initial parameters,
     together with friction and an offset. The gain is divided by the coefficient of the rigid-body torque. Joints
     without a significant coefficient have the median coefficient of the others.
 
-    A corrected gain has the same relative error as the masses in the URDF that load the joint. The prior of the gains
-    is then wide, so that the prior of all bodies determines the common scale of gains and masses.
+    A corrected gain depends on the masses in the URDF, and has their relative error. The prior of the gains is
+    therefore widened: the prior of all bodies then determines the common scale of gains and masses.
 
     Args:
         model: model whose motor gains are corrected.
@@ -192,7 +192,7 @@ def step_in_inertial_parameters(raw: torch.Tensor, step: torch.Tensor) -> torch.
 
     The pseudo-inertia of a body is C S C^T with a constant matrix C and S = T T^T, where T is the upper triangular
     matrix `body_factor(raw)`. Let X be the first-order change of T by the step. The first-order change of S is then T
-    (T^-1 X + (T^-1 X)^T) T^T. This change of S is added to S, or only a fraction of the change, so that S remains
+    (T^-1 X + (T^-1 X)^T) T^T. This change is added to S, or only a fraction of it if this is necessary for S to remain
     positive definite.
 
     Args:

@@ -210,9 +210,8 @@ class TorqueProblem:
         residual: squared residual per joint, (n,) [Nm^2, N^2], which is not used: the residual of each sample is
         computed here.
         """
-        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters.
-        # Therefore the Hessian of all parameters is computed first, and the rows and columns of the free ones are
-        # selected afterwards.
+        # The prior of factors that all joints share (see `prior_covariance`) couples free and fixed parameters: the
+        # gradient of the free ones depends on the deviations of the fixed ones from their prior mean.
         curvature, descent = self.jacobian.normal_equations(x, self.noise)
         penalty_gradient = self.prior.precision @ (x - self.prior.mean)
         curvature = (curvature + self.prior.precision)[self.free][:, self.free]
@@ -221,8 +220,9 @@ class TorqueProblem:
     def candidates(self, x: torch.Tensor, step: torch.Tensor) -> Iterator[torch.Tensor]:
         """Yield two candidates (K,) for the parameters after a step: x + step, and the end of a curve.
 
-        The curve has the tangent `step` at x, and is a straight line in the inertial parameters of the bodies (see
-        `TorqueJacobian.curved_step`). step: (k,), step of the k free parameters; the step of fixed parameters is zero.
+        The torque is less nonlinear along the curve than along x + step. The curve has the tangent `step` at x, and is
+        a straight line in the inertial parameters of the bodies (see `TorqueJacobian.curved_step`). step: (k,), step of
+        the k free parameters; the step of fixed parameters is zero.
         """
         change = torch.zeros_like(x).masked_scatter(self.free, step)
         # The candidate x + step needs less time and is as good near the optimum. Far from the optimum, the candidate
@@ -248,7 +248,7 @@ class TorqueProblem:
         return self.of_all_parameters(torch.linalg.inv(precision))
 
     def of_all_parameters(self, free_covariance: torch.Tensor) -> torch.Tensor:
-        """Return the covariance (K, K) of all parameters, which is zero for fixed parameters.
+        """Return the covariance (K, K) of all parameters for a covariance of the free ones; other entries are zero.
 
         free_covariance: (k, k), covariance of the k free parameters.
         """

@@ -88,7 +88,7 @@ def _regression(
         """Return the vector (w, -1), (..., K + 1), with the ridge solution w of the K scaled columns of the regressor.
 
         gram: (..., K + 1, K + 1), G = A^T A of A = [scaled columns, torque]. A (w, -1) is the residual, so the squared
-        residual is (w, -1)^T G (w, -1).
+        residual is (w, -1)^T G (w, -1). penalty: factor of |w|^2 in the cost.
         """
         normal = gram[..., :-1, :-1] + penalty * np.eye(len(length))
         weights = np.linalg.solve(normal, gram[..., :-1, -1:])[..., 0]

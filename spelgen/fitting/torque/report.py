@@ -115,12 +115,13 @@ def _few_data(
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
-    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`. names: (n,), names of the joints. comparison: its nMSE of
-    ridge regression is part of the text; None: no comparison.
+    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`. names: (n,), names of the joints. comparison: the text also
+    states its nMSE of ridge regression; None: no such nMSE.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion. It is at
-    # most a minute, which is enough for the recorded arms. After a minute, the cause is not the duration.
+    # most a minute, which is enough for the recorded arms: if an nMSE remains large after a minute, the cause is not
+    # the duration.
     enough = min(math.ceil(seconds * float(np.nanmax(nmse)) / TUNING.unsupported), 60)
     advice = f"record about {enough} s in which all joints move"
     if enough <= seconds:

@@ -53,7 +53,10 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice."""
+    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice.
+
+    correlation_length: number of samples per independent error.
+    """
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
@@ -117,16 +120,16 @@ def select_functions(
 
 
 def max_torques(model: ArmModel, q: torch.Tensor, torque_std: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return {name of a term's parameter: bound of the standard deviation of the term's torque, (n,) [Nm, N]}.
+    """Return the largest allowed standard deviation of the torque of residual terms, {parameter: (n,) [Nm, N]}.
 
-    The bounds apply to terms that are selected on one or two recordings. Friction factors have no bound. The bound of
-    torque splines is zero for joints without gravity load: the splines represent springs, which are built in to balance
-    a load.
+    The bounds apply to terms that are selected on one or two recordings: a fraction of torque_std for ripple and torque
+    splines, and infinity for friction factors. For splines the bound is zero at joints without gravity load: the
+    splines represent springs, which are built in to balance a load.
 
     Args:
         model: fitted model.
         q: (T, n) positions [rad, m].
-        torque_std: (n,) standard deviation of the torque [Nm, N].
+        torque_std: (n,) standard deviation of the joint torques in the logs [Nm, N].
     """
     with torch.no_grad():
         loaded = model.gravity(q).std(dim=0) > SELECTION.min_load_fraction * torque_std
@@ -187,9 +190,10 @@ def _best(
 
 
 def _better(first: SelectedTerm | None, other: SelectedTerm) -> SelectedTerm:
-    """Return the better one of two candidates of a joint.
+    """Return the better one of two candidates of a joint; `first` is preferred at similar errors.
 
-    This is `other` if its held-out error is clearly smaller (`preference_ratio`), otherwise `first`.
+    The result is `other` if there is no `first`, or if the held-out error of `other` is clearly smaller
+    (`preference_ratio`).
     """
     # Candidates are tested in the order splines, friction factor, ripple. At similar errors splines are preferred to
     # ripple: both fit the torque of a linear spring, but only splines extrapolate it.

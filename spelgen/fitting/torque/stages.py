@@ -86,9 +86,9 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     - The torque of the regression line exceeds a fraction of the measured torque (`TUNING.min_compensation`): a delay
       of some milliseconds between torque and motion causes a smaller negative slope.
 
-    The drives of an arm are similar. If one of them is known to compensate friction, a negative slope of more than one
-    standard deviation, without the regression on position, suffices for the others: their parameters may have absorbed
-    a part of the compensation.
+    The drives of an arm are similar. If one of them is known to compensate friction, the others probably do, too, and
+    their parameters may have absorbed a part of the compensation. For the others, a negative slope of more than one
+    standard deviation suffices, without the regression on position.
     """
     samples = problem.jacobian.residual_samples(x)
     residual, qd, estimator = samples.torque_residual, samples.qd, problem.noise_estimator
@@ -177,7 +177,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     evidence = log_likelihood_ratio(estimate, unsaturated) - penalty
     if evidence.clamp(-limit, limit).sum() < 0:
         estimate = unsaturated
-    # effects: (n, effects), indices of the coefficients in x
+    # `effects`: row k contains the indices in x of the coefficients of joint k, one per effect.
     effects = torch.stack([index[name] for name in rigid.names("effects", "load_dependence")], dim=-1)
     plain = _without(estimate, effects.flatten())
     rejected = _rejected(log_likelihood_ratio(estimate, plain) - penalty)
@@ -187,9 +187,10 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
 
 
 def _without(estimate: TorqueEstimate, indices: torch.Tensor) -> TorqueEstimate:
-    """Return a refit of all parameters without some friction coefficients; indices: their indices in x (K,).
+    """Refit all parameters without some friction coefficients; return the new estimate.
 
-    The initial values and the prior means of these coefficients, which are logarithms, become `NEGLIGIBLE`.
+    indices: indices of these coefficients in x (K,). The coefficients are logarithms. Their initial values and prior
+    means become `NEGLIGIBLE`.
     """
     problem, x, mean = estimate.problem, estimate.state.x.clone(), estimate.problem.prior.mean.clone()
     # The prior mean of the removed coefficients is changed, too: otherwise the prior would restore the coefficients.

@@ -74,8 +74,9 @@ class TorqueTuning:
     # [1] Friction compensation of a drive is detected only if the slope of the torque residual over velocity differs
     # from zero by this number of its standard deviations.
     min_significance: float = 4.0
-    # [1] Smallest standard deviation of the torque of a friction compensation, as a fraction of the torque's standard
-    # deviation. Delays of milliseconds between torque and motion have a similar but smaller effect on the residual.
+    # [1] A friction compensation is detected only if the standard deviation of its torque exceeds this fraction of the
+    # torque's standard deviation. Delays of milliseconds between torque and motion have a similar but smaller effect on
+    # the residual.
     min_compensation: float = 0.05
     # [1] Number of samples per block in computations of the torque Jacobian: a block and its derivatives need some 100
     # MB of memory for seven joints.
@@ -123,10 +124,10 @@ class ResidualTuning:
     folds: int = 10
     # [1] Gap between fitted and held-out samples, divided by the correlation time of the torque errors.
     gap: float = 2.5
-    # [1] Smallest t value of the mean error reduction over the blocks: p = 0.01 for Student's t with nine degrees of
-    # freedom.
+    # [1] A residual term is accepted only if the t value of its mean error reduction over the blocks exceeds this
+    # number: p = 0.01 for Student's t with nine degrees of freedom.
     standard_errors: float = 2.82
-    # [1] Smallest t value of the mean error reduction with one or two recordings, for p = 0.001. It is larger than
+    # [1] Bound of the t value of the mean error reduction for one or two recordings, with p = 0.001. It is larger than
     # `standard_errors`, since held-out and fitted motion of few recordings may be similar, with the same errors of the
     # model.
     standard_errors_of_one: float = 4.30
@@ -136,7 +137,7 @@ class ResidualTuning:
     # [1] Smallest standard deviation of a joint's gravity torque for which a spring at this joint is plausible, as a
     # fraction of the standard deviation of the joint's torque.
     min_load_fraction: float = 0.1
-    # [1] Smallest relative reduction of the held-out squared torque residual by a residual term that is selected.
+    # [1] A residual term is selected only if it reduces the held-out squared torque residual by at least this fraction.
     min_reduction: float = 1e-3
     # [1] A candidate replaces the best previous candidate of a joint only if its held-out squared residual is below
     # this fraction of the previous one. The order of the candidates is splines, friction factor, ripple.
