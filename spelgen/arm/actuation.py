@@ -24,8 +24,8 @@ _SIMPLE, _DIFFERENTIAL = "SimpleTransmission", "DifferentialTransmission"
 class InputEntry:
     """A nonzero entry of the input matrix G, joint torques per logged torque; row and column are 0-based.
 
-    ``kind``: ``fixed`` for the known gear of a motor of one joint; ``coupled`` for a known entry of a motor that moves
-    several joints; ``gain`` for an entry that is trained, with the initial value ``value``.
+    ``kind``: ``fixed``: known gear of a motor that moves one joint; ``coupled``: known entry of a motor that moves
+    several joints; ``gain``: trained entry, with the initial value ``value``.
     """
 
     row: int
@@ -57,9 +57,9 @@ class Actuation:
     """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
 
     A motor that drives several joints couples them: it has an entry, joint torque per motor torque, for each of its
-    joints. If the logs contain motor torques, these entries are entries of G, in ``entries``. If the logs contain joint
-    torques, G is the identity for the driven joints. The entries of coupling motors are then in ``couplings`` and
-    determine only the motor speeds (see `drives`).
+    joints. If the logs contain motor torques, these entries are part of G and are stored in ``entries``. If the logs
+    contain joint torques, G is the identity for the driven joints. The entries of coupling motors are then stored in
+    ``couplings``; they are used only for the motor speeds (see `drives`).
     """
 
     joints: int
@@ -82,9 +82,9 @@ class Actuation:
     def drives(self) -> Drives:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds G^T qd need
-        # the joint torques per motor torque: in `torques`, a copy of G, the rows of coupled joints are replaced by the
-        # couplings.
+        # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds need the
+        # couplings: in `torques`, a copy of G, the rows of coupled joints are replaced by the couplings (joint torques
+        # per motor torque).
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -99,9 +99,9 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
         inputs: matrix G of joint torques per motor torque, (n, n).
 
     Returns:
-        C (n, n): G^T, row i for motor i, with each row divided by its element of largest magnitude, the gear ratio to
-        the joint on which the motor has the largest torque. C is the identity if each motor moves only its own joint. A
-        passive joint has no motor: its row of C is the row of the identity.
+        C (n, n), row i for motor i: G^T with each row divided by its element of largest magnitude. This element is the
+        gear ratio of motor i to the joint on which it has the largest torque. C is the identity if each motor moves
+        only its own joint. The row of a passive joint, which has no motor, is the row of the identity.
     """
     # Motors and joints have equal power: tau_m . speed_m = tau . qd, and tau = G tau_m, so that the motor speeds are
     # speed_m = G^T qd. Each row of G^T is divided by its element of largest magnitude: friction is then a function of
@@ -113,10 +113,11 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:
-    """Return the input matrix G of the arm whose coordinates are the joints named ``joints``.
+    """Return the nonzero entries of the input matrix G of an arm, with diagnostics.
 
-    Raises SettingsError for a coupling of a moving and a locked joint, and UrdfError if a transmission that is needed
-    has unusable numbers.
+    joints: names of the moving joints, which are the coordinates of the arm. Raises SettingsError for a coupling of a
+    moving and a locked joint. Raises UrdfError if the numbers of a differential transmission are unusable and the logs
+    contain motor torques.
     """
     # Only driven joints have entries of the input matrix G: the row of a passive joint is zero.
     driven = [name for name in joints if settings.joint(name).actuated]
@@ -126,8 +127,8 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # A joint that is driven by several motors gets no entry here: its entries of the input matrix G are in `couplings`,
-    # and include the gear ratios.
+    # Joints that are driven by several motors are omitted here: their entries of G, which include the gear ratios, are
+    # in `couplings`.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -153,7 +154,11 @@ def _undriven(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterat
 
 
 def _reduced(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterator[Diagnostic]:
-    """Yield a remark if the URDF states reductions of driven joints, and the settings do not state a `torque`."""
+    """Yield a remark if the URDF states reductions of driven joints, and the settings do not state a `torque`.
+
+    Text of the remark: the logged torques are assumed to be joint torques; motor torques must be declared in the
+    settings. driven: names of the joints that are not passive in the settings.
+    """
     transmissions = [x for x in robot.transmissions if not x.errors and set(x.joint_names) <= set(driven)]
     reductions = {
         name: reduction
@@ -173,8 +178,8 @@ def _reduced(robot: Robot, settings: Settings, driven: Sequence[str]) -> Iterato
 def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEntry:
     """Return the entry of the input matrix G of a motor that moves only the joint ``name``, with the index ``index``.
 
-    Its value is the gear in the settings, otherwise the reduction in the URDF; without both, the entry is a trained
-    gain with the initial value 1.
+    Its value is the gear in the settings, otherwise the reduction in the URDF. If both are absent, the entry is a
+    trained gain with the initial value 1.
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
@@ -221,8 +226,8 @@ def _couplings(robot: Robot, settings: Settings, joints: Sequence[str]) -> list[
     for transmission in robot.transmissions:
         names = transmission.joint_names
         is_pair = _DIFFERENTIAL in transmission.type and len(names) == len(transmission.actuators) == 2
-        # An unusable transmission is an error only if the logs contain motor torques: with logged joint torques, the
-        # transmission is not needed, and is ignored.
+        # With logged joint torques, transmissions are not needed: an unusable transmission is ignored. With logged
+        # motor torques, it is an error.
         if is_pair and free.issuperset(names) and not (transmission.errors and settings.torque == "joint"):
             collect(transmission.errors)
             entries += _block(joints, names, _differential(transmission))

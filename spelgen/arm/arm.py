@@ -63,12 +63,12 @@ class Coordinate(NamedTuple):
 class Body:
     """A joint and all links that move rigidly with the child link of the joint.
 
-    ``name`` is the name of the joint, ``link`` of its child link. ``parent`` is the index of the parent body, -1 for
-    the root link. ``rotation`` and ``translation`` [m] are the pose of the joint's frame in the frame of the parent
-    body at zero position. The joint rotates about, or translates along, the z axis of its frame by
-    multiplier * q + offset [rad, m], where q is the position of the coordinate with the index ``coordinate``.
-    ``inertia`` is (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) [kg, kg m, kg m^2] about the origin of the joint's frame, in
-    this frame; None if no link of the body has an inertial.
+    ``name`` is the name of the joint, ``link`` the name of its child link. ``parent`` is the index of the parent body,
+    -1 for the root link. ``rotation`` and ``translation`` [m] are the pose of the joint's frame in the frame of the
+    parent body at zero position. The joint rotates about, or translates along, the z axis of its frame by multiplier *
+    q + offset [rad, m], where q is the position of the coordinate with the index ``coordinate``. ``inertia`` is (m, m
+    c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) [kg, kg m, kg m^2] about the origin of the joint's frame, in this frame; None if no
+    link of the body has an inertial.
     """
 
     name: str
@@ -185,8 +185,8 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # `following` is the number of mimic joints of the chain: each is a separate body in the derivation. The joints of
-    # the chain are subtracted, because `leaders` contains them as their own leaders.
+    # `following` is the number of mimic joints of the chain, which are separate bodies in the derivation: the number of
+    # joints with a leader in the chain, minus the joints of the chain, which are their own leaders.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
@@ -207,9 +207,11 @@ def _joint_type(joint: UrdfJoint) -> JointType:
 def lump_links(robot: Robot, chain: ChainChoice, angle_tolerance: float) -> LumpedLinks:
     """Lump links that move together into bodies: one per joint of the chain and per mimic joint of such a joint.
 
-    All other joints are locked.
+    All other joints are locked. A body belongs to one joint of the chain, or to one mimic joint that follows such a
+    joint.
 
-    angle_tolerance: largest change of an angle to a multiple of pi/2, see ``make_arm`` [rad].
+    angle_tolerance: angles [rad] that differ from a multiple of pi/2 by at most this tolerance are rounded to the
+    multiple.
     """
     rounding = AngleRounding(angle_tolerance)
     placement = Placement(robot.root, rounding)
@@ -300,7 +302,8 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
     # One remark lists all locked joints, because a humanoid robot has about thirty locked joints.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
-        # The real joint is never at 0 in this case, so that the real arm has other inertias.
+        # If 0 is outside its limits, the real joint is never at 0, and the inertia of the real arm differs from the
+        # model.
         limits = [joint.safe_limits or (0.0, 0.0) for joint in outside]
         names = ", ".join(
             repr(joint.name) + (" (0 is outside its limits)" if low > 0 or high < 0 else "")
@@ -323,8 +326,9 @@ def _dependent_remarks(
 ) -> Iterator[Diagnostic]:
     """Yield a warning for each locked joint that may be part of a parallelogram linkage of the arm.
 
-    URDF has no closed loops, so a linkage is opened at a joint. Two revolute joints then have the same parent body and
-    parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links in their bodies.
+    URDF has no closed loops, so the closed loop of a linkage is cut at a joint. Two revolute joints then have the same
+    parent body and parallel axes: one is in the chain (``moved``), the other is locked. placement: poses of the links
+    in their bodies.
     """
     roots: dict[str, str] = {}  # {link: first link of its branch}, to group joints by branch
     branches: dict[str, list[UrdfJoint]] = {}
@@ -362,11 +366,11 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of revolute joints in ``moved`` that are on the same body and parallel to ``axis``.
+    """Return the names of revolute joints in ``moved`` that are parallel to ``axis`` and have a given parent body.
 
-    frame: frame of a link of this body, which is the parent of the joints; [] for the root link. axis: direction (3,)
-    in the frame of the body.
+    frame: frame of a link of the parent body; for the root link the result is []. axis: direction (3,) in the frame of
+    the body.
     """
-    # The axis of a moving joint is the z axis of its frame, in the frame of the parent body.
+    # Column 2 of `rotation` is the z axis of the joint's frame, which is the axis of the joint, in the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]
     return [x.name for x in beside if _are_parallel(axis, np.array(x.rotation, dtype=float)[:, 2])]

@@ -29,7 +29,7 @@ class ChainChoice(NamedTuple):
 
 
 class Leader(NamedTuple):
-    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; it is no mimic joint itself."""
+    """Joint that a mimic joint follows by q = multiplier * q_leader + offset [rad, m]; the leader has no <mimic>."""
 
     leader: UrdfJoint
     multiplier: Fraction
@@ -103,7 +103,7 @@ def _independent(joints: Iterable[UrdfJoint]) -> tuple[UrdfJoint, ...]:
 
 
 def _named(robot: Robot, names: Sequence[str]) -> tuple[UrdfJoint, ...]:
-    """Return the joints that the user has chosen. Raises ArmError unless they are on one path, in the path's order."""
+    """Return the joints named by the user. Raises ArmError unless all are on one path, in order from root to tip."""
     chosen = [_usable(robot, name) for name in names]
     for name in names:
         if list(names).count(name) > 1:
@@ -147,8 +147,8 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    1. The last joint is omitted if it is a jaw of a gripper: the last joints of all longest chains, together with the
-       joints that mimic the last joint, must be two or more prismatic joints with the same parent link.
+    1. If the last joint is a jaw of a gripper, it is omitted. The jaws are the last joints of all longest chains, and
+       the joints that mimic the last joint. There must be at least two, all prismatic and with the same parent link.
     2. If there are no jaws and several chains are the longest, the chain with effort limits of all joints is returned.
        Raises ArmError if no chain, or more than one, has these limits.
     """
@@ -190,8 +190,8 @@ def _possible_gripper(robot: Robot, last: UrdfJoint, is_mimicked: bool) -> tuple
     """Return a remark if the last joint of the chain may open a gripper; otherwise no remark.
 
     The joint may open a gripper in three cases: it is prismatic and moves by at most 0.1 m; other jaws or finger joints
-    follow it (``is_mimicked``); or its child link has the name of a gripper. Names of links are used only if no joint
-    of the robot has the name of a gripper: joints with such names are excluded from the chain already. A joint with a
+    follow it (``is_mimicked``); or its child link has the name of a gripper. The last criterion is used only if no
+    joint of the robot has the name of a gripper, since such joints are excluded from the chain already. A joint with a
     range of more than half a turn causes no remark: no jaw opens that far, so it rotates the whole gripper.
     """
     lower, upper = last.limits or (0.0, 0.0)

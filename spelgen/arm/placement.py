@@ -47,8 +47,8 @@ class AngleRounding:
     @property
     def rotation_error(self) -> float:
         """Largest permitted error of the rational approximation of a rotation [rad]."""
-        # If rounding is disabled, the rational approximation must not round either: with a permitted error of 1e-11,
-        # the rotation by 1.57079632679 would become a quarter turn, since this angle differs from pi/2 by 5e-12.
+        # If rounding is disabled, the rational approximation must not round either. For example, 1.57079632679 differs
+        # from pi/2 by 5e-12: with a permitted error of 1e-11, the rotation would become a quarter turn.
         return TUNING.rotation_error if self.tolerance else 1e-15
 
     def origin(
@@ -69,7 +69,7 @@ class AngleRounding:
                 changes.append(f"{angle:.10g} is taken as {_in_pi(special)}")
         if changes:
             self._note("snapped-angle", where, line, "; ".join(changes))
-        # Most origins have no rotation: for the result None, callers omit a product of exact matrices.
+        # Most origins have no rotation. None then indicates that a slow product of exact matrices can be omitted.
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
@@ -108,7 +108,7 @@ class AngleRounding:
 
     def position(self, vector: np.ndarray) -> np.ndarray:
         """Return the position ``vector`` (3,) [m]; components below 1 nm, rounding errors of rotations, become 0."""
-        # [m] Bound of the rounding errors that composed rotations cause in positions.
+        # [m] Smaller components are rounding errors, which composed rotations cause in positions.
         noise = 1e-9 if self.tolerance else 0.0
         return np.array([bounded(value) if abs(value) >= noise else Fraction(0) for value in vector])
 
@@ -139,8 +139,8 @@ class Frame(NamedTuple):
         body: index of the body of the link, -1 for the root link.
         rotation, position: rotation (3, 3) and position (3,) [m] of the link in the frame of this body, as fractions.
         composed: float64 rotation (3, 3) of the link relative to the start of its segment, from which `rotation` is
-            approximated. A segment starts at the root or at a body with a revolute joint. Bodies with prismatic joints
-            continue the segment, so that all rotations within it are constant.
+            approximated. A segment starts at the root or at a body with a revolute joint. A prismatic joint does not
+            rotate: its body continues the segment. All rotations within a segment are therefore constant.
     """
 
     body: int
@@ -249,19 +249,19 @@ class Placement:
                 already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components of the joint's position are set to 0 in the joint's frame and in the body's frame: a rounding
-        # error in either would make a zero entry of M nonzero.
+        # Tiny components are set to 0 in the joint's frame (above) and in the body's frame: a rounding error in either
+        # frame would make a zero entry of M nonzero.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 
     def _in_body(self, body: int, composed: np.ndarray) -> np.ndarray:
         """Return the rotation (3, 3) of a frame relative to a body as fractions, approximated from float64.
 
-        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. Such zeros may
-        occur relative to each body of the segment: the bodies since the last revolute joint, or since the root. A
-        rational approximation of the rotation relative to one body preserves the zeros relative to this body only. The
-        rotation is therefore approximated once per body of the segment. The approximation that preserves most zeros is
-        converted to the frame of ``body`` and returned.
+        A zero element of a rotation means that an axis of the frame is normal to an axis of the body. The rotation of
+        the frame may have zeros relative to each body of the segment (the bodies since the last revolute joint, or
+        since the root). A rational approximation preserves only the zeros of the rotation that is approximated. The
+        rotation is therefore approximated relative to each body of the segment. The approximation that preserves most
+        zeros is converted to the frame of ``body`` and returned.
 
         Args:
             body: index of the body, -1 for the root link.

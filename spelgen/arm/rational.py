@@ -56,7 +56,7 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     if tolerance == 0.0:
         return angle
     # {divisor: tolerance [rad]}: special angles are multiples of pi / divisor, as found in the URDFs of 189 arms. The
-    # tolerance of pi/12, pi/8 and pi/5 is small, because 0.26, 0.39 and 0.63 rad also occur as exact values.
+    # tolerance of pi/12, pi/8 and pi/5 is small: angles of 0.26, 0.39 and 0.63 rad also occur that are not rounded.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor
@@ -90,8 +90,8 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     """Return a rotation R (3, 3) with R z = ``axis``, a unit vector (3,).
 
     For an axis along +-x, +-y or +-z, R is a signed permutation. For any other axis, R is the signed permutation for
-    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``: if a component of
-    ``axis`` is zero, four elements of R are zero.
+    the closest coordinate axis, followed by the smallest rotation from this axis to ``axis``: in this way, four
+    elements of R are zero if a component of ``axis`` is zero.
     """
     index = int(np.argmax(np.abs(axis)))
     sign = 1.0 if axis[index] > 0 else -1.0
@@ -116,8 +116,8 @@ def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -
 
     Elements differ by less than ``error``. The components of the quaternion, divided by the largest one, are replaced
     by close fractions: the rotation matrix of any rational quaternion is rational (Euler-Rodrigues). If a zero element
-    of ``rotation`` becomes nonzero in this way, `_rotation_with_zero` is used: the product of two rotations with errors
-    below ``error``. The construction of this product preserves one zero element, the first one.
+    of ``rotation`` becomes nonzero in this way, the result of `_rotation_with_zero` is returned: an approximation in
+    which the first zero element is exactly zero.
     """
     ratios = _quaternion_ratios(rotation)
     candidate = IDENTITY

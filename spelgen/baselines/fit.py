@@ -28,13 +28,13 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
     For each friction model, inertial and friction parameters are identified by linear least squares. The parameters are
     absent if the logs have no torques or no accelerations.
 
-    preprocessing: preprocessing of the fit, in which all default values are resolved.
+    preprocessing: resampling and filters of the logs, as in the fit of the model, with all default values resolved.
     """
-    # The identification is imported here, since an evaluation, which imports this file, only reads fitted baselines.
+    # The identification is imported here: an evaluation imports this file, too, and needs no identification.
     from spelgen.identification.identification import LeastSquares
     from spelgen.identification.identify import identify_by
 
-    # The coverage is stored for the assessment of an evaluation, which compares the motion in test logs with it.
+    # The coverage of the training logs is stored, because an evaluation compares the motion in test logs with it.
     fitted: FittedBaselines = {"coverage": coverage(logs)}
     methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
     try:
@@ -44,7 +44,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
     except (LogError, np.linalg.LinAlgError):
         return fitted
     fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-    # The whole identification is recorded for the friction model without bristles. For the friction model with
-    # bristles, only the parameters are recorded.
+    # For the friction model without bristles, parameters and statistics of the identification are recorded. For the
+    # friction model with bristles, only the parameters are recorded.
     parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
     return {**fitted, **fits["parameters"].to_dict(), **parameters}

@@ -32,8 +32,8 @@ class LinearServos:
         damping: Damping ratio of each joint, (n,) [1].
         delay: Delay of the command of each joint, (n,) [s].
         offset: Offset of the position of each joint, (n,) [rad, m].
-        late: Delay of the baseline `DelayedCommand`, the same for all joints [s]. It is here because a run stores the
-            parameters of both baselines in one record.
+        late: Delay of the baseline `DelayedCommand`, the same for all joints [s]. A run stores the parameters of both
+            baselines in one record.
     """
 
     frequency: Sequence[float]

@@ -33,9 +33,9 @@ def roll_out_stiff(
 
     Method: ROS2, a Rosenbrock method. This method has order two for any approximation of the Jacobian, and is L-stable
     with the exact Jacobian (Verwer, Spee, Blom and Hundsdorfer, SIAM J. Sci. Comput. 20:1456, 1999). Here the
-    approximation is the Jacobian of friction only. Even stiff damping and bristles, which occur with light links and
-    dry friction, then need no smaller steps. An explicit method would need them; otherwise its integration error would
-    be confused with an error of the dynamics.
+    approximation is the Jacobian of friction only. Stiff damping and bristles, which occur with light links and dry
+    friction, then need no smaller steps. An explicit method would need smaller steps: its integration error could be
+    confused with an error of the dynamics.
 
     Args:
         dynamics: dynamics of the arm, see `equations_of`.
@@ -44,7 +44,7 @@ def roll_out_stiff(
         disturbance: constant disturbance in each window, (W, n), see `_stepper`; None: no disturbance.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    # The friction state of the windows may be of another model: it is omitted for dynamics whose friction has no state.
+    # `windows.z` may be the friction state of another model. Dynamics whose friction has no state do not use it.
     z = windows.z if windows.z is not None and is_stateful(dynamics) else sliding_memory(dynamics, qd)
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
@@ -81,9 +81,10 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, plus `disturbance` as a force (see `_stepper`).
+        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, including the disturbance of `_stepper`.
 
-        pose: mass matrix and forces at the positions q. qd, tau: (W, n). z: friction state.
+        A disturbance that is an acceleration is multiplied by M. pose: mass matrix and forces at the positions q. qd,
+        tau: (W, n). z: friction state.
         """
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
@@ -92,8 +93,8 @@ def _stepper(
         """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`); step: (W, 1) [s].
 
         The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
-        friction / d qd. If friction has a state z, K is its derivative with respect to q, on which z depends; otherwise
-        K = 0.
+        friction / d qd. If friction has a state z, which depends on q, K is the derivative of friction with respect to
+        q; otherwise K = 0.
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -138,7 +139,7 @@ def _friction_slopes(
     """Return the derivatives of joint friction with respect to velocity (damping) and to position (stiffness).
 
     Damping [Nm s/rad, N s/m] and stiffness [Nm/rad, N/m] are (W, n) for W windows, the diagonals of Jacobian matrices:
-    the friction of a joint depends only on the motion of the joint, and on its position through the bristles.
+    the friction of a joint depends only on the motion of this joint. Bristles add the dependence on position.
 
     Args:
         dynamics: dynamics of the arm.
@@ -171,11 +172,11 @@ class PredictorTuning:
     # [s] Shortest integrator step: only diverging dynamics would need shorter steps.
     shortest_step: float = 1e-3
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
-    # fraction of their RMS error. With this value reported errors change by a thousandth.
+    # fraction of their RMS error. With this value, the integration error changes the reported errors by about 0.1 %.
     tolerance: float = 5e-2
-    # [1] Lower bound of the RMS error of predicted velocities, with which `tolerance` is multiplied, divided by the RMS
-    # change of velocity in the windows: an exact model, with an error of zero, would otherwise need the largest number
-    # of steps.
+    # [1] `tolerance` is multiplied by the RMS error, or by this fraction of the RMS change of velocity in the windows
+    # if it is larger. Without this bound, an exact model, with an error of zero, would need the largest number of
+    # steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16
@@ -220,8 +221,8 @@ class Solver:
     def substeps(self) -> int:
         """Number of integrator steps per sample interval; it is computed when motion is predicted for the first time.
 
-        The number is doubled until twice as many steps change the predictions of the `probe` windows by less than
-        `TUNING.tolerance` times the error of the predictions.
+        The number is doubled until a further doubling would change the predicted velocities of the `probe` windows by
+        less than `TUNING.tolerance` times their RMS error.
         """
         windows = thinned(self.probe, TUNING.probed_windows)
         motion = (windows.qd - windows.qd[:, :1]).square().mean().sqrt().clamp(min=1e-9)
@@ -248,7 +249,7 @@ A predictor returns q and qd of W windows of K samples, (W, K-1, n) each, at all
 
 
 class CommandFollower(Protocol):
-    """Predictor of positions under position commands."""
+    """Interface of predictors of joint positions under position commands."""
 
     def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
         """Return the predicted positions of each segment at the end of each sample interval.

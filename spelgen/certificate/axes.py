@@ -47,9 +47,9 @@ class Axes:
         self.arm = arm
         self.prismatic = [joint_type == "prismatic" for joint_type in arm.joint_types]
         generator = random.Random(0)  # The seed is constant, so that reports are reproducible.
-        # Two configurations suffice: a relation is a polynomial equation in random numbers below 1e6 (see
-        # `_configuration`). If the relation is false and the polynomial has the degree d, it is true by chance at one
-        # configuration with a probability of about d / 1e6.
+        # Two configurations suffice. A relation is a polynomial equation, of degree d, in the random numbers below 1e6
+        # of a configuration. If it is not an identity, the random numbers of one configuration satisfy it by chance
+        # with a probability of about d / 1e6.
         configurations = [_configuration(arm, generator) for _ in range(2)]
         # Exact fractions: directions (2, n, 3) and twists (2, n, 6) of the axes of the n joints.
         self._directions, self._twists = map(np.array, zip(*configurations, strict=True))
@@ -86,8 +86,8 @@ class Axes:
     def same_twist(self, a: int, b: int) -> bool:
         """Return True if joints ``a`` and ``b`` have equal or opposite twists.
 
-        Two revolute joints then are coaxial, and two prismatic joints are parallel. A body that both joints carry then
-        has equal or opposite velocities for unit velocities of the two joints.
+        This is true for coaxial revolute joints, and for parallel prismatic joints. A unit velocity of ``a`` and a unit
+        velocity of ``b`` give equal or opposite velocities to a body that both joints carry.
         """
         return _are_parallel(self._twists[:, a], self._twists[:, b])
 
@@ -101,10 +101,10 @@ class Axes:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
         The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
-        ``hinge`` and is parallel to the axis of ``slider``. If ``hinge`` rotates, the velocity of a point along
-        ``slider`` is proportional to its signed distance from the plane. If the distances are constant for all motions
-        of the joints after ``hinge``, the entry of M in the row of ``slider`` and the column of ``hinge`` is therefore
-        constant. If the two axes are parallel, the velocity along ``slider`` is zero for any such plane.
+        ``hinge`` and is parallel to the axis of ``slider``. If the relation is true, the entry of M in the row of
+        ``slider`` and the column of ``hinge`` is constant. Reason: if only ``hinge`` rotates, the velocity of a point
+        along ``slider`` is proportional to the signed distance of the point from the plane. If the two axes are
+        parallel, this velocity is zero for any such plane.
         """
         # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
         # any plane that is fixed to the child link of `hinge`.
@@ -159,7 +159,8 @@ def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
 def _is_orthogonal(twist: np.ndarray, direction: np.ndarray) -> bool:
     """Return True if no point of a body has a velocity component along ``direction``, (2, 3), or (3,) if constant.
 
-    twist: linear velocity, then angular velocity of the body, (2, 6): one row per configuration of `Axes`.
+    direction: vector at each configuration of `Axes`, (2, 3), or a constant vector, (3,). twist: linear velocity, then
+    angular velocity of the body, (2, 6): one row per configuration.
     """
     v, w = np.split(twist, 2, axis=-1)
     return not (v * direction).sum(axis=-1).any() and not np.cross(w, direction).any()

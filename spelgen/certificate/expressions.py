@@ -49,7 +49,7 @@ def weighted_sum(terms: Mapping[Expr, fmpq]) -> Expr:
 
 
 class PolynomialWriter:
-    """Conversion to SymPy terms of the polynomials that multiply inertial parameters in M or in the potential energy.
+    """Convert polynomials, the factors of inertial parameters in M or in the potential energy, to SymPy terms.
 
     The variables of the polynomials are s1, c1, q1, s2, ...: sine, cosine and position of each coordinate (see
     `Expansion`).
@@ -63,8 +63,8 @@ class PolynomialWriter:
         generators = context.gens()
         waves = zip(generators[::3], generators[1::3], strict=True)
         self._circles = [sine**2 + cosine**2 - 1 for sine, cosine in waves]
-        # The variables s and c are the sine and cosine of q / d, with the coordinate q and an integer d: the angles of
-        # mimic joints are integer multiples of q / d.
+        # The variables s and c of a coordinate q are the sine and cosine of q / d. The integer d is chosen so that the
+        # angles of its mimic joints are integer multiples of q / d.
         fractions = enumerate(base_denominators(arm))
         self._angles = [coordinate(joint) / denominator for joint, denominator in fractions]
         self._runs = parallel_runs(arm)
@@ -137,7 +137,8 @@ def multiple_angles(powers: tuple[tuple[Expr, int, int], ...]) -> Terms:
     result: Terms = {}
     for (total, quarters), value in waves.items():
         function = sin(total) if quarters % 2 else cos(total)
-        # SymPy has simplified cos(-a) to cos(a) and sin(-a) to -sin(a): the sign is moved to the coefficient.
+        # SymPy simplifies sin(-a) to -sin(a): the sign is separated from the function and multiplied with its
+        # coefficient.
         sign, function = function.as_coeff_Mul()
         if quarters > 1:
             sign = -sign

@@ -96,8 +96,8 @@ class _Sentences:
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
                 # A reason names one joint of an entry and has a placeholder for the other joint (see `zero_reason`,
-                # `balance_reason`): the other joint is the joint of the column or, if the joint of the column is
-                # prismatic, the joint of the row.
+                # `balance_reason`). The placeholder is replaced by the joint of the column if it is revolute, otherwise
+                # by the joint of the row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -257,8 +257,9 @@ def idle_reason(axes: Axes, joint: int) -> Reason:
     """Return the geometric reason why M does not depend on the position of ``joint``; None if no reason is found."""
     if joint == 0:
         return "it moves the whole arm as one rigid body"
-    # A joint whose motion commutes with the motions of all joints nearer the root could be the first joint of the arm.
-    # M does not depend on the position of the first joint, which moves the whole arm.
+    # M does not depend on the position of the first joint, which moves the whole arm. If the motion of a joint commutes
+    # with the motions of all joints nearer the root, it could be the first joint, and M does not depend on its
+    # position.
     nearer = list(range(joint))
     if all(axes.commute(joint, earlier) for earlier in nearer):
         return f"its motion commutes with {joints_in_words(nearer)}, as if it were the first joint"

@@ -83,7 +83,8 @@ def _parameters(formulas: Formulas, width: int) -> list[str]:
     lines = ["Base parameters, and the URDF's values" if values else "Base parameters"]
     for symbol, definition in formulas.base_parameters.items():
         value = f" [{float(values[symbol]):.6g}]" if symbol in values else ""
-        # A base parameter that is a single inertial parameter has the same name as it, so no equation is printed.
+        # A base parameter that equals a single inertial parameter has the name of this parameter: no equation is
+        # printed.
         name = "" if definition.is_Symbol else f"{symbol.name} = "
         lines += expressions.lines(expressions.text(definition), f"  {name}", width, value)
     return lines

@@ -43,8 +43,8 @@ class Formula:
 
     Attributes:
         entry: (row, column) counted from 1, or "V".
-        terms: number of products of a base parameter and a monomial in cosines, sines and distances; None if the
-            expansion would exceed the permitted number of multiplications (`Expansion.budget`).
+        terms: number of products of a base parameter and a monomial in cosines, sines and positions of prismatic
+            joints; None if the expansion would exceed the permitted number of multiplications (`Expansion.budget`).
         expression: SymPy expression; None if the entry is too long.
     """
 
@@ -59,7 +59,7 @@ class Formula:
 
     @property
     def omission(self) -> str:
-        """Text with the reason why the entry has no expression, for users."""
+        """Text for users: reason why the entry has no expression."""
         if self.terms is None:
             return "too many terms to be expanded"
         return f"{self.terms} terms, omitted"
@@ -143,7 +143,7 @@ class Formulas:
 
     @property
     def unwritten(self) -> tuple[Formula, ...]:
-        """The formulas without an expression: entries of M, or the potential energy V, with too long closed forms."""
+        """The formulas without an expression: closed forms of entries of M, or of V, that have too many terms."""
         return tuple(row for row in self.rows if row.expression is None)
 
     def __repr__(self) -> str:
@@ -182,7 +182,7 @@ def formulas(
             raise SpelgenError(f"the entry {entry[0]},{entry[1]} of M", expected=expected)
         entries = [lower]
     if longest is None:
-        # By default, only entries of at most 40 terms are shown, about three lines of a terminal, which can be read.
+        # By default, only entries of at most 40 terms are shown: longer formulas, above three lines, are hard to read.
         longest = 40 if entry is None else WRITABLE
     writer = _Writer(arm, structure)
     # Entries of joints close to the tip are short. They are expanded first, so that they have expressions even if the
@@ -199,7 +199,7 @@ def formulas(
 class _Writer:
     """Computes closed forms of entries of M and of the potential energy V.
 
-    M and V are prepared only once, for all entries, for their expansion to polynomials (`Expansion`).
+    One `Expansion`, which expands M and V to polynomials, is used for all entries.
 
     Attributes:
         base: base parameters in the closed forms.
@@ -242,8 +242,8 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # The first inertial parameter of a base parameter occurs in no other base parameter, so its coefficient in
-            # M or V is the coefficient of the base parameter.
+            # Each base parameter contains an inertial parameter, its first one, that occurs in no other base parameter.
+            # The coefficient of this inertial parameter in M or V is the coefficient of the base parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
@@ -252,8 +252,9 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # The formulas are for the inertials of the URDF only: terms of different base parameters with the same monomial
-        # may cancel each other for these values. Monomials whose total coefficient is then zero are removed.
+        # These formulas need to be valid only for the inertials of the URDF. A monomial may occur with several base
+        # parameters. If the sum of coefficient times URDF value over the base parameters is zero, the monomial is
+        # removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

@@ -34,7 +34,7 @@ class Inspection:
         arm: the arm.
         structure: structure of the mass matrix M and the potential energy V.
         actuation: entries of the input matrix G.
-        diagnostics: remarks of the reading of the URDF, such as rounded angles.
+        diagnostics: remarks about the URDF and the arm, such as rounded angles.
         input: "torque", or "position" for an arm with position servos.
     """
 
@@ -233,7 +233,7 @@ class Inspection:
 
 
 def _driven_joints(entries: Iterable[InputEntry]) -> str:
-    """Return the joints that entries of the input matrix G drive (their rows), as text such as ``joints 2-4``."""
+    """Return the joints of ``entries`` of the input matrix G (their rows) as text, such as ``joints 2-4``."""
     return joints_in_ranges(tuple(sorted({entry.row for entry in entries})))
 
 

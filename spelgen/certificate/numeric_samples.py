@@ -121,12 +121,12 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tuple[float, float]]:
-    """Return {quantity, such as "masses and inertias": two largest relative differences of readings of the URDF}.
+    """Return {quantity, such as "masses and inertias": two relative differences between readings of the URDF}.
 
-    The URDF is read by Pinocchio, by spelgen, and by spelgen without rounding of angles such as 1.5708 to pi/2. The
-    first difference is between Pinocchio and spelgen without rounding, the second between spelgen with and without
-    rounding. Both are relative to the values without rounding. Joint axes, masses and inertias are compared at random
-    configurations. Raises the exceptions of Pinocchio, and ValueError if the file has changed.
+    The quantities are "axes of the joints" and "masses and inertias", compared at random configurations. The first
+    number is the largest difference between Pinocchio and spelgen without rounding of angles, such as 1.5708 to pi/2.
+    The second number is the largest difference between spelgen with and without rounding. Both are relative to the
+    values without rounding. Raises the exceptions of Pinocchio, and ValueError if the file has changed.
 
     robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random configurations.
     """
@@ -140,9 +140,9 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tup
         del written["masses and inertias"]
     differences = {}
     for quantity, values in written.items():
-        # Each difference of two numbers is divided by the magnitude of the number, so that errors of light bodies are
-        # detected. A thousandth of the largest magnitude is added to the divisor, so that rounding errors of numbers
-        # close to zero are not reported.
+        # Each element of a difference is divided by the largest magnitude of this element over the samples, so that
+        # errors of light bodies are detected. A thousandth of the largest magnitude of all elements is added to the
+        # divisor, so that rounding errors of elements close to zero are not reported.
         scale = np.abs(values).max(axis=0) + (1e-3 * np.abs(values).max() or 1.0)
         difference, rounding = (np.abs(samples[quantity] - values) / scale for samples in (theirs, ours))
         differences[quantity] = float(difference.max()), float(rounding.max())
@@ -152,7 +152,7 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tup
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
     """Return the dynamics of the URDF as Pinocchio reads it.
 
-    Raises ValueError if the file has changed, or if a mass is negative, which Pinocchio reads as other numbers.
+    Raises ValueError if the file has changed, or if a mass is negative: Pinocchio would use another mass.
     """
     if any(link.inertial is not None and link.inertial.mass < 0 for link in robot.links):
         raise ValueError("negative mass of a link")
@@ -182,12 +182,12 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 
 
 def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return {quantity: values} of the B moving bodies of an arm at S positions q, (S, n), for a comparison.
+    """Return the values of the two compared quantities for the B moving bodies of an arm at S positions q, (S, n).
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
     (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
-    column. M is the sum of its upper triangle, which Pinocchio computes, and the transposed triangle. The sum doubles
-    the diagonal entries, which has no effect, because each entry is compared relative to its own magnitude.
+    column. The diagonal entries of M are doubled (upper triangle plus its transpose). This has no effect, because each
+    entry is compared relative to its own magnitude.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

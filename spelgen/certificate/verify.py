@@ -156,8 +156,8 @@ def verify(robot: Robot, arm: Chain, structure: Structure, *, seed: int = 0) -> 
         structure: structure that is derived from the chain.
         seed: seed of the random configurations and inertial parameters.
     """
-    # A derived rank is at most the number of entries of M, so this number of samples suffices to confirm it. Six more
-    # samples would show a larger rank.
+    # A derived rank is at most the number of entries of M: this number of samples confirms it. Six more samples
+    # are drawn to detect a true rank that is larger.
     count = len(structure.entries) + 6
     rng = np.random.default_rng(seed)
     is_random = structure.assume == "kinematics"
@@ -203,7 +203,8 @@ def _reading_checks(robot: Robot, arm: Chain, seed: int) -> Iterator[FactCheck]:
 def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield two facts about the entries of M: the zero entries, if any, and the joints on which each entry depends.
 
-    The first fact is tested by the entries in `samples`, and the second by their changes if only one joint moves.
+    The first fact is tested by the sampled entries of M, the second by the changes of the entries if only one joint
+    moves.
     """
     largest = np.abs(samples.mass).max(axis=(0, 1)).tolist()
     # `largest_changes`, (entries, n): largest change of each entry of M when only one joint moves.
@@ -238,8 +239,9 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # A term of the minimal form is a function f_j(q) or a constant c_k. Its value is a weighted sum of the entries
-        # of M, with the weights `functional`. Changes of the value if one joint moves, (n,), are divided by the sum
-        # over the entries of |weight| times scale, to which rounding errors are proportional.
+        # of M, with the weights `functional`. `changes`, (n,): largest change of the value if one joint moves. It is
+        # divided by the sum of |weight| times scale over the entries, because rounding errors are proportional to this
+        # sum.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
         # A term may change if one of its own joints moves; the minimal form is wrong only if another joint changes the
         # term.
@@ -247,8 +249,8 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
-    # The bound of rounding errors is larger than for other facts, because the coefficients of the functionals, which
-    # are fractions, are rounded to floats.
+    # The tolerance for rounding errors is larger than for other facts: the fractions in `functional` are rounded to
+    # floats.
     derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
@@ -257,19 +259,20 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
 
     Outputs are the terms that vary with q, constants the other terms; all terms are linearly independent. A matrix has
-    one column per entry of M. A change of M is its difference if one joint moves to another random position. First, the
-    number of outputs must be the rank of all changes of M, one row per configuration and moved joint. Second, the
-    number of outputs and constants must be the rank of M itself, one row per configuration. Third, for each k, the
-    number of outputs that depend on any of the first k joints must be the rank of the changes of M if one of these
-    joints moves.
+    one column per entry of M. A change of M is its difference if one joint moves to another random position.
+
+    1. The number of outputs must be the rank of all changes of M, one row per configuration and moved joint.
+    2. The number of outputs and constants must be the rank of M itself, one row per configuration.
+    3. For each k, the number of outputs that depend on any of the first k joints must be the rank of the changes of M
+       for which one of these joints moves.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # The derivation of the structure maximises, for each k, the number of outputs (terms of M that vary with q) that do
-    # not depend on the first k joints. A rank shows for each k that no larger number is possible.
+    # For each k, as many outputs as possible do not depend on the first k joints. The rank of a matrix shows for each k
+    # that the derivation has found the largest possible number.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
@@ -284,7 +287,7 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
 def _potential(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
     """Return the fact that the potential energy V depends only on the joints `structure.potential`, and its test.
 
-    The test uses the gravity torques dV/dq in `samples`: zero at all other joints, nonzero at these joints.
+    The test uses the gravity torques dV/dq in `samples`: they must be nonzero at these joints and zero at all others.
     """
     magnitudes = []
     for joint, size in enumerate(np.abs(samples.gravity).max(axis=0).tolist()):

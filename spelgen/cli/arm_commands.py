@@ -72,7 +72,7 @@ def inspect(
 def _text(
     format: str, inspection: Inspection, closed: Formulas | None, proof: Verification | None, urdf: Path
 ) -> str:
-    """Return the text of the inspection in a format, with a line end.
+    """Return the result of the inspection in the format ``format``, with a line end.
 
     closed: closed forms of M and of the potential energy V. proof: verification of the structure. urdf: path of the
     URDF, whose shapes an HTML page shows.

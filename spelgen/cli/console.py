@@ -40,7 +40,7 @@ def handle_errors(command: Callable[..., None]) -> Callable[..., None]:
     """
     groups: dict[str, type] = {}
     options: list[inspect.Parameter] = []
-    # `eval_str` turns annotations into types: `from __future__ import annotations` makes them strings.
+    # With `from __future__ import annotations`, annotations are strings: `eval_str` converts them to types.
     for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
         if isinstance(parameter.annotation, type) and is_dataclass(parameter.annotation):
             groups[name] = parameter.annotation
@@ -128,8 +128,8 @@ def _message(error: BaseException, debug: bool) -> str:
 def progress_bar(title: str) -> Iterator[Callable[..., None]]:
     """Context manager that shows a progress bar on stderr if stderr is a terminal.
 
-    It yields a function with the arguments number of finished steps, number of all steps, and optionally title of the
-    current step.
+    It yields a function f(done, total, title) that updates the bar: number of finished steps, number of all steps, and
+    (optional) title of the current step.
     """
     from rich.console import Console
     from rich.progress import Progress

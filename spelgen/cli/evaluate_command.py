@@ -51,7 +51,7 @@ def evaluate(
     from spelgen.logs.preprocessing import Preprocessing
 
     logs = read_test_logs(run, paths, mapping)
-    # The run is loaded after the logs are read, since errors in logs are more frequent.
+    # The logs are read before the run is loaded: errors in logs are frequent, and are reported without delay.
     model = load_run(run)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
@@ -70,7 +70,7 @@ def evaluate(
     for diagnostic in results.diagnostics:
         note(diagnostic)
     options.write_result(format, output, {"text": results.text, "json": lambda: json.dumps(record)})
-    # Limits are tested after the result is printed, so that a script gets the errors also if one exceeds its limit.
+    # Limits are tested after the result is printed: a script gets the result even if an error exceeds its limit.
     values = limit_figures(results)
     exceeded = []
     for name, limit_value in limits:
@@ -123,8 +123,8 @@ def estimate(
     path = output or Path(run) / "estimate.html"
     options.choose_format(None, path, ["html"])
     fit = load_run(run)
-    # The estimator needs predicted torques, and models of position servos predict none. `torque_model` raises the error
-    # for such a model before logs are read.
+    # The estimator needs predicted torques. A model of position servos predicts no torques: `torque_model` then raises
+    # an error, before logs are read.
     torque_model(fit)
     levels = noise_levels(fit)
     joints = list(fit.model.joint_names)
@@ -225,7 +225,7 @@ def compare(
             for table in section.tables:
                 say(f"{table.text()}\n")
         say(f"wrote {write_comparison(study, sections)}")
-    # The exit code for failed runs is set only after the page is written, which lists these runs.
+    # The page lists the failed runs, so it is written before the command exits with an error.
     if study.failures:
         raise typer.Exit(FAILED)
 

@@ -152,7 +152,7 @@ def logs(
     from spelgen.log_checks.check_logs import check_logs
     from spelgen.logs.read import read_bounded_logs
 
-    # The mapping is loaded after the arm, because its names are checked against the joints of the URDF.
+    # The mapping is loaded after the arm, because the names in the mapping are checked against the joints of the URDF.
     arm = options.ArmOptions(robot, joints, tip, angle_tolerance).load()
     # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
@@ -182,7 +182,10 @@ def logs(
 
 
 def _suggested(paths: list[Path], arm: Arm, file: Path) -> Path:
-    """Write a mapping that fits the columns of the first log; return its path. Exit with 1 if columns are absent."""
+    """Write a mapping for the columns of the first log to ``file``; return ``file``.
+
+    Exits with 1 if a needed quantity, such as the position of a joint, has no matching column.
+    """
     from spelgen.errors import collect
     from spelgen.logs.formats import log_files
     from spelgen.logs.suggest import suggest_mapping

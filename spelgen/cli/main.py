@@ -40,7 +40,7 @@ class Command(TyperCommand):
         return super().get_help(ctx)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the texts of the arguments in the usage line: without braces, optional arguments in brackets."""
+        """Return the arguments of the usage line as texts: optional arguments in brackets, braces of typer removed."""
         return [re.sub(r"[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]
 
 
@@ -118,6 +118,6 @@ def main() -> None:
     # during imports take 6 % of the time of a short command.
     gc.set_threshold(100_000)
     for stream in (sys.stdout, sys.stderr):
-        # Characters of names from a file that the encoding of the terminal does not have are printed as escapes.
+        # A name from a file may contain characters that the terminal's encoding does not have: escapes are printed.
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     app(prog_name="spelgen")

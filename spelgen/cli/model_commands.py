@@ -59,7 +59,7 @@ def build(
     format: options.TextOrJson = options.TEXT_OR_JSON,
 ) -> None:
     """Write the PyTorch module tailored to an arm."""
-    # The preset is checked before the URDF is read, which takes time.
+    # The preset is checked first, because reading the URDF takes time.
     if preset not in PRESET_NAMES and Path(preset).suffix not in (".yaml", ".yml"):
         message = f"{preset!r} is none of {', '.join(PRESET_NAMES)}, nor a YAML file"
         raise typer.BadParameter(message, param_hint="'--preset'")
@@ -125,11 +125,11 @@ def export(
     # By default the suffix of the output file selects the format of the export.
     if to is None:
         to = format_by_extension(output)
-    # The name of the output is checked before the model is loaded, which takes seconds.
+    # The name of the output is checked first, because loading the model takes seconds.
     require_fitting(to, output)
     options.require_free(output, force=force)
     result = export_run(load_run(run), to, entries=entry or (), float32=float32)
-    # Nothing is written if the comparison with the model fails, because it raises its error above.
+    # `export_run` has compared the export with the model. If they differ, it raises an error and nothing is written.
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]
     answer(format, {"files": files, "summary": result.summary}, *lines, *result.summary)

@@ -32,7 +32,7 @@ class UsageError(typer.BadParameter):
     """Usage error about an option that does not apply; the message names the option."""
 
     def format_message(self) -> str:
-        """Return the message without the prefix that typer adds, which names a parameter."""
+        """Return the message without typer's prefix "Invalid value for ...": the message names the option."""
         return self.message
 
 
@@ -63,7 +63,7 @@ def flag(name: str, text: str) -> Declared:
 
 
 def argument(metavar: str, text: str, default: object = ...) -> Declared:
-    """Return the declaration of a positional argument, `metavar` in the help; without a default it is required."""
+    """Return the declaration of a positional argument; `metavar` is its name in the help; it is required by default."""
     return typer.Argument(default, metavar=metavar, help=text)
 
 

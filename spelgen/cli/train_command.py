@@ -107,7 +107,8 @@ def train(
             require=lambda logs: [] if arm is None else require_sound_logs(logs, arm, log_mapping),
             options=run_options,
         )
-    # The logs determine the objective, so only `train_files` finds options that do not apply to the objective.
+    # The default objective depends on the logs. Options that do not apply to it are therefore found in `train_files`,
+    # which raises OptionError.
     except OptionError as error:
         option = "--objective" if error.element == "objective" else f"--set {error.element}"
         raise UsageError(f"{option}: {error.got}") from error
@@ -119,11 +120,12 @@ def train(
 def _payload(fit: Fit, source: Path | None) -> Payload | None:
     """Write the noise levels of the live estimator into the run folder; return the payload in the logs, or None.
 
-    A new fit of rigid bodies to torques estimates the noise levels from its logs; it has no payload.
+    The noise levels of a new fit of rigid bodies to torques are estimated from its logs. A run that was adapted from
+    the run in the folder `source` gets a copy of the noise levels of that run, if there are any. `source` is None for a
+    new fit.
 
-    A run that was adapted from the run in the folder `source` gets a copy of the noise levels of that run, if there are
-    any. For `adapt=load`, these noise levels and the model of `source` are used to estimate the payload. In all other
-    cases the result is None. `source` is None for a new fit.
+    The payload is estimated only for `adapt=load`, with these noise levels and the model of `source`; otherwise the
+    result is None.
     """
     from spelgen.live.levels import cross_validated_levels
     from spelgen.live.noise import keep_levels, stored_levels
@@ -165,7 +167,7 @@ def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> Non
 
         record["payload"] = payload_content(payload)
         outcome.append(textwrap.fill(f"in these logs: {payload_sentence(payload)}", 80))
-    # For a servo fit only the first table of the posterior is printed: its outcome already contains a table of drives.
+    # For a servo fit only the first table of the posterior is printed: the second table, of drives, is in `outcome`.
     listings = () if posterior is None else posterior.listings[: 1 if fit.record.servo else None]
     outcome += [table.text() for table in listings]
     answer(format, record, *outcome, f"run folder: {folder}")
@@ -265,7 +267,7 @@ def read_assignments(assignments: Sequence[str]) -> dict[str, object]:
     A key such as `prior.bodies` sets one field of a group. Raises a usage error for an invalid value and for an unknown
     key; the message suggests the most similar known key.
     """
-    keys = Assignments.model_fields.keys() - {"objective"}  # The option --objective sets it: no key of --set.
+    keys = Assignments.model_fields.keys() - {"objective"}  # --objective sets the objective: no key of --set.
     # All assignments of --set are collected before they are checked, since the fields of a group are checked together.
     texts: dict[str, str | dict[str, str]] = {}
     for assignment in assignments:
@@ -340,8 +342,8 @@ def fit_options(
         # parameters.
         settings["torque_first"] = False
     if objective is None and TIME_LIMIT in options:
-        # No objective is given: the logs determine the objective after this point, and some objectives have no time
-        # limit. Among `options`, a time limit would then be an error; among `settings`, which are only default values,
-        # it is ignored.
+        # Without --objective, the objective is chosen later from the logs, and may be one without a time limit. An
+        # entry of `options` that does not apply is an error, an entry of `settings` (default values) is ignored: the
+        # time limit is therefore moved to `settings`.
         settings[TIME_LIMIT] = options.pop(TIME_LIMIT)
     return FitOptions(objective, options, settings)

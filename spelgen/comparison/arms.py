@@ -57,8 +57,9 @@ class Comparison(Group):
             all presets for a simulated arm.
         seeds: Number of seeds 0, 1, ... Default: 1 for an arm with logs, and `comparison.seeds` in the settings of a
             simulated arm.
-        splits: Number of folds of a cross-validation over whole trajectories. 1: no cross-validation; the logs train.*
-            are for training and the logs test.* for testing, or a quarter of the trajectories if there is no test.*.
+        splits: Number of folds of a cross-validation over whole trajectories. 1: no cross-validation; the logs test.*
+            are for testing, all others for training. If there is no test.*, a random quarter of the trajectories is for
+            testing.
         width: Number of units of a hidden layer.
         depth: Number of hidden layers.
         training: Training settings for all arms, with the keys of a robot's settings.
@@ -137,10 +138,11 @@ class ArmInputs(ComparedArm):
     def split(self, number: int, splits: int) -> tuple[list[Trajectory], list[Trajectory]]:
         """Return the training and test trajectories of split `number` of `splits`. Raises LogError.
 
-        A single split tests on the logs test.*, or on a quarter of all trajectories. Several splits are the folds of a
-        cross-validation. The seed of the choice is fixed, so all models are tested on the same trajectories.
+        For ``splits`` = 1, the test trajectories are the logs test.* or, without such logs, a random quarter of all
+        trajectories. Otherwise they are fold ``number`` of a cross-validation with random folds. The seed is fixed: all
+        models are tested on the same trajectories.
         """
-        # Each worker process loads the arm from its files: a job contains only their paths.
+        # A job contains only the paths of the URDF and the logs: each worker process loads the files itself.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []
@@ -169,7 +171,7 @@ def arm_inputs(
 
     If the arm has no logs, logs are simulated and written to ``folder``. Models of a simulated arm are built from a
     copy of the URDF in this folder, without inertials, drives and friction. splits: number of folds; LogError if there
-    are too few trajectories. progress: argument of `simulate`.
+    are too few trajectories. progress: callback of the simulation, see `simulate`.
 
     Raises the errors of `load_arm`, `load_mapping`, `read_logs` and `simulate`.
     """
@@ -195,7 +197,7 @@ def arm_inputs(
 
 
 def _simulate(inputs: ArmInputs, loaded: Arm, folder: Path, progress: Progress | None) -> None:
-    """Simulate logs by the protocol of the arm's settings and write them to ``folder``, unless it contains them.
+    """Simulate logs by the protocol of the arm's settings; write them to ``folder``, if it does not contain them yet.
 
     A copy of the URDF without inertials, drives and friction is written, too. Models are built from this copy, so that
     no model starts from the true parameters.

@@ -68,7 +68,7 @@ def simulated_figures(
     """
     model, substeps = fit.model, int(fit.checkpoint.substeps)
     decimation = fit.preprocessing.decimation or 1
-    config = cast("Rollout", fit.config)  # Models of a simulated arm are fitted to predicted windows.
+    config = cast("Rollout", fit.config)  # All fits to simulated logs have the rollout objective.
     steps = round(TUNING.horizon / (decimation * float(testing[0].t[1] - testing[0].t[0])))
     far = spread_windows(testing, steps + 1, decimation)
     visited = far.q[:, 0]
@@ -78,7 +78,7 @@ def simulated_figures(
         model.mass_matrix(visited), true_mass(truth, visited, fit.record.joints)
     )
     # The training loss is the loss that the fit minimises. The windows of training loss and test loss are therefore as
-    # long as the windows of the fit; only the prediction loss is over 1 s.
+    # long as the windows of the fit. The windows of the prediction loss above are 1 s long.
     for label, logs in (("training loss", training), ("test loss", testing)):
         windows = spread_windows(logs, config.window, decimation)
         losses[label] = prediction_loss(model, windows, substeps)[0]

@@ -94,7 +94,7 @@ class Job(Group):
 
     @cached_property
     def folder(self) -> Path:
-        """Run folder, whose name ends with a hash of all inputs of the run, so that other inputs have another folder.
+        """Run folder. Its name ends with a hash of all inputs of the run: other inputs give another folder.
 
         The inputs are logs, URDF, settings, design, options and version of spelgen. Paths of files do not affect the
         hash.
@@ -122,8 +122,8 @@ class Job(Group):
     def config(self, model: ArmModel) -> FitConfig | FitOptions:
         """Return the configuration of the fit of the model.
 
-        On a simulated arm, all models have the same one (see `equal_steps`). On logs of the user, it consists of the
-        training settings of the arm.
+        For a simulated arm, the configuration is the same for all models (see `equal_steps`). For logs of the user, it
+        consists of the training settings of the arm.
         """
         if self.inputs.truth is not None:
             return self.equal_steps()
@@ -165,7 +165,7 @@ def run_job(job: Job) -> RunResult:
     # One thread per worker: there is one worker per core, so more threads would wait for each other.
     torch.set_num_threads(1)
     run = RunFolder(job.folder)
-    # The folder belongs to these inputs, so an interrupted fit in it is resumed.
+    # The folder's name has a hash of all inputs: a fit found in it is an interrupted fit of this job, and is resumed.
     resume = run.config.exists()
     training, testing = job.inputs.split(job.split, job.splits)
     model, start = job.build(), time.monotonic()

@@ -51,7 +51,7 @@ def arm_results(
     medians = {measure: _medians(runs, measure) for measure in results[0].errors}
     measure, errors = next(iter(medians.items()))
     ranked = _by_error(errors)
-    # The errors include baselines, which have no runs.
+    # `ranked` also contains baselines, which are not trained: the best model is the first one with runs.
     best = next(model for model in ranked if model in runs)
     # The true parameters of a user's arm are unknown, so the only table about such an arm has the errors on test logs.
     tables = (_losses(medians, published), _sizes(runs)) if results[0].sizes else (_ranking(medians, runs),)
@@ -131,7 +131,7 @@ def _by_error(medians: Numbers) -> Numbers:
 def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFigures]) -> Listing:
     """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
     rows, presets = dict(medians), next(iter(medians.values()))
-    # Published figures are added as further rows. Presets that the publication does not evaluate have no number there.
+    # Published figures are added as further rows. The cell of a preset that the publication does not evaluate is empty.
     records = {name: published[name].model_dump(exclude_none=True) for name in presets if name in published}
     for field in PublishedFigures.model_fields:
         values = {name: record[field] for name, record in records.items() if field in record}
@@ -155,6 +155,7 @@ def _sizes(runs: Runs) -> Listing:
 
 def _combined(values: Sequence[float | None], combine: Callable[[list[float]], float]) -> float | None:
     """Return combine(values), in which None is replaced by infinity; None if the result is not finite."""
-    # None is not omitted: otherwise a model that diverges with one of two seeds would be ranked by the other seed.
+    # None, the error of a diverged run, counts as infinite: if it were omitted, a model that diverges with one of two
+    # seeds would be ranked by the other seed only.
     combined = combine([math.inf if value is None else value for value in values])
     return combined if math.isfinite(combined) else None

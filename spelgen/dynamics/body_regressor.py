@@ -78,7 +78,7 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
     jacobian = pose.jacobian if identical else chain.ratios.mT @ pose.jacobian
     jacobian = torch.unflatten(jacobian, -1, (3, count, 4))
     # `forces`, (..., B, 12, 10): the derivative of the inertial forces T'' J with respect to each inertial parameter.
-    # Their matrix products with the Jacobian take half the time of a product of Jacobian and T'', (..., n, B, 4, 4).
+    # The product of Jacobian and `forces` takes half the time of the product of Jacobian and T'', (..., n, B, 4, 4).
     forces = torch.unflatten(rises.transpose(-3, -2) @ _DERIVATIVES.to(q), -1, (4, 10)).flatten(-3, -2)
     rows: Tensor = jacobian.movedim(-2, -4).flatten(-2) @ forces
     return rows.transpose(-3, -2).flatten(-2)
@@ -93,7 +93,7 @@ def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.nda
 
 
 def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Return the regressor of inertial parameters and armatures: the derivative of the joint torques.
+    """Return the derivative of the joint torques with respect to inertial parameters and armatures (the regressor).
 
     Args:
         chain: kinematics of B bodies.
@@ -110,28 +110,30 @@ def constants_regressor(chain: BodyChain, motors: Tensor, q: Tensor, qd: Tensor,
 def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...], Tensor]:
     """Return the r base parameters of an arm: their names, and their coefficients, (r, 10 B + n).
 
-    A base parameter is its row of coefficients times the inertial parameters of B bodies and the n armatures, in the
-    order of `constants_regressor`. That regressor is evaluated at random states. The parameter of a column that depends
-    linearly on the preceding columns is regrouped into the parameters of those columns (Gautier and Khalil, IEEE T-RA
-    6:368, 1990). A name ends with R if other parameters are regrouped into the parameter. Torque offsets take part in
-    the regrouping, since constant gravity along a prismatic joint cannot be distinguished from an offset. The columns
-    and rows of the n offsets are then removed from the result.
+    A base parameter is a row of coefficients times the vector of all parameters: the inertial parameters of B bodies
+    and the n armatures, in the order of the columns of `constants_regressor`. This regressor is evaluated at random
+    states. If a column depends linearly on the preceding columns, its parameter is regrouped into the parameters of
+    these columns (Gautier and Khalil, IEEE T-RA 6:368, 1990). The name of a base parameter with regrouped parameters
+    ends with R.
+
+    The parameters that are regrouped include torque offsets, since constant gravity along a prismatic joint cannot be
+    distinguished from an offset. Rows and columns of the n offsets are omitted from the result.
 
     Args:
         chain: kinematics of B bodies.
         motors: matrix C, (n, n): the velocities of the drives are C qd.
     """
     n, inertial = len(motors), 10 * len(chain.parents)
-    # A column can only be regrouped into preceding ones. The parameters that are regrouped by convention (Iyy, hz, m)
-    # are therefore last in BASE_ORDER, and the result has the conventional base parameters.
+    # A column can only be regrouped into preceding columns. By convention, Iyy, hz and m are regrouped: they are
+    # therefore the last parameters in BASE_ORDER.
     order = [
         10 * body + INERTIAL_PARAMETERS.index(name) for body in range(inertial // 10) for name in BASE_ORDER
     ]
     order += range(inertial, inertial + 2 * n)
     # The random states give twice as many equations as parameters, so that they do not limit the rank.
     shape = (3, 2 * len(order) // n + 1, n)
-    # The last digit of a result of torch depends on the alignment of its memory, which varies for NumPy arrays. The
-    # random states are therefore copied to memory of torch.
+    # In torch, the last digit of a result depends on the memory alignment of the arguments, which varies for NumPy
+    # arrays. The random states are therefore copied to memory of torch.
     motion = torch.tensor(np.random.default_rng(0).uniform(-3.0, 3.0, shape))
     columns = constants_regressor(chain, motors, *motion)
     columns = torch.cat([columns, motors.mT.expand(len(columns), n, n)], dim=-1).flatten(0, 1)
@@ -148,7 +150,7 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     combination[combination.abs() < 1e-9] = 0.0
     labels = [*map(parameter_name, range(inertial)), *(f"armature{joint + 1}" for joint in range(n))]
     names = []
-    # Rows of torque offsets are omitted: they are the last ones.
+    # The rows of torque offsets, which are the last rows, are omitted.
     for index, row in zip(base[base < len(labels)].tolist(), combination, strict=False):
         names.append(base_name(labels[index], int(row.count_nonzero())))
     return tuple(names), combination[: len(names), : len(labels)]

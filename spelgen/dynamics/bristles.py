@@ -36,7 +36,7 @@ class BristleReach:
         return int(self.values.shape[1])
 
     def of_drives(self, joints: np.ndarray) -> np.ndarray:
-        """Return positions or velocities of the drives, (..., n), from positions or velocities of the joints."""
+        """Return C times ``joints``: drive positions or velocities, from joint positions or velocities (..., n)."""
         return joints if self.motors is None else joints @ self.motors.T
 
 
@@ -103,8 +103,8 @@ def bristles_along(q: np.ndarray, bristles: BristleReach) -> np.ndarray:
 def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None:
     """Return the smooth sign of the velocity of each drive, (T, n), at joint velocities qd, (T, n) [rad/s, m/s].
 
-    The dry friction of a drive without bristles has this factor, from -1 to 1. Return None if the smoothing velocity
-    is unknown.
+    The dry friction of a drive without bristles is proportional to the smooth sign, which is from -1 to 1. Return None
+    if the smoothing velocity is unknown.
     """
     if bristles.smoothing_velocity is None:
         return None
@@ -116,8 +116,8 @@ def direction_along(qd: np.ndarray, bristles: BristleReach) -> np.ndarray | None
 def encoded(q: np.ndarray) -> np.ndarray:
     """Return the measured positions q, (T, n) [rad, m], without encoder jitter.
 
-    Jitter between two adjacent encoder steps would be a reversal of the drive at each sample. The result is constant
-    until q differs from it by more than one encoder step, like the output of a gear with backlash.
+    Jitter between two adjacent encoder steps would count as a reversal of the drive at each sample. The result is
+    constant until q differs from it by more than one encoder step, like the output of a gear with backlash.
     """
     step = encoder_step(q)
     if not step.any():

@@ -38,7 +38,7 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics whose method `equations_at` gives M, force and friction with fewer operations than `_of_dynamics`."""
+    """Dynamics with a method that gives M, force and friction in fewer operations than the general `_of_dynamics`."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
         """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""
@@ -47,7 +47,7 @@ class OwnEquations(Protocol):
 def equations_of(dynamics: object) -> EquationsAt:
     """Return a function of positions q, (W, n), that returns the equations of motion of W rollouts at q.
 
-    The function uses the parameter cache of ``dynamics``: it is valid until a parameter changes.
+    The returned function uses a parameter cache of ``dynamics``: do not use the function after a parameter has changed.
     """
     if isinstance(dynamics, PortHamiltonian):
         return partial(_of_model, dynamics, dynamics.prepare())
@@ -127,9 +127,9 @@ def runge_kutta(
 def unbounded(mass: Tensor) -> Tensor:
     """Return the factor t = 1, (...), for mass matrices M, (..., n, n): M is not corrected.
 
-    ``DerivedMass`` replaces M by C + t (M - C), with a constant C; ``DerivedMass.fraction`` returns t < 1 for an
-    indefinite M, so that the result is positive definite. ``mass_as_learned`` puts this function in place of that
-    method.
+    ``DerivedMass`` replaces M by C + t (M - C), with a constant matrix C. The method ``DerivedMass.fraction`` returns a
+    factor t < 1 for an indefinite M, so that the result is positive definite. ``mass_as_learned`` replaces this method
+    by this function, with t = 1 for every M.
     """
     return mass.new_ones(mass.shape[:-2])
 

@@ -50,8 +50,8 @@ class DriveFriction:
         The last two terms tend to `forward` and `backward` for large |v|. The torque is smooth, 0 at rest, and
         dissipative: the torque of a drive times its velocity is not negative.
 
-        direction: factor s of the dry friction of each drive, from -1 to 1, (..., n), if it is a function of the
-        friction state.
+        direction: factor s of the dry friction of each drive, from -1 to 1, (..., n), computed from the friction state;
+        None: the tanh above.
         """
         v = qd if self.speeds is None else qd @ self.speeds.T
         if direction is None:
@@ -106,7 +106,7 @@ class FrictionModel:
         stribeck: True: add dry friction at low velocity (Gaussian, Armstrong-Helouvry 1991).
         polynomial: True: add the effects qd |qd| and qd^3.
         memory: True: Coulomb friction depends on the deflections of bristles (see ``runtime.friction_laws``), and each
-            bristle is an effect with its own coefficient. False: it depends on the tanh of the velocity.
+            bristle is an effect with its own coefficient. False: Coulomb friction depends on the tanh of the velocity.
     """
 
     coulomb_smoothing_velocity: float = 0.01

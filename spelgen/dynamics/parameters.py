@@ -77,7 +77,7 @@ NamedTensors = Mapping[str, Tensor]
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of the parameters of idle residual terms, whose value is zero for all q.
+    """Return the names of the parameters of residual terms that are zero for all q (idle terms).
 
     The list is empty for a model without residual terms.
     """
@@ -108,7 +108,7 @@ def without_residuals(model: Model) -> Model:
 
 
 def without_idle_residuals(model: Model) -> Model:
-    """Return a copy of the model without residual terms that are zero, which takes less time to evaluate.
+    """Return a copy of the model without residual terms that are zero; the copy takes less time to evaluate.
 
     The copy must not be trained, since the removed terms could become nonzero in a training.
     """

@@ -69,6 +69,6 @@ def kinematic_model(arm: Chain) -> pin.Model:
 
 def _inertia(parameters: np.ndarray) -> pin.Inertia:
     mass, hx, hy, hz, ixx, ixy, ixz, iyy, iyz, izz = parameters
-    if mass == 0.0:  # `FromDynamicParameters`, which divides by the mass, is not used.
+    if mass == 0.0:  # `FromDynamicParameters` would divide by zero.
         return pin.Inertia(0.0, np.zeros(3), np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]]))
     return pin.Inertia.FromDynamicParameters(np.array([mass, hx, hy, hz, ixx, ixy, iyy, ixz, iyz, izz]))

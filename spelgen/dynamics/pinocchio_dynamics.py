@@ -49,8 +49,8 @@ class PinocchioDynamics:
 
     Args:
         model: Pinocchio model of b joints, with the rotor inertia as armature.
-        constraint: joint positions as a function of the coordinates (mimic joints); joints of the model that it does
-            not name are locked.
+        constraint: joint positions as a function of the coordinates (mimic joints); joints of the model that are not
+            named in it are locked.
         friction: function of the velocity (..., n) that returns the friction torque (..., n); None: no friction.
         inputs: input matrix G, (n, n); None: each input is the torque of its joint.
     """
@@ -147,7 +147,7 @@ class PinocchioDynamics:
 
 
 def urdf_dynamics(urdf: Path, joints: Sequence[str], *, drives: bool = False) -> PinocchioDynamics:
-    """Return the dynamics of an arm as Pinocchio reads them from its URDF: a reference for spelgen's own parser.
+    """Return the dynamics of the arm in a URDF that Pinocchio has parsed, as a reference for spelgen's own parser.
 
     The URDF defines inertials, damping and friction. The settings file of the URDF defines gravity and the input
     matrix. Raises the errors of Pinocchio if it cannot read the URDF.

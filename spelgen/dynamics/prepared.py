@@ -1,4 +1,4 @@
-"""A trained model for many calls, as in control loops: its parameters are constant, and their cache is computed once.
+"""A trained model for many calls, as in control loops: constant parameters, whose cache is computed only once.
 
 The methods return torques, accelerations, rollouts and linearizations.
 """
@@ -82,7 +82,7 @@ class PreparedModel:
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state after a displacement of the joints without reversals, (..., n, K) [rad, m].
 
-        z: friction state before it, (..., n, K) [rad, m]. displacement: (..., n) [rad, m].
+        z: friction state before the displacement, (..., n, K) [rad, m]. displacement: (..., n) [rad, m].
         """
         return memory_after(self.model, z, displacement)
 
@@ -195,7 +195,7 @@ class PreparedModel:
         return self._kinematics().pose(q)
 
     def jacobian(self, q: Tensor) -> Tensor:
-        """Return the Jacobian of the tip in root axes, (..., 6, n), linear velocity first.
+        """Return the Jacobian of the tip, (..., 6, n), in root axes: three rows of linear, three of angular velocity.
 
         Raises ValueError without a tip.
         """
@@ -227,8 +227,8 @@ def _state_and_input_jacobians(function: Callable[..., Tensor], *arguments: Tens
     """Return the Jacobians, (batch, m, k), of a function of (state, input, ...) with respect to state and input.
 
     Args:
-        function: function of arguments without batch dimension; state and input are vectors, (k,) each. It returns a
-            vector, (m,).
+        function: function of (state, input, ...), without batch dimension. State and input are vectors, (k,) each. The
+            function returns a vector, (m,).
         arguments: all arguments of the function, (batch, ...) each.
     """
     if not torch.is_grad_enabled():

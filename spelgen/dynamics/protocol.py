@@ -40,7 +40,7 @@ class RigidDynamics(Protocol):
         """Return h, (..., n): Coriolis, centrifugal and gravity torque, without friction."""
 
     def friction_torque(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the friction torque, (..., n) [Nm, N], with the sign of qd: it is subtracted from the inputs."""
+        """Return the friction torque, (..., n) [Nm, N]: term on the left side of the equation, with the sign of qd."""
 
     def forward_dynamics(self, q: Tensor, qd: Tensor, tau: Tensor) -> Tensor:
         """Return the accelerations qdd, (..., n), under the inputs tau."""
@@ -124,17 +124,17 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
             first qd.
     """
     states = [sliding_memory(dynamics, qd[:, 0]) if z is None else z]
-    # The friction state at a sample depends on the state at the previous sample, so samples cannot be a batch.
+    # The friction state at a sample depends on the previous sample: a loop over the samples is needed.
     for moved in q.diff(dim=1).unbind(1):
         states.append(memory_after(dynamics, states[-1], moved))
     return torch.stack(states, dim=1)
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the arguments about friction that a caller appends to (q, qd, ...) in a call of a method of `dynamics`.
+    """Return the friction arguments for a call of a method of `dynamics`, which follow the arguments (q, qd, ...).
 
-    The result is () if z is None or friction has no state; `direction` is then ignored, since it is the argument after
-    z. It is (z, direction) for a `RigidBodyDynamics` and a given direction, otherwise (z,).
+    The result is () if z is None or friction has no state; `direction` is then ignored, since it can be passed only
+    after z. The result is (z, direction) for a `RigidBodyDynamics` and a given direction, otherwise (z,).
 
     Args:
         dynamics: dynamics whose method is called.

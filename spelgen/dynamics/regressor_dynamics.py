@@ -41,7 +41,7 @@ def regressor(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.
 def urdf_parameters(arm: Chain) -> np.ndarray:
     """Return the inertial parameters of the arm's B bodies from the URDF, (10 B,); zero for bodies without <inertial>.
 
-    Their order is the order of the columns of ``regressor``.
+    The parameters are in the order of the columns of ``regressor``.
     """
     return np.array([body.inertia or (0,) * 10 for body in arm.bodies], dtype=float).ravel()
 
@@ -75,8 +75,8 @@ class RegressorDynamics:
         drives: Drives | None = None,
         bristle_reach: np.ndarray | None = None,
     ) -> None:
-        # This class uses pseudo-inertias in place of the Cholesky factors of trained models: least-squares parameters
-        # may be physically inconsistent, and have no Cholesky factors then.
+        # Trained models use Cholesky factors of pseudo-inertias. They do not exist for physically inconsistent
+        # parameters, which least squares may return: this class uses the pseudo-inertias themselves.
         self.chain, self.friction = body_chain(arm), friction
         by_body = torch.from_numpy(parameters).double().reshape(-1, 10)
         self.inertia = torch.block_diag(*pseudo_inertia(by_body))
@@ -110,11 +110,11 @@ class RegressorDynamics:
         return applied(momenta, self.chain.accelerations(chain, qd))
 
     def _bodies(self, q: Tensor) -> tuple[ChainConfiguration, Tensor]:
-        """Return the configuration cache of the B bodies at q, (..., n) [rad, m], and the derivatives of their momenta.
+        """Return the configuration cache at q, (..., n) [rad, m], and d momenta / d qd of the bodies.
 
-        The momentum of a body is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and the time
-        derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of the
-        momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
+        The momentum of each of the B bodies is the matrix T' J, (3, 4), with the body's pseudo-inertia J, (4, 4), and
+        the time derivative T', (3, 4), of its homogeneous transform without the constant last row. The 12 B entries of
+        the momenta of all bodies are linear in qd; their derivatives with respect to qd are (..., n, 12 B).
         """
         # The kinetic energy of a body is 1/2 tr(T' J T'^T), with T' = dT/dt. The pseudo-inertia J itself is used,
         # without its Cholesky factors, so J may be physically inconsistent. `chain.forward` returns the transforms T

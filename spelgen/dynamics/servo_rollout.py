@@ -25,7 +25,7 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 
 
 class ServoDrives(NamedTuple):
-    """Constants of an arm for rollouts of this module: of servos, friction, torque offsets and bristles.
+    """Constants of an arm's drives for the rollouts of this module: servos, friction, torque offsets and bristles.
 
     Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): with
     this layout, a rollout takes two thirds of the time that it takes with (..., n, K).
@@ -127,8 +127,8 @@ def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor
     velocity = slipped(inertia * qd + impulse, inertia + damping, bristle_stiffness, bent, reach)
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
-        # Which bristles slide depends on the displacements of all joints, which the inertia couples. The mean velocity
-        # of the step is found by fixed-point iteration; two iterations suffice.
+        # The inertia couples the joints, so the sliding bristles of one joint depend on the motion of all joints. The
+        # mean velocity of the step is found by fixed-point iteration; two iterations suffice.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)

@@ -59,7 +59,7 @@ class TipKinematics:
         return self.pose(q)[..., :3, 3]
 
     def jacobian(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the Jacobian of the link, (..., 6, n): its linear, then its angular velocity per qd, in root axes."""
+        """Return the Jacobian of the link, (..., 6, n), in root axes: rows 0-2 linear, 3-5 angular velocity."""
         jacobian: torch.Tensor = self._chains[q.dtype].jacobian_tensor(
             self._positions(q)
         ) @ self._jacobian.to(q)
@@ -106,7 +106,7 @@ def tip_kinematics(
         joints: names of the coordinates, if ``arm`` is a path.
 
     Raises:
-        ValueError: a joint does not move the link, or no joints are named.
+        ValueError: a joint does not move the link, or ``arm`` is a path and ``joints`` is None.
     """
     if isinstance(arm, str | Path):
         robot, names = read_urdf(Path(arm)), list(joints or ())

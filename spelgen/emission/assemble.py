@@ -46,7 +46,7 @@ class ArmModel(PortHamiltonian):
         return PreparedModel(self, tip)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        # pickle does not find the model's class by name, since a function makes the class: pickle calls the function.
+        # pickle cannot find the model's class by name, because a function makes it: the function is called again.
         return (_without_state, (base_class(self.spec),), *super().__reduce_ex__(protocol)[2:])
 
     def __repr__(self) -> str:
@@ -106,7 +106,7 @@ def spec_of(model: object) -> ModelSpec | None:
 def _mass_entries(rows: list[list[Sums]], *terms: Tensor) -> Tensor:
     """Return the mass matrix M, (..., n, n), from its functions of q and its constants (the terms).
 
-    The function ``mass_entries`` of an emitted module computes the same.
+    The function ``mass_entries`` of an emitted module computes the same matrix.
 
     Args:
         rows: for each row of the lower triangle of M, a list of the entries as linear combinations of the terms.

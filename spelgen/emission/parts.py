@@ -34,7 +34,7 @@ class Call:
 
 
 def call(callee: str, *positional: object, **named: object) -> Call:
-    """Return a ``Call`` of ``callee`` with these positional and keyword arguments."""
+    """Return a ``Call`` of ``callee`` with the given positional and keyword arguments."""
     arguments = [(None, value) for value in positional]
     return Call(callee, (*arguments, *named.items()))
 
@@ -47,8 +47,8 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 class NetworkTuning:
     """Constants of untrained networks: numbers of hidden units, and the scale of inputs."""
 
-    # [1] Factor on the encoded positions that are inputs of friction networks: positions are initially weaker inputs
-    # than velocities, which are divided by typical speeds and are of the order of one.
+    # [1] Factor of the encoded positions, inputs of friction networks. It is below one, so that an untrained network
+    # depends less on positions than on velocities. The velocities are divided by typical speeds.
     position_sensitivity: float = 0.1
     # [1] Number of hidden units per joint of the friction networks.
     friction_units: int = 8
@@ -129,8 +129,8 @@ def base_class(spec: ModelSpec) -> str:
 def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str, object]:
     """Return ``fields`` without arguments that have their default values, so that the rows of a module are short.
 
-    fields: {name of a keyword argument: value}. is_default: {name of an argument: True if its value is the default};
-    absent arguments are kept.
+    fields: {name of a keyword argument: value}. is_default: {name of an argument: True if its value is the default}.
+    Arguments that are not in ``is_default`` are kept.
     """
     return {name: value for name, value in fields.items() if not is_default.get(name)}
 
@@ -138,8 +138,8 @@ def _without_defaults(fields: dict[str, object], **is_default: bool) -> dict[str
 def _joint(joint: JointSpec) -> Call:
     typical, limits = (joint.center, joint.half_range), None
     if joint.lower is not None and joint.upper is not None:
-        # `typical_range` is (center, half range). `runtime.rows.Joint` computes the same two numbers from the limits,
-        # with the same rounding: the row of a joint omits `typical_range` if it is equal to the computed numbers.
+        # `typical_range` is (center, half range). By default, `runtime.rows.Joint` computes it from the limits, with
+        # the rounding used here: the row of a joint omits `typical_range` if it has its default value.
         limits = rounded((joint.lower + joint.upper) / 2), rounded((joint.upper - joint.lower) / 2)
     fields = {"lower": joint.lower, "upper": joint.upper, "speed": joint.speed, "friction": joint.friction}
     fields |= {"armature": joint.armature, "gear": joint.gear}
@@ -208,7 +208,7 @@ def _friction_laws(spec: ModelSpec) -> Call:
 def _networks(spec: ModelSpec) -> dict[str, object]:
     """Return the keyword arguments of the constructor of a network model, except for ``joints`` and ``inputs``.
 
-    Their order determines the initial weights, since all networks use one random generator.
+    The order of the arguments determines the initial weights, since all networks use one random generator.
     """
     n = len(spec.joints)
     ones = (1.0,) * n
@@ -249,8 +249,8 @@ def _mass_scales(spec: ModelSpec) -> tuple[tuple[float, ...], ...]:
     """Return the factors by which the inputs of the network of M are multiplied: two rows, (n,) each.
 
     The first row is for the inputs cos q (scaled q of a prismatic joint), the second for the inputs sin q. The rows are
-    equal, since a factor depends only on the joint: it is the root mean square change of M if only this coordinate
-    changes, divided by the largest such change of all coordinates.
+    equal, since a factor depends only on the joint: the root mean square change of M due to a change of the joint's
+    position, divided by the largest such value of all joints.
     """
     return (tuple(joint.mass_sensitivity for joint in spec.joints),) * 2
 
@@ -360,9 +360,8 @@ def term_names(spec: ModelSpec) -> list[str]:
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
     """Return the lower triangle of the mean of M without armature, (n, n) [kg m^2, kg m, kg], to 6 significant digits.
 
-    The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero.
-    outputs, constants: terms of M, functions of q with their means over these positions, and constants with their
-    values.
+    The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero. outputs,
+    constants: the terms of M. Functions of q have their means over these positions, constants their values.
     """
     mean = np.zeros((n, n))
     for constant in constants:

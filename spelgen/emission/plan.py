@@ -184,8 +184,8 @@ def _joint(
         sizes: typical magnitudes of M, potential energy V and torques.
         index: index of the coordinate, from 0.
         drive: settings of the joint's drive.
-        min_armature: armature if the rotor inertia and at least one of the limits of effort and speed are unknown [kg
-            m^2, kg].
+        min_armature: armature [kg m^2, kg] of a drive with unknown rotor inertia, if its effort limit or its speed
+            limit is unknown, too.
     """
     # The working range defines center and half range, since it exists even if the URDF has no limits.
     low, high = coordinate.working_range
@@ -232,8 +232,8 @@ def _entries(weights: Weights) -> Entries:
 def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[LinkSpec, ...]:
     """Return a ``LinkSpec`` for each body of ``arm``, with inertial parameters that are physically consistent.
 
-    inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint frame, (10,) each. They
-    are changed if they are not physically consistent.
+    inertias: (m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz) of each body about the origin of its joint frame, (10,) each.
+    Inconsistent parameters are corrected by `_consistent`.
     """
     specs = []
     for body, ten in zip(arm.bodies, inertias, strict=True):
@@ -259,8 +259,8 @@ def _links(arm: Chain, inertias: Sequence[Sequence[Fraction | float]]) -> tuple[
 def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     """Return the inertial parameters ``ten`` of a body, (10,), made physically consistent if necessary.
 
-    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`), as are principal second
-    moments of mass below `min_second_moment` times the largest.
+    Eigenvalues of the pseudo-inertia that are not positive are raised (see `reference_factor`). Principal second
+    moments of mass below `min_second_moment` times the largest are raised, too.
     """
     factor, is_consistent = reference_factor(np.array(ten, dtype=float))
     pseudo = factor @ factor.T

@@ -49,7 +49,7 @@ def make_spec(
     None: the specification contains only the file name of the URDF.
     Other arguments and errors as for ``build``.
     """
-    # `derive_spec` is imported here, because commands that have a specification do not need it.
+    # `derive_spec` is imported here, since importing it takes time: commands that read a specification do not need it.
     from spelgen.emission.plan import derive_spec
 
     arm = arm if isinstance(arm, Arm) else load_arm(arm)
@@ -87,8 +87,8 @@ def arm_of_spec(spec: ModelSpec | None, urdf: str | Path) -> Arm:
 def find_urdf(module: Path, name: str) -> Path:
     """Return the path of the URDF of a module. Raises ModuleError if the URDF is not found.
 
-    module: path of the module. name: name or relative path of the URDF in the module's specification. It is searched in
-    the module's folder, in the current folder, and in the subfolders robots/ of both.
+    module: path of the module. name: name or relative path of the URDF in the module's specification. The URDF is
+    searched in the module's folder, in the current folder, and in the subfolders robots/ of both.
     """
     # The folder of the module is searched first, since most projects have the URDF there.
     folders = [module.parent, Path(), Path("robots"), module.parent / "robots"]
@@ -103,7 +103,7 @@ def find_urdf(module: Path, name: str) -> Path:
 
 
 def _path_of_urdf(module: Path, urdf: Path) -> str:
-    """Return the URDF's file name if ``find_urdf`` finds it by name, else its path relative to the module's folder."""
+    """Return the URDF's file name if ``find_urdf`` can find it; otherwise its path relative to the module's folder."""
     try:
         if find_urdf(module, urdf.name).samefile(urdf):
             return urdf.name

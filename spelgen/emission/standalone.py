@@ -25,7 +25,7 @@ class Definition(NamedTuple):
 class Runtime(NamedTuple):
     """The source of all files of ``spelgen.runtime``."""
 
-    definitions: dict[str, Definition]  # by name, in an order in which they can be executed
+    definitions: dict[str, Definition]  # {name: definition}, each after the definitions it uses
     imports: tuple[ast.Import | ast.ImportFrom, ...]  # imports of other packages and of the standard library
 
 

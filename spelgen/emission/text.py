@@ -1,7 +1,7 @@
 """Conversion of a ``ModelSpec`` to the source of a module, and back. Equal specifications give equal bytes.
 
-Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. The specification of
-a module is found in its text, which is not executed.
+Names from a URDF appear only as string literals, and as JSON strings in docstrings, never as code. A module is not
+executed to read its specification: its text is searched for the specification.
 """
 
 import ast
@@ -44,7 +44,7 @@ _EXAMPLE = """\
 # [bytes] Largest file that is read as a module: ten times the size of the largest module that `spelgen build` writes.
 MAX_MODULE = 2**22
 _EXPECTED = "a module written by this version of `spelgen build`"
-# The statement of a module with its specification. JSON has no three quotes in a row.
+# The statement of a module with its specification, as JSON. It ends at the first """, which cannot occur in JSON.
 _SPEC = re.compile(r'^SPEC = r"""(.*)"""', re.MULTILINE)
 
 
@@ -174,7 +174,7 @@ def _quoted(name: str) -> str:
 
 
 def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
-    """Return the source of the tables ``JOINTS``, ``LINKS``, ...: one assignment each, after comments on its units."""
+    """Return the source of the tables ``JOINTS``, ``LINKS``, ...; comments with the units precede each table."""
     statements = []
     terms: dict[str, Sequence[OutputSpec | ConstantSpec]] = {
         "FUNCTIONS": spec.outputs,

@@ -99,7 +99,7 @@ def typical_and_worst(motions: Sequence[Drawn]) -> tuple[Drawn, ...]:
 
 
 def thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
-    """Return every k-th sample of a motion for a chart, with the smallest k that gives at most `max_samples`."""
+    """Return every k-th sample of a motion, for a chart; k is the smallest stride that gives at most `max_samples`."""
     # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
     stride = -(-len(motion.t) // max_samples)
     arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
@@ -111,7 +111,7 @@ def predicted_motion(trajectory: str, windows: Windows, states: States, k: int) 
     """Return the measured and the predicted motion of window k, for a chart.
 
     trajectory: name of the log. windows: measured motion of W windows. states: predicted q and qd of the windows after
-    their first sample, (W, T-1, n) each. The first sample of the prediction is the measured one.
+    their first sample, (W, T-1, n) each. The first sample of the predicted motion is the measured initial state.
     """
     predicted_q, predicted_qd = states
     return PredictedMotion(
@@ -154,9 +154,10 @@ def torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
 
 
 def torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
-    """Return the torques along `samples` that charts show: of all predictors, and the terms of the model.
+    """Return the torques along `samples` for a chart: measured, predicted by each predictor, and terms of the model.
 
-    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`.
+    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`. Its torque is also
+    returned as a sum of four terms: inertia, Coriolis, gravity and friction torque.
     """
     model = dynamics[MODEL]
     q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))

@@ -1,6 +1,6 @@
 """Evaluate a model and its baselines on test logs, on the same windows and with the same integrator.
 
-``Subject`` is the evaluated model, with data about the fit and the arm of this model.
+``Subject`` combines the evaluated model with data about its fit and its arm.
 """
 
 import copy
@@ -95,18 +95,18 @@ class Subject:
 
     @property
     def fitted_arm(self) -> Arm | None:
-        """Arm of the URDF of the fit, for the baselines that were fitted to the training logs; None without them.
+        """Arm in the URDF of the fit, whose kinematics the baselines of least_squares.json use; None without them.
 
-        The baselines use its kinematics. Raises UrdfError, ArmError or SettingsError.
+        Raises UrdfError, ArmError or SettingsError.
         """
         if self.fitted_urdf is None or not self.baselines:
             return None
         return arm_of_spec(self.spec, self.fitted_urdf)
 
     def assessed(self, results: Results) -> Results:
-        """Return the results of an evaluation of this model with an assessment in words added.
+        """Return the results of an evaluation of this model, with an added assessment in words.
 
-        The assessment uses the range of the training logs and the joint limits of the specification.
+        Its recommendations of further motions depend on the motion in the training logs and on the joint limits.
         """
         limits: Limits = ()
         independent: list[str] = []
@@ -208,7 +208,7 @@ def evaluate(
 def _preprocessing(
     used: Preprocessing | None, chosen: Preprocessing | None, logs: Sequence[Trajectory]
 ) -> Preprocessing:
-    """Return the preprocessing (filter, torque delay) of test logs: `chosen`, or by default the one of the fit.
+    """Return the preprocessing (filter, torque delay) of test logs: `chosen`, by default the preprocessing of the fit.
 
     used: preprocessing of the fit; None if the model has no fit. chosen: preprocessing that the user passed; None if
     the user passed none. Without both, default settings are used.
@@ -233,7 +233,7 @@ def _evaluate_torques(
     truth: Arm | Path | str | None,
     progress: Progress | None,
 ) -> Results:
-    """Return the errors of model and baselines for torque logs: of inverse dynamics, and of motion under these torques.
+    """Return the errors of model and baselines on torque logs: of predicted torques, and of predicted motion.
 
     Args:
         tested: the model with the data of its fit.
@@ -256,8 +256,8 @@ def _evaluate_torques(
     pieces = used.pieces(logs, shortest=2)
     tests = EvaluatedLogs(pieces, samples, used, tested.reach, tested.model.joint_types)
     lengths = horizon_lengths(tests, *ahead, notes)
-    # The windows for the choice of the integrator steps are short. In long windows the motion diverges because of
-    # errors of the dynamics, and integration errors cannot be distinguished.
+    # The windows for the choice of the integrator steps are short. In long windows, errors of the dynamics let the
+    # motion diverge: integration errors cannot be distinguished from them.
     probe = tests.windows(TUNING.model_window - 1, TUNING.probed_model_windows)
     # Residual terms that the fit did not select are zero; they are removed to save time.
     model = without_idle_residuals(tested.model)
@@ -287,7 +287,8 @@ def _evaluate_torques(
             expected=NEEDED,
             do="omit --quick",
         )
-    # Joints with coarsely quantised torques have torque errors in the tables, but the assessment in words omits them.
+    # Torque errors of joints with coarsely quantised torques are mostly quantisation errors: tables contain them, the
+    # assessment in words omits them.
     steps = coarse_torques(logs, tested.joints, notes) if torque else {}
     masses = {}
     if truth is not None:
@@ -307,7 +308,7 @@ def _results(
 ) -> Results:
     """Return results that contain the names of the arm, joints and logs, the notes and the curves, but no errors yet.
 
-    The caller adds the errors with `replace`.
+    The fields of errors are empty until `replace` sets them.
     """
     return Results(
         robot=tested.spec.robot if tested.spec else type(tested.model).__name__,

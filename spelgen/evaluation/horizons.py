@@ -25,7 +25,7 @@ from spelgen.logs.windows import Windows, cut_windows, joined
 
 
 def past_steps(rate: float) -> int:
-    """Return the number of sample intervals before a prediction from which a momentum observer estimates a disturbance.
+    """Return the number of sample intervals, before a prediction starts, that a momentum observer uses.
 
     rate: sample rate [Hz].
     """
@@ -83,8 +83,8 @@ def observe(dynamics: Any, windows: Windows, past: int) -> tuple[Windows, Tensor
 def without_past(windows: Windows, past: int) -> Windows:
     """Return the windows without their first `past` steps, the steps in which a momentum observer runs.
 
-    The friction state z remains the state at the first sample of the given windows, since its change depends on the
-    dynamics: `observe` replaces z by the state after the first `past` steps.
+    The friction state z of the result is not updated: it is the state before these steps. `observe`, which has the
+    dynamics of the friction state, replaces z.
     """
     dt, q, qd, tau = (column[:, past:] for column in (windows.dt, windows.q, windows.qd, windows.tau))
     return Windows(dt, q, qd, tau, windows.z)
@@ -165,7 +165,7 @@ class EvaluatedLogs:
     def stride(self, span: int, window_count: int) -> int:
         """Return the number of samples between the starts of consecutive windows of `span` steps.
 
-        With this stride, the segments of the logs (cut at gaps) together contain about `window_count` windows.
+        The stride is chosen so that the segments of all logs together contain about `window_count` windows.
         """
         return -(-sum(max(0, len(piece) - span) for piece in self.pieces) // window_count)
 

@@ -1,4 +1,4 @@
-"""Conversion of arrays and numbers to JSON: rounded to five significant digits, None if not finite."""
+"""Conversion of arrays and numbers to JSON: five significant digits, None in place of NaN and infinity."""
 
 import math
 from typing import Annotated

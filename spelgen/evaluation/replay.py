@@ -20,8 +20,8 @@ from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split
 class ReplayErrors:
     """RMS errors of the positions that one predictor gives under the commands of test logs [rad, m].
 
-    trajectories: {log: error over time and joints}. mean: mean of these errors. joints: error of each joint over time
-    and all logs, (n,).
+    trajectories: {log: RMS over time and joints}. mean: mean of the errors of all logs. joints: RMS of each joint over
+    all logs, (n,).
     """
 
     trajectories: dict[str, float]
@@ -61,8 +61,8 @@ class ServoModel:
             q: (segments, n) initial positions [rad, m].
             qd: (segments, n) initial velocities [rad/s, m/s].
         """
-        # All segments form one batch, because a rollout of many takes about as long as a rollout of one. A batch has
-        # one number of integrator steps per interval: the number for the segment that needs most steps.
+        # All segments form one batch, because a rollout of many segments takes about as long as a rollout of one. All
+        # segments get the same number of integrator steps per interval, the largest number that one of them needs.
         steps = max(steps_between(log) for log, _ in segments)
         lengths = [rows.stop - rows.start - 1 for _, rows in segments]
         commands, intervals = [], []
@@ -135,10 +135,11 @@ def _replay(
 def _summary(names: Sequence[str], errors: Sequence[np.ndarray]) -> ReplayErrors:
     """Return the RMS position errors of one predictor per log and per joint.
 
-    names: name of the log of each segment. errors: position errors of each segment, (K, n) [rad, m] for K + 1 samples.
+    names: name of the log of each segment. errors: position errors of each segment of K + 1 samples, (K, n) [rad, m];
+    the first sample, the initial state, has no error.
     """
     by_name: dict[str, list[np.ndarray]] = {}
-    # The errors of a log with gaps are joined: it consists of several segments with the same name.
+    # A log with gaps consists of several segments with the same name: their errors are joined.
     for name, error in zip(names, errors, strict=True):
         by_name.setdefault(name, []).append(np.square(error))
     trajectories = {name: float(np.sqrt(np.concatenate(x).mean())) for name, x in by_name.items()}

@@ -32,7 +32,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Con
         title: title that states the quantity and unit of the numbers.
         rows: {label of a row: {name of a column, such as a predictor: number}}.
         note: explanation of the rows, below the table.
-        unranked: labels of the rows in which the smallest number is not the best one.
+        unranked: labels of the rows without a star, because the smallest number is not the best.
     """
     columns = list(dict.fromkeys(name for row in rows.values() for name in row))
     lines = []
@@ -75,7 +75,7 @@ def summary(results: Results) -> Listing | None:
         return None
     errors = {name: x.mean_nmse for name, x in results.torque.items()}
     rows: dict[str, Numbers] = {"torque that is unexplained": errors, "error of M(q)": results.mass_errors}
-    # Columns are ordered by the information used (URDF, then logs), which shows the improvement of each step.
+    # The columns show the improvement from the URDF to least squares on logs, and to the trained model.
     names = [name for name in (URDF, LEAST_SQUARES, MODEL) if name in errors]
     lines = []
     for label, values in rows.items():
@@ -97,7 +97,7 @@ def _horizon_tables(results: Results) -> list[Listing]:
             head = f"{head} ({horizon.seconds:.3g} s)"
         relative[head] = {name: errors.mean_relative_rms for name, errors in horizon.errors.items()}
         tips[head] = {name: errors.tip_mm for name, errors in horizon.errors.items()}
-        # The note explains the observer, if there are predictions with an observer: there are none on short logs.
+        # The note explains the observer. It is omitted if the logs are too short for predictions with an observer.
         if observed(MODEL) in horizon.errors:
             note = OBSERVER
         if any(error is None for error in relative[head].values()):

@@ -40,7 +40,7 @@ class TorqueErrors:
 
     @property
     def worst_nmse(self) -> float | None:
-        """Largest nMSE (squared error / variance of the torque) of all joints; None if all torques are constant."""
+        """Largest nMSE of all joints (mean squared error / torque variance); None if all torques are constant."""
         return max((nmse for nmse in self.joint_nmse if nmse is not None), default=None)
 
 
@@ -78,9 +78,9 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
     """Return the history of motion on which friction depends: the last arguments of methods such as `inverse_dynamics`.
 
-    The values are the bristle deflections (T, n, K) [rad, m] and the direction (T, n), a smooth sign of the velocity
-    that is filtered like the torques. A value that the methods of `dynamics` do not accept is omitted (see
-    `known_past`).
+    The arguments follow q, qd and qdd: the bristle deflections (T, n, K) [rad, m], and the direction (T, n), a smooth
+    sign of the velocity that is filtered like the torques. An argument that the methods of `dynamics` do not accept is
+    omitted (see `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)
@@ -113,7 +113,7 @@ def _nmse(residual: np.ndarray, torque: np.ndarray) -> np.ndarray:
 def _mean(nmse: np.ndarray) -> float | None:
     """Return the mean of nMSE values (n,) over the joints of varying torque, i.e. without NaN.
 
-    None is returned without such a joint, or if an nMSE is infinite.
+    None is returned if all torques are constant, or if an nMSE is infinite.
     """
     varying = nmse[~np.isnan(nmse)]
     return finite(varying.mean(keepdims=True))[0] if varying.size else None

@@ -141,7 +141,8 @@ def motion_traces(
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
     """Return the curves of the evaluation of an arm under position servos, from the replayed logs.
 
-    The logs of median and of largest error are shown. errors: position errors of the model along each replayed log.
+    Charts show the log of median error and the log of largest error. errors: position errors of the model along each
+    replayed log.
     """
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
@@ -185,7 +186,10 @@ def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[Predic
 
 
 def _quantiles(values: Tensor) -> Quantiles:
-    """Return the 10, 50 and 90 % quantiles over W windows, (T,) each, of errors (W, T) at T times; NaN is infinity."""
+    """Return the 10, 50 and 90 % quantiles of the errors of W windows, (T,) each; NaN counts as infinite.
+
+    values: errors (W, T) at T times.
+    """
     errors = values.nan_to_num(nan=torch.inf).numpy()
     return Quantiles(*np.quantile(errors, (0.1, 0.5, 0.9), axis=0, method="nearest"))
 

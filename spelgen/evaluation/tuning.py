@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvaluationTuning:
-    """Settings of the measurements of an evaluation, and thresholds of the assessment in words."""
+    """Constants of an evaluation: windows and horizons, thresholds of the assessment in words, resolution of curves."""
 
-    # [s] Time that the momentum observer runs before a prediction; 0.2 and 0.3 s are no better on the UR10e of
-    # `benchmarks/arms.py`.
+    # [s] Time that the momentum observer runs before a prediction; with 0.2 and 0.3 s, predictions of the UR10e of
+    # `benchmarks/arms.py` are no better.
     observed_past: float = 0.1
     # [s] Time constant 1 / K of the momentum observer with the gain K; prediction errors differ by 3 % for 0.02 to 0.1
     # s on the UR10e of `benchmarks/arms.py`.

@@ -115,7 +115,7 @@ def _assess_torques(results: Results, uses: _Uses) -> None:
 
 
 def _worst_torque(results: Results) -> tuple[str, float]:
-    """Return the joint of the model's largest nMSE, and the nMSE; joints of coarsely quantised torque are omitted."""
+    """Return the joint with the largest nMSE of the model, and the nMSE; coarsely quantised torques are omitted."""
     torque = results.torque.get(MODEL)
     errors = {} if torque is None else dict(zip(results.joints, torque.joint_nmse, strict=False))
     nmse = {x: error for x, error in errors.items() if error is not None and x not in results.torque_steps}
@@ -148,7 +148,7 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
 
 
 def _assess_replays(results: Results, uses: _Uses) -> None:
-    # Only the first replay is assessed, which is over whole logs: windows of one second do not show drift.
+    # Only the replay of whole logs, the first one, is assessed: windows of one second do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
         if error == min(errors.mean for errors in replay.errors.values()):
@@ -172,7 +172,9 @@ def _relative(errors: StateErrors | None) -> float:
 def _better_baselines(results: Results, good_torques: bool) -> list[str]:
     """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
 
-    good_torques: whether the torques of the model are accurate enough for a use, which is then recommended.
+    Constant velocity has a sentence of its own: at the horizons at which it predicts better than the model, the model
+    is recommended for torques only, if ``good_torques`` is True (torque errors small enough for a use). A second
+    sentence lists all other baselines with the horizons, or "in torque".
     """
     times = []
     better: dict[str, list[str]] = {}
@@ -201,8 +203,8 @@ def _better_baselines(results: Results, good_torques: bool) -> list[str]:
 def _worst_joint(results: Results) -> tuple[str, str]:
     """Return the name of the worst joint, "" if no error is known, and a sentence about its motion error.
 
-    The worst joint has the largest torque error. If all torque errors are small, but the motion error is not, it is the
-    joint of the largest motion error.
+    The worst joint is the joint with the largest torque error. If all torque errors are small and the motion error is
+    not, it is the joint with the largest motion error.
     """
     joint, error = _worst_torque(results)
     moving, motion_error = _worst_motion(results)
@@ -214,13 +216,13 @@ def _worst_joint(results: Results) -> tuple[str, str]:
 
 
 def _worst_motion(results: Results) -> tuple[str, float]:
-    """Return the joint of the largest relative error at the longest horizon, and this error, averaged over q and qd.
+    """Return the joint with the largest motion error at the longest horizon, and this error.
 
-    The relative error is the RMS error divided by the RMS change over the horizon.
+    The error is relative: RMS error divided by RMS change over the horizon, averaged over q and qd.
     """
     for last in results.horizons[-1:]:
-        # q and qd are averaged as in the error of all joints, so that the worst joint is not better than their mean.
-        # An unknown error (None) becomes NaN.
+        # The errors of q and qd of a joint are averaged, as in `mean_relative_rms`: the largest value is then at least
+        # the mean over joints. An unknown error (None) becomes NaN.
         of_model = last.errors[MODEL]
         errors = np.mean(np.array([of_model.q_relative_rms, of_model.qd_relative_rms], dtype=float), axis=0)
         if np.isfinite(errors).all():

@@ -52,8 +52,8 @@ def motion_bounds(
         arm: The arm.
         range_fraction: Fraction of each position range; the middle of the range is unchanged.
         speed_fraction: Fraction of each velocity limit.
-        joints: {name: joint of the URDF}. The bounds are then reduced so that <mimic> joints keep their limits, and to
-            the soft limits of <safety_controller>. None: limits of mimic joints and soft limits are ignored.
+        joints: {name: joint of the URDF}. The bounds are then reduced to the soft limits of <safety_controller>, and so
+            that <mimic> joints keep their limits, too. None: limits of mimic joints and soft limits are ignored.
         ranges: {name of a joint: position range}, in place of the limits in the URDF. A continuous joint without a
             range has the range -pi to pi.
 
@@ -86,7 +86,7 @@ def motion_bounds(
 
 
 def range_error(joint: str, limits: tuple[float, float] | None) -> ArmError:
-    """Return the error about a joint without a range to move in; limits: [rad, m], None if there are none."""
+    """Return the error for a joint whose limits are absent or not increasing; limits: [rad, m], None if absent."""
     got = "no position limits"
     do = f"write 'simulation: {{positions: {{{joint}: [LOWEST, HIGHEST]}}}}' into the robot's YAML"
     if limits is not None:

@@ -58,8 +58,8 @@ class Collisions:
         """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
 
         bounds: position limits of the joints. The pairs in ``ignored`` are determined at random positions within these
-        limits. The limits of prismatic joints also bound the length of the arm, and with it the displacement of its
-        points.
+        limits. The limits of prismatic joints also bound the length of the arm, from which the largest displacement of
+        a point of the arm is computed.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
@@ -72,7 +72,8 @@ class Collisions:
         self._geometry = pin.GeometryModel()
         self._names: list[str] = []  # The name of each object.
         self._bodies: list[int] = []  # The index of the body that carries each object; -1 is the root link.
-        # For each body: the largest distance of a point of its shapes from the origin of its frame, (bodies,) [m].
+        # Radius of each body, (bodies,) [m]: largest distance between a point of its shapes and the origin of its
+        # frame.
         self._extents = np.zeros(len(chain.bodies))
         poses = link_poses(arm, arm.angle_tolerance)
         for shape in shapes.shapes:
@@ -119,10 +120,10 @@ class Collisions:
     def contact(self, motion: Motion) -> Contact | None:
         """Return the first distance of a motion that is below the clearance; None if there is none.
 
-        Distances are computed at selected positions of the motion. Between two successive selected positions, no point
-        of the arm moves along a path longer than 1.5 clearances, relative to any object. At each position between the
-        two, a distance therefore differs by at most 0.75 clearances from its value at the nearer one, and is positive
-        if all computed distances are at least the clearance.
+        Distances are computed at selected positions of the motion. They are so close that, between two successive
+        selected positions, each point of the arm moves by at most 1.5 clearances relative to any object. In between, a
+        distance is therefore at most 0.75 clearances smaller than at the nearer selected position. If all computed
+        distances are at least the clearance, there is no collision.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -212,8 +213,8 @@ class Collisions:
         """
         neighbour = {}
         for index, body in enumerate(chain.bodies):
-            # Shapes of a body and its parent overlap at the joint, so this pair is not checked. If the parent has no
-            # shape, the next ancestor with a shape is used.
+            # Shapes of a body and its parent overlap at the joint, so their distance is not computed. For a parent
+            # without shapes, this applies to the next ancestor with a shape.
             parent = body.parent
             while parent >= 0 and parent not in self._bodies:
                 parent = chain.bodies[parent].parent
@@ -257,8 +258,8 @@ class Collisions:
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
-            # A pair with the floor or a box is removed only if it is too close at all positions, as for a base on the
-            # floor: otherwise the motion must avoid the contact.
+            # A pair of a link and the floor, or a box, is removed only if it is too close at all positions (a base on
+            # the floor). In all other cases, the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
                 names[" and ".join(self._names_of(pair))] = None
                 self._geometry.removeCollisionPair(objects)

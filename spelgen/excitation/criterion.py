@@ -2,8 +2,9 @@
 
 The criterion is the logarithm of the condition number of the base regressor (Gautier and Khalil, IJRR 11:362, 1992)
 with columns of unit length, plus penalties. There are penalties on violated effort limits, on distances between objects
-below a margin, and on reduced amplitudes. The penalty on amplitudes is needed because the condition number of columns
-of unit length does not depend on the amplitude of the motion, but the signal-to-noise ratio of the torque does.
+below a margin, and on small amplitudes. The penalty on small amplitudes is needed, because scaling the columns to unit
+length removes the effect of the amplitude: without it, a small motion, with a low signal-to-noise ratio of the torques,
+would be as good as a large motion.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Criterion:
         self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd for parameters (size,) at the T times of the criterion, (3, T, n)."""
+        """Return q, qd and qdd, (3, T, n), of the motion with the given parameters (size,), at T equidistant times."""
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:
@@ -71,7 +72,7 @@ class Criterion:
         return float(self._value(torch.from_numpy(parameters)))
 
     def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,) for parameters (size,). The criterion must be finite."""
+        """Return the criterion and its gradient (size,) for parameters (size,). It must be finite there."""
         variables = torch.from_numpy(parameters).requires_grad_()
         value = self._value(variables)
         (gradient,) = torch.autograd.grad(value, variables)
@@ -86,8 +87,8 @@ class Criterion:
         penalties = TUNING.penalty * overrun.square().sum() + reduction
         if self.collisions is not None:
             value, gradient = self.collisions.penalty(states[0].detach().numpy())
-            # Torch cannot differentiate the penalty on distances, so it is replaced by a linear function of q with the
-            # same value and gradient.
+            # Torch cannot differentiate the penalty on distances. A linear function of q with the same value and the
+            # same gradient, from `Collisions.penalty`, is used.
             change = torch.from_numpy(gradient) * (states[0] - states[0].detach())
             penalties = penalties + TUNING.collision_penalty * (value + change.sum())
         return self._log_condition(rows) + penalties

@@ -132,10 +132,11 @@ def _checked_harmonics(
 def _accelerated(
     bounds: MotionBounds, acceleration: float | Sequence[float] | None, arm: Chain
 ) -> tuple[MotionBounds, np.ndarray]:
-    """Return the bounds with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
+    """Return ``bounds`` with a limit of the acceleration, and the limits for the approach, (n,) [rad/s^2, m/s^2].
 
-    The approach is the motion to the first position of the exciting motion. Without an acceleration limit, the approach
-    reaches its largest speed in one second. arm: for the number and the names of the joints.
+    ``acceleration`` limits the exciting motion and the approach, which is the motion to its first position. None: the
+    bounds are unchanged, and the approach reaches its largest speed in one second. arm: for the number and the names of
+    the joints.
     """
     if acceleration is None:
         return bounds, bounds.speed
@@ -195,7 +196,8 @@ def _start(
     """
     if start is None:
         middle = (limits.low + limits.high) / 2
-        # The default start position is zero if possible, since the controllers of most arms start there.
+        # By default, the approach starts at zero if the limits allow it: most arms are at zero when their controller
+        # starts.
         position = np.where((limits.low <= 0) & (limits.high >= 0), 0.0, middle)
         if collisions is not None and collisions.contact_at(position):
             position = middle

@@ -26,7 +26,7 @@ class Excitation:
         collisions: Text about the checked collisions.
         parameters: Number of base parameters, friction and armature included.
         first: Condition number for the first random motion, for comparison.
-        first_overruns: True if the torques of that motion exceed effort limits.
+        first_overruns: True if the torques of the first random motion exceed effort limits.
         condition: Condition number of the base regressor with columns of unit length for `motion`.
         efforts: Largest rigid-body torque divided by the effort limit, (n,) [1]; NaN without a limit or inertials.
     """
@@ -60,7 +60,7 @@ class Excitation:
         return "\n\n".join(paragraphs)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers that `text` shows; unknown efforts are None."""
+        """Return the quality numbers of the motion, which `text` shows, for JSON; unknown efforts are None."""
         efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
         return {
             "robot": self.arm.name,

@@ -64,7 +64,7 @@ def approach(
     duration = float(max(by_speed, by_acceleration))
     t = np.linspace(0.0, duration, ceil(duration * sample_rate) + 1)
     still = np.zeros_like(distance)
-    # For equal positions, the motion is a single sample, and any duration is right.
+    # If `start` and `end` are equal, the motion is a single sample; the polynomial needs some duration > 0.
     curve = BPoly.from_derivatives([0.0, duration or 1.0], [[start, still, still], [end, still, still]])
     return Motion(t, curve(t), curve(t, 1), curve(t, 2))
 

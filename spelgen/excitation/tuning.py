@@ -7,10 +7,10 @@ from dataclasses import dataclass
 class ExcitationTuning:
     """Constants of the design of the motion that `spelgen excite` proposes."""
 
-    # [1] Number of random motions. L-BFGS starts from the best one.
+    # [1] Number of random motions. L-BFGS starts from the random motion with the smallest criterion.
     starts: int = 40
-    # [1/s] Number of harmonics divided by the duration, which is the frequency of the highest harmonic. Arms track such
-    # slow motions well, and the frequencies of drive ripple are far higher.
+    # [1/s] Number of harmonics divided by the duration, which is the frequency of the highest harmonic. Arms track
+    # motions of such low frequencies well. Torque ripple of the drives has far higher frequencies.
     harmonics_per_second: float = 0.4
     # [1] Smallest number of harmonics, as in Swevers et al., IEEE T-RA 13:730, 1997.
     min_harmonics: int = 5

@@ -102,7 +102,7 @@ def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Check logs with the arm; return the findings. Raises LogError if the logs cannot be used for training.
+    """Check logs; return the findings that concern the arm. Raises LogError if the logs cannot be used for training.
 
     A fit calls this function before it uses the logs.
     """

@@ -134,8 +134,8 @@ class Following(NamedTuple):
         correlation: (n, n) correlation of the command of joint i (row) with the position of joint j (column), at this
             delay.
         gain: (n,) amplitude of a joint's motion divided by the amplitude of the joint's command.
-        offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a
-            changing load causes smaller means.
+        offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a smaller
+            mean may be due to a changing load.
         joints: tracking errors and lag of each joint.
         saturation: (n,) [rad, m] see `measure_following`.
     """
@@ -171,8 +171,8 @@ def measure_following(logs: Sequence[Trajectory], saturation: np.ndarray) -> Fol
         correlations.append(covariance / np.maximum(np.outer(u.std(axis=0), q_std), 1e-6))
         tracking_rms.append(np.sqrt(np.mean((u - q) ** 2, axis=0)))
     stacked = np.array(correlations)
-    # A periodic motion is also correlated, negatively, with commands half a period before: the magnitude of a negative
-    # correlation must therefore exceed the positive ones clearly.
+    # In periodic motion, positions also have a negative correlation with the commands half a period before. A negative
+    # correlation is therefore used only if its magnitude exceeds the largest positive correlation by 0.1.
     is_opposite = -stacked.min(axis=0) > stacked.max(axis=0) + 0.1
     best = np.where(is_opposite, stacked.argmin(axis=0), stacked.argmax(axis=0))
     correlation = np.take_along_axis(stacked, best[None], axis=0)[0]
@@ -304,8 +304,9 @@ class ServoLogs:
         unchanged, *better = compare_hypotheses(problem, kinds_of_servo_faults(self._arm.chain))
         if not better or {fault.code for fault in better[0].hypothesis.faults} <= accepted:
             return
-        # The cost must fall by double the bound for torques: with times stretched by two, the best wrong hypothesis
-        # lowers it by 20, and right ones by 40 to 240, on simulated arms.
+        # The cost must fall by twice the bound for logs of torques. On simulated arms, right hypotheses lower it by 40
+        # to 240. If the logged times are twice too long, a fault that no hypothesis corrects, the best hypothesis
+        # lowers it by 20.
         is_sure = better[0].cost < unchanged.cost - 2 * GEOMETRY.needed
         errors = better[0].errors
         if is_sure and errors.max() <= GEOMETRY.no_advice and errors.mean() <= GEOMETRY.explained:
@@ -326,7 +327,8 @@ class ServoLogs:
             return []
         stated, problems = stated_hypothesis(chain, self._logs[0].mapping), []
         for delay in COMMAND_DELAYS:
-            # The fourth signal is the command until it is replaced by the position error.
+            # The fourth signal of the samples is the command u, collected in place of a torque. It becomes the position
+            # error.
             signals = samples.at(np.tile([0.0, 0.0, 0.0, -delay], (len(self._names), 1))).copy()
             signals[..., 3] -= signals[..., 0]
             if signals[..., 3].any():
@@ -387,8 +389,8 @@ class ServoLogs:
         for expected, by_joint in faults.items():
             for k, occurrences in by_joint.items():
                 names = ", ".join(name for name, _ in occurrences) if k in sound else ""
-                # A command offset that all recordings have is not an error but a warning, which is added elsewhere: the
-                # load of a soft servo has the same effect.
+                # A command offset in all recordings is no error, since the load of a soft servo has the same effect.
+                # `_command_warning` yields a warning about it.
                 if names or expected != ONE_ZERO:
                     groups.setdefault((expected, names), {})[k] = occurrences[0][1]
         for (expected, names), group in groups.items():
@@ -431,8 +433,7 @@ def _command_faults(
             got, do = "commands that other joints follow, and these do not", "check the names of the columns"
             faults[k] = CommandFault(got, "their own commands", keys, do)
     of_sum = np.zeros(len(joints)) if (correlations > FOLLOWS).all() else _sum_correlations(following, log)
-    # Correlation and gain are measured at the delay of largest correlation, so that a slow servo is not reported as a
-    # fault.
+    # Correlation and gain are measured at the delay of largest correlation: the delay of a slow servo is no fault.
     for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
         if k in faults:
             continue
@@ -454,10 +455,9 @@ def _command_faults(
 def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
     """Return the correlation (n,) of each position with the sum of the commands of its joint.
 
-    The sum of the commands is the position if the commands are increments. Their integral (the sum divided by the
-    sample rate) is the position if they are velocities. The result is 0 for a joint whose position has neither the
-    amplitude of the sum nor of the integral, within a factor of 2: any motion with the period of the commands is
-    correlated with their sum.
+    If the commands are increments, their sum is the position. If they are velocities, the sum divided by the sample
+    rate is the position. The amplitude of the position must agree with one of both within a factor of 2, otherwise the
+    result is 0 for this joint: any motion with the period of the commands is correlated with their sum.
     """
     u = log.q[0] + np.cumsum(require_commands(log), axis=0).clip(-1e6, 1e6)
     summed = measure_following([replace(log, u=u)], following.saturation)
@@ -471,8 +471,10 @@ def _sum_correlations(following: Following, log: Trajectory) -> np.ndarray:
 def _command_units(gain: float, q: str | None, u: str | None) -> dict[str, str]:
     """Return the units of a joint's positions and commands, {"q": ..., "u": ...}, that explain the ratio `gain`.
 
-    One of both units is changed; {} is returned if no unit explains the ratio within 25 %. gain: amplitude of positions
-    divided by amplitude of commands, each converted by its unit q or u in the mapping (None: rad).
+    Only one of the two units is changed; {} is returned if no unit explains the ratio within 25 %.
+
+    gain: amplitude of positions divided by amplitude of commands, both converted to SI units. q, u: units of positions
+    and commands in the mapping; None: rad.
     """
     present = np.array([SCALES.get(x or "", 1.0) for x in (q, u)])
     candidates = []
@@ -488,8 +490,8 @@ def _command_warning(
 ) -> Iterator[Diagnostic]:
     """Yield a warning if the logged command of joint k may not be the command that its servo tracks.
 
-    Reasons: in all `logs` the command equals the position, or the position up to two rows earlier or later; or it
-    hardly changes, is not tracked, has a constant distance from the position, or comes after the position.
+    Reasons: the command equals the position in all `logs`, with a shift by at most two rows; the command is nearly
+    constant; the position does not track it; they differ by a constant offset; or the position is ahead of the command.
     """
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     shift = next((x for x in (0, 1, 2, -1, -2) if all(_is_shifted(log, k, x) for log in logs)), None)

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION, LOADS = "small-motion", "different-loads"
-# Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
+# Codes of warnings that the torques are untested, or that the model does not explain them. Drives are then not tested.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -106,9 +106,9 @@ class TorqueLogs:
         motion = joined_samples([empty, *self._samples]).thinned(6000)
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
-        # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
-        # hints.
-        # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
+        # The model is fitted only to logs without errors: wrong velocities, for example, result in wrong friction. The
+        # error about an unknown unit of positions is an exception, since the torques may show this unit; a finding that
+        # states the unit then replaces the error.
         self._guessed = summary.guessed
         is_sound = len(summary.errors) <= bool(self._guessed) and not any(
             x.code == WRONG_VELOCITY for x in summary.notes
@@ -136,8 +136,8 @@ class TorqueLogs:
                 self._check_drives(moving, summary)
             if is_right:
                 summary.notes.extend(self._load_notes(loads))
-        # Torques beyond the limits of the drives are not reported if the log has an error, since they are a consequence
-        # of it, and if the torques agree with the gravity of the URDF: the limits are then placeholders.
+        # Torques beyond the limits of the drives are not reported in two cases. If the log has another error, this
+        # error is the reason. If the torques agree with the gravity of the URDF, the limits are only placeholders.
         faults = dict[Check[JointEvidence], dict[str, str]]()
         if summary.errors or any(joint.shows_unit for joint in evidence):
             accepted.add("torque-beyond-drive")
@@ -171,10 +171,11 @@ class TorqueLogs:
         accepted: set[str],
         loads: Sequence[LoadChange],
     ) -> list[LogError | Diagnostic]:
-        """Return the findings about the geometry of the logs.
+        """Return the findings about the geometry of the logs: senses, order, zeros and units of joints, and gravity.
 
-        Recordings whose torques agree are tested together. If they have no errors, each recording that contradicts
-        them, or has another load, is tested by itself; its errors name it, and its warnings are omitted.
+        Recordings whose torques agree are tested together. If they have no errors, every other recording, which
+        contradicts them or has another load, is tested by itself. Only its errors are returned; they name the
+        recording.
 
         Args:
             samples: unfiltered samples, then filtered ones, which are used unless they are too few.
@@ -268,7 +269,7 @@ class TorqueLogs:
         if len(samples.values) < HINTS.fewest_samples / 4 or not varying(samples.tau).any():
             return None
         joints, inputs = self._arm.chain.joint_names, self._drives.inputs
-        # The scale of the torques includes the gear ratios of the drives if each motor drives one joint.
+        # If each motor drives one joint, the factor from logged torques to joint torques includes the gear ratio.
         gears = np.diag(inputs) if np.count_nonzero(inputs) == len(joints) else np.ones(len(joints))
         stated = stated_hypothesis(self._arm.chain, self._mapping, np.where(gears, gears, 1.0))
         return GeometryProblem(self._arm.chain, samples, self._drives.speeds, share * self._seconds, stated)
@@ -299,7 +300,8 @@ class TorqueLogs:
             )
             yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
             return
-        # Positions in a wrong unit contradict all torques, so that their signs and limits are not tested.
+        # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit
+        # contradict all torques.
         wrong: Sequence[SpelgenError] = (
             find_unsigned(problem) if not self._guessed and UNSIGNED not in accepted else []
         )
@@ -351,7 +353,8 @@ class TorqueLogs:
         torque_unit = TorqueUnit(factors, is_open, is_milli)
         if not motion <= {(None, None), *stated}:
             return kinds_of_faults(problem.arm, [torque_unit])
-        # The unit of a single joint is tested if its motion is larger than its limits, or than two turns.
+        # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
+        # two turns.
         width = np.array(
             [
                 min(high - low, 4 * np.pi) if high > low else np.inf
@@ -389,7 +392,8 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
         # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
-        # The cost must fall by a penalty of rare faults: a wrong centre of mass of the last link has a similar effect.
+        # At other joints, the cost without gravity must be lower by at least the penalty of a rare fault, `rarity`: a
+        # wrong centre of mass of the last link has a similar effect.
         without = problem.without_gravity(k).fit(problem.unchanged).cost
         if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
             message = (
@@ -402,9 +406,10 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
 def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
-    The first moment is the mass times the centre of mass. The torques that both values cause are compared, by
-    regression. The difference from the URDF must also exceed four standard deviations of the fitted value, and change
-    the torque of a joint by more than half of this torque's standard deviation.
+    The first moment is the mass times the centre of mass. The ratio is the least-squares ratio of the torque due to the
+    fitted value to the torque due to the URDF's value. The difference of both torques must also be significant at a
+    joint (more than half the standard deviation of its torque), and the ratio must differ from 1 by four of its
+    standard deviations.
     """
     rows, _ = problem.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
@@ -421,13 +426,13 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             effect = (columns @ (found - stated)).std(axis=0)
             if not size or not (effect > 0.5 * torque).any():
                 continue
-            # The ratio of the torques of the link: components without an effect on the torques are undetermined.
+            # `ratio`: torque due to the fitted value, divided by the torque due to the URDF's value. Torques are
+            # compared because components of the value that have no effect on torques are undetermined.
             axis = np.tensordot(of_urdf, columns, 2) / size
             ratio = float(axis @ found)
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis))
-            # The ratio must be beyond 2.5 or its inverse: masses of CAD models are wrong by less. The difference from
-            # the URDF must also exceed four standard deviations of the fitted value: at one of many bodies, it exceeds
-            # two by chance.
+            # The ratio must be above 2.5 or below 1/2.5: masses of CAD models are wrong by less. It must also differ
+            # from 1 by more than four standard deviations: at one of many bodies, it differs by two by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

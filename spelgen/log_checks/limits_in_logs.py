@@ -77,9 +77,9 @@ def flat_tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     """Return an error that names the joints whose torques were logged as magnitudes; [] if there are none.
 
-    The torques get the signs of the model's torques, and the model is fitted again, in a few alternations. A joint is
-    named if this lowers the joint's squared residual much, and if both signs occur. If only one sign occurs, the load
-    of the joint may indeed always have the same direction.
+    The signs are estimated in a few alternations: the torques get the signs of the model's torques, then the model is
+    fitted again. A joint is named if both signs occur and lower its squared residual much. If only one sign occurs, the
+    load of the joint may indeed always have the same direction.
     """
     problem = problem.thinned(GEOMETRY.confirming_samples)
     signals = problem.unchanged.signals(problem.samples)
@@ -142,8 +142,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # At a flat top of the torque, the model's torque must exceed the logged torque by more than the friction:
-        # friction estimated from few samples may be wrong, and its error is no evidence of a limit.
+        # Torques are clipped at a flat top if the model's torque exceeds the logged torque by more than `sure`. This
+        # bound is at least the joint's friction, since friction estimated from few samples may be wrong by its own
+        # magnitude.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
@@ -159,8 +160,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - certain * deviation)[rows, k])
-            # A controller that pushes against a stop needs a large torque. Smaller differences occur in pauses of a
-            # joint that moves one way only, so that its friction is not determined.
+            # Contact with a stop requires a large difference, since a controller that pushes against a stop needs a
+            # large torque. Smaller differences also occur in pauses of a joint that moves one way only: its friction is
+            # not determined.
             sure = max(certain * noise[k], 0.5 * samples.tau[:, k].std())
             if difference > sure + 2 * abs(friction[k]):
                 message = (

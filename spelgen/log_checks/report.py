@@ -67,8 +67,8 @@ class JointReport:
         name: name of the joint.
         kind: joint type.
         low, high: lowest and highest value of each signal.
-        range_fraction: visited range of q, divided by the range between the position limits.
-        noise: standard deviation of the white noise on each signal; None for sparse logs.
+        range_fraction: range of the logged q, divided by the range between the position limits.
+        noise: standard deviation of the white noise on each signal; None if all logs are sampled below 50 Hz.
         steps: quantisation step of each signal; None for signals that are not quantised in most trajectories.
         velocity_factor: ratio of dq/dt to qd, by least squares.
         velocity_correlation: correlation of dq/dt and qd.
@@ -252,7 +252,7 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
     """Return two tables of the joints: the ranges of the signals `quantities`, and their noise and quantisation steps.
 
-    The first quantity must be "q".
+    The first quantity must be "q": the fraction of the joint's range is in the column after it.
     """
     ranges, signals = [], []
     for joint in joints:

@@ -37,12 +37,12 @@ class RobotCheckTuning:
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
     # [rad, m] Hypotheses about a log are not tested if its positions range over less than this value: friction before
-    # sliding may then determine the torques. At a range of 0.02, wrong hypotheses fit best on simulated arms; at 0.1,
-    # none does.
+    # sliding may then determine the torques. On simulated arms, wrong hypotheses fit best if positions range over 0.02,
+    # but not if they range over 0.1.
     smallest_motion: float = 0.05
-    # [1] The unit of a joint's torque is checked only if its gravity torque, by the URDF, varies by at least this
-    # fraction of the variation at the joint with the largest gravity. At other joints, such as wrists, a payload may
-    # multiply the gravity torque.
+    # [1] The unit of a joint's torque is checked only if gravity loads the joint enough: the standard deviation of its
+    # gravity torque by the URDF must be at least this fraction of the largest standard deviation of all joints. At
+    # other joints, such as wrists, a payload may multiply the gravity torque.
     loaded: float = 0.01
     # [1] A column of the regressor is linearly dependent on others if the norm of its residual after projection onto
     # them is below this fraction of its norm.
@@ -81,7 +81,8 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # `is_rounding`: signals of which only rounding errors remain after friction is removed, e.g. a constant torque
+    # `is_rounding`: True for signals, e.g. a constant torque, that are zero except for rounding errors after the
+    # projection
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))
@@ -151,8 +152,8 @@ def find_beyond_limits(joint: JointEvidence) -> str | None:
         if high > upper:
             findings.append(f"{name} up to {high:.4g} {unit}, the limit is {joint.limits()[1]:z.4g}")
     is_limited = joint.coordinate.joint_type == "revolute" and upper - lower < 2 * pi
-    # Shifts by one revolution are tried: drivers that log 0 to 360 degrees are a turn above the negative half of the
-    # range.
+    # Shifts by one revolution are tried: a driver that logs angles from 0 to 360 degrees logs -90 degrees as 270
+    # degrees.
     for shift in (-2 * pi, 2 * pi) if findings and is_limited else ():
         if all(lower <= low + shift and high + shift <= upper for low, high in ranges.values()):
             offset = plain_number(joint.offset + shift, 8)
@@ -177,11 +178,11 @@ def torque_factors(
 ) -> list[np.ndarray]:
     """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
-    For joints that are True in both masks and show gravity clearly, let r be the gravity in the logged torques divided
-    by the gravity torque of the URDF; r is negative if the torques have the opposite sense. If |r| is above five or
-    below a fifth, wrong inertials do not explain it. For each joint with such an r there is a candidate with the factor
-    1 / r for this joint and 1 for all others. If the magnitude of the median of r over the joints is beyond these
-    bounds, and all joints are `undeclared`, there is also a candidate with 1 / median for all joints.
+    Only joints are used that are True in both masks and whose torques show gravity clearly. For such a joint, r is the
+    gravity in the logged torques divided by the gravity torque of the URDF; r is negative if the torques have the
+    opposite sense. Wrong inertials may explain an |r| from 1/5 to 5. For any other r there is a candidate with the
+    factor 1 / r for this joint and 1 for all others. If all joints are `undeclared` and the median of r over the joints
+    is also outside these bounds, there is a candidate with 1 / median for all joints.
 
     Args:
         joints: the joints with their fits of gravity.
@@ -240,8 +241,8 @@ def find_one_way(joint: JointEvidence) -> str | None:
     Dry friction is then confounded with the load of the joint.
     """
     slower, faster = sorted((-joint.report.low["qd"], joint.report.high["qd"]))
-    # Velocities of the rarer sign may be noise if they are below a tenth of the velocities of the other sign. A logged
-    # velocity that does not agree with dq/dt does not show the direction of motion.
+    # The joint moves one way if its largest speed in one direction is below a tenth of its largest speed in the other:
+    # the smaller speed may be noise. The check is omitted if logged velocities do not agree with dq/dt.
     if slower >= 0.1 * faster or not (joint.report.velocity_correlation or 0.0) > TUNING.seen:
         return None
     return (

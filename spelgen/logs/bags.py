@@ -23,7 +23,7 @@ from spelgen.settings.log_mapping import PLAIN, LogColumns, LogMapping
 
 ROS1 = ".bag"
 MESSAGE = "sensor_msgs/msg/JointState"
-MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times its size
+MEMORY = 2**29  # [B] memory for reading a bag, in addition to 20 times the bag's size
 FIELDS = {"q": "position", "qd": "velocity", "tau": "effort"}
 MAGIC = b"\x89MCAP0\r\n"  # bytes at the beginning and at the end of a complete MCAP file
 SCHEMA, CHANNEL, MESSAGE_RECORD, CHUNK = 3, 4, 5, 6  # operation codes of records in an MCAP file
@@ -231,7 +231,8 @@ def _of_other_recorders(path: Path, remarks: list[str]) -> list[Path]:
         with file.open("rb") as source:
             head = source.read(64)
             if head.startswith(MAGIC):
-                # The first record, after its code and length, has the profile. Tools that join or cut files omit it.
+                # The first record of an MCAP file begins, after its code and length, with the profile, such as "ros2".
+                # Tools that join or cut files write an empty profile.
                 is_ros2 &= _text(head, len(MAGIC) + 9) == "ros2"
                 source.seek(-len(MAGIC), 2)
                 is_closed &= source.read() == MAGIC
@@ -279,7 +280,7 @@ def mcap_messages(path: Path, message_type: str) -> Iterator[RawState]:
 
 
 def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield operation code and body of each complete record in the bytes of an MCAP file, also of records in chunks."""
+    """Yield operation code and body of each complete record in the bytes of an MCAP file; chunks are unpacked."""
     start = 0
     while start + 9 <= len(data):
         code, length = struct.unpack_from("<BQ", data, start)

@@ -43,7 +43,7 @@ from spelgen.logs.unit_checks import (
 from spelgen.settings.log_mapping import SCALES
 
 ELASTIC = "elastic-joint"
-# Advice for a fault of some recordings: settings that correct these recordings would be wrong for the others.
+# Advice for a fault that only some recordings have: settings apply to all recordings, so no setting is advised.
 OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
 Subject = TypeVar("Subject")
@@ -81,7 +81,8 @@ AnyCheck = Check[Any]
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions have an unknown unit, which the torques may show.
+    guessed: names of joints whose positions are in an unknown unit. If the log has torques, the checks of torques
+    determine this unit by a fit of the arm's model.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
@@ -131,8 +132,8 @@ def run_checks(
     """
     results: dict[str, tuple[Check[Subject], Advice]] = {}
     for check in checks:
-        # A check is omitted if the finding of another check explains the fault: velocities in degrees, for example, are
-        # also no derivatives of positions in rad.
+        # A check is omitted if the finding of an earlier check explains the fault. Example: velocities in degrees per
+        # second are reported as such, and not again as velocities that differ from dq/dt.
         if check.code in accepted or not results.keys().isdisjoint(check.unless):
             continue
         advice = check.find(subject)
@@ -179,7 +180,7 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
     Return None for logs of position commands, whose fits do not need accelerations.
     """
     rate = trajectory.sample_rate
-    # Below 2 Hz the times are probably in another unit, which the check of times reports.
+    # Times that correspond to less than 2 Hz are probably in another unit than seconds: `find_time_unit` reports them.
     if trajectory.u is not None or rate * SIGNALS.slowest_step < 1 or is_dense(rate):
         return None
     use = f"too slow for fits to torques, which need {SLOWEST:g} Hz"
@@ -192,15 +193,15 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 
 
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
-# REPAIRED and REMARKED are no checks, but the code and severity of messages from the reader of the log, about changed
-# rows (REPAIRED) or properties of the file (REMARKED).
+# REPAIRED and REMARKED check nothing. They are the code and severity of messages that the reader of the log has written
+# about changed rows (REPAIRED) or about properties of the file (REMARKED).
 REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
 REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
 # This check compares a trajectory with earlier ones: `LogChecks` computes its message.
 REPEATED: Check[Trajectory] = Check("repeated-samples", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals: a velocity in raw register words differs from dq/dt as a frozen signal
-    # does, and would otherwise be reported as one.
+    # Jumps are searched before frozen signals. If a signal consists of raw register words, qd and dq/dt differ, and the
+    # check "frozen" would report a frozen signal.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -259,7 +260,8 @@ class LogChecks:
 
     Trajectories are added one at a time, so that only one of them has to be in memory.
 
-    products: (2n, 2n) Gram matrix that compares dq/dt to qd: sum of `velocity_products` over all trajectories.
+    products: (2n, 2n) sum of the Gram matrices `velocity_products` of all trajectories, from which `velocity_agreement`
+    computes the ratio and the correlation of dq/dt and qd.
     """
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
@@ -302,8 +304,8 @@ class LogChecks:
         summary = Findings()
         groups: dict[tuple[AnyCheck, str], list[str]] = {}
         for (group, check), occurrences in self._results.items():
-            # For checks with `everywhere`, the fault must occur in all trajectories: a joint may rest in some of them,
-            # for example.
+            # A check with `everywhere` reports a fault only if it occurs in all trajectories. Example: a joint that
+            # rests in some trajectories but moves in others is not reported.
             if not check.everywhere or len(occurrences) == self._count:
                 advice, _, _ = occurrences[0]
                 is_error = check.severity == "error" or advice.joint or advice.keys
@@ -314,7 +316,8 @@ class LogChecks:
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
             if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
-                # The unit, after the colon of the message, is not certain.
+                # If at most half of the joints have the fault, the guessed unit is not stated: it follows the colon of
+                # the message, which is cut off there.
                 message, _, _ = message.partition(": ")
                 summary.guessed.update(names)
                 entries = {}
@@ -323,8 +326,8 @@ class LogChecks:
             if names[0] in self._joints:
                 where += f", joint {', '.join(map(repr, names))}"
             keys = {**advice.keys, **(self._joint_keys(entries) if advice.joint and entries else {})}
-            # Advised units, columns and sample rates may be wrong for the recordings without the fault. Dropped rows,
-            # periods and sign bits do not change recordings without the fault.
+            # Some recordings may not have the fault. For them, advised units, columns and sample rates may be wrong.
+            # Other settings (dropouts, periods, sign bits) do not change recordings without the fault.
             is_partial = len(occurrences) < self._count and any(
                 x in str(keys) for x in ("units", "columns", "rate")
             )
@@ -332,12 +335,12 @@ class LogChecks:
         return summary
 
     def _kin(self, joint: str) -> list[str]:
-        """Return the names of all joints of the same type as a joint, revolute or prismatic."""
+        """Return the names of all joints of the same type as `joint`: all prismatic joints, or all others."""
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
-        """Return the settings of the group `logs` that correct a fault which several joints have in common.
+        """Return the settings for the group `logs` that correct one fault of several joints.
 
         If the fault is a wrong unit of most joints of one type (revolute or prismatic), the units are also set for the
         other joints of this type, unless a joint's ratio of dq/dt to qd contradicts the units.

@@ -52,9 +52,10 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a CSV file; an incomplete last line is omitted, with a remark.
+    """Return the content of a CSV file as a list of one table; an incomplete last line is omitted, with a remark.
 
-    If the header is repeated between the rows, a new recording begins where the clock goes back.
+    If the header is repeated between the rows, one table per recording is returned: a new recording begins at a header
+    after which the times do not increase.
     """
     table, header, cut = csv_table(file)
     remarks = (f"the last line is cut off and was left out: {cut:.30}",) if cut else ()
@@ -67,7 +68,8 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     lines = [line.lstrip("\ufeff") for line in file.read_text(text.encoding).splitlines()]
     starts = [k for k, line in enumerate(lines, start=1) if line == lines[header - 1]]
     for start, stop in pairwise([*starts, len(lines) + 1]):
-        # Without lines between two headers, `csv_table` would read the whole file.
+        # A comment line "#" is added, so that the text is never empty: `csv_table` reads the whole file for an empty
+        # text.
         segment, _, _ = csv_table(file, text, "\n".join([*lines[start : stop - 1], "#"]))
         t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
         times = segment[t].drop_null().to_pylist()
@@ -86,7 +88,8 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tuple[pa.Table, int, str]:
     """Return the table of a CSV file, the number of lines before the values, and the text of an incomplete last line.
 
-    text: beginning of the file, if it is known. rows: some of its lines of values; "": all.
+    text: beginning of the file, None: it is read from the file. rows: lines of values of the file that become the
+    table, "": all lines are used.
 
     Columns may be separated by commas, semicolons, tabs, bars or spaces; numbers may have decimal commas; the encoding
     may be UTF-8, UTF-16 or Latin-1. Files without a header are accepted if `ros2 topic echo --csv` wrote them.
@@ -102,15 +105,16 @@ def csv_table(file: Path, text: Beginning | None = None, rows: str = "") -> tupl
             wrong.append(row)
         return "skip" if len(wrong) < 2 else "error"
 
-    # Arrow reads neither several spaces, which align columns, as one delimiter, nor exponents of Fortran (1.0D-02).
+    # Two forms that Arrow cannot read are replaced: several spaces that align columns, by one space, and exponents of
+    # Fortran (1.0D-02), by E.
     exponent = r"(?<=[\d.])[dD](?=[+-]\d\d)"
     spaces = "^ +| +$| +(?= )" if text.delimiter == " " else "(?!)"
     skipped_lines = 0 if rows else text.lines
     if re.search(f"{exponent}|{spaces}", text.rows, re.MULTILINE):
         rows = re.sub(exponent, "E", rows or file.read_text(text.encoding))
         rows = re.sub(spaces, "", rows, flags=re.MULTILINE)
-    # Arrow reads with one thread and with the system's allocator, which limits the memory and frees it after use. This
-    # costs 0.02 s for 17 MB.
+    # With one thread and the system's allocator, Arrow needs less memory and frees it after use. Reading 17 MB takes
+    # 0.02 s longer.
     encoding = "utf-8" if rows else text.encoding
     table = pa.csv.read_csv(
         pa.BufferReader(rows.encode()) if rows else file,
@@ -148,7 +152,8 @@ def _beginning(file: Path) -> Beginning:
         names, start = _column_names(lines, cells, header)
         names = names + [""] * (width - len(names))
         units = [plain_unit(x) for x in cells[start - 1]]
-        # Names, and the header itself, may contain words such as `deg`.
+        # A line of names may contain words such as `deg`. It counts as a line of units only if more than half of its
+        # nonempty cells are units.
         units = units if sum(map(is_unit, units)) > sum(map(bool, units)) / 2 else []
     return Beginning(encoding, delimiter, names, start, units, "\n".join(lines[start:]))
 
@@ -170,8 +175,7 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
     The header is the first line that has `width` cells, the number of cells of most lines, and is no comment. If this
     line has values and a comment with `width` cells precedes it, the comment is the header.
     """
-    # If all rows of values end with a delimiter, their last cell is empty and has no name: the header may have one cell
-    # less.
+    # Rows of values may all end with a delimiter. Their last cell is then empty, and the header may have one cell less.
     is_ended = all(row[-1] == "" for row in cells[1:-1] if len(row) == width)
     full = [k for k, row in enumerate(cells) if len(row) in (width, width - is_ended)] or [0]
     first = next((k for k in full if not COMMENT.match(lines[k])), full[0])

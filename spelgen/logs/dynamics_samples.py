@@ -17,7 +17,8 @@ FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default c
 # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
 SHORTEST = 1.0
 NEEDED = f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least"
-# [s] Shorter gaps do not cut a recording: the low-pass would remove motion that is fast enough to occur within them.
+# [s] Shorter gaps do not cut a recording. They are shorter than a quarter period of the low-pass's default cutoff, so
+# that the filter removes all motion that could have occurred within them.
 HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()
 
@@ -128,8 +129,8 @@ def _columns(
         require_cutoff(piece, rate if is_denser else FREQUENCY, cutoff)
     q, qd, tau = sampled(piece.q), sampled(piece.qd), sampled(piece.tau)
     selected = is_moving(qd)
-    # If a piece begins or ends during motion, the filter has a transient there, with an error of 20 times the noise. It
-    # lasts for 0.75 periods of the cutoff frequency; the samples in this time are removed at both ends.
+    # If a piece begins or ends during motion, the filter has a transient at this end, with errors of 20 times the
+    # noise. The transient lasts for 0.75 periods of the cutoff frequency; the samples in this time are removed.
     if cutoff is not None:
         unsettled = round(0.75 * FREQUENCY / cutoff)
         selected[:unsettled] = selected[len(selected) - unsettled :] = False
@@ -138,9 +139,9 @@ def _columns(
         selected[moving[0] : moving[-1]] = True
     columns = [q, qd, np.gradient(qd, t, axis=0), tau]
     if reach is not None and reach.elements:
-        # The filter smooths the torque steps at reversals of a joint, so the bristle states are computed at the times
-        # of the log, and get the same filter. Unfiltered states would step up to one sample earlier or later than the
-        # torque, an error that is confounded with inertia.
+        # The filter smooths the torque steps at reversals of a joint. The bristle states are therefore computed at the
+        # times of the log and filtered like the torque. Unfiltered states would step up to one sample earlier or later
+        # than the torque, and a fit would attribute this difference to inertia.
         path, speed = piece.q, piece.qd
         if cutoff is not None:
             path, speed = interpolated(t, q, times), interpolated(t, qd, times)

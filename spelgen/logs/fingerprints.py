@@ -28,9 +28,10 @@ class Fingerprints:
             self._names.setdefault(number, name)
 
     def original(self, fingerprint: Collection[int]) -> str | None:
-        """Return the name of an added recording that has a quarter or more of the samples of the shorter recording.
+        """Return the name of an added recording that shares samples with the recording of `fingerprint`, or None.
 
-        Return None if there is none. The quarter is estimated from the hashes that both fingerprints contain.
+        The two recordings must share at least a quarter of the samples of the shorter one. This fraction is estimated
+        from the hashes that both fingerprints contain.
         """
         common = Counter(self._names[number] for number in fingerprint if number in self._names)
         if not common:
@@ -42,8 +43,9 @@ class Fingerprints:
 def smallest_hashes(q: np.ndarray, inputs: np.ndarray) -> list[int]:
     """Return the `SIZE` smallest hashes of runs of `RUN` consecutive samples in motion, [] without motion.
 
-    The hashes are computed in single precision. Samples at rest are omitted, since two recordings may have equal
-    samples there. A recording that is a part of another one shares a part of its hashes (bottom-k sketch, Broder 1997).
+    The hashes are the fingerprint of a recording (bottom-k sketch, Broder 1997): recordings that share samples share
+    hashes. Values are rounded to single precision before. Samples at rest are omitted, since different recordings may
+    have the same rest position.
 
     q: (T, n) positions. inputs: (T, m) torques or commands.
     """

@@ -47,7 +47,7 @@ CONVERT = {
 
 
 def _lazy(name: str) -> Callable[..., list[LogTable]]:
-    """Return a function of this package by "module:function"; the module is imported only when the function is called.
+    """Return the function `name` ("module:function") of this package, whose module is imported when it is first called.
 
     Most users have logs in one format, and the reader of each format imports another library.
     """
@@ -108,7 +108,7 @@ def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], lis
 def _conversion(path: Path) -> str | None:
     """Return the advice, for an error message, to convert a file by a command in CONVERT; None for other files."""
     suffix = path.suffix.lower()
-    # The documents of `ros2 topic echo` are YAML in a file of any name.
+    # The output of `ros2 topic echo`, often saved as .txt or .log, is YAML and begins with "header:".
     if suffix in (".txt", ".log") and path.is_file():
         with path.open("rb") as source:
             suffix = ".yaml" if source.read(7) == b"header:" else suffix

@@ -29,7 +29,7 @@ class Advice(NamedTuple):
         message: the finding.
         joint: settings that correct the log for this joint, `logs: {joints: {NAME: ...}}`; empty if there are none.
         keys: settings that correct the log for all joints, `logs: {...}`; empty if there are none.
-        is_guess: True if the settings of the joint are only certain if most joints need them.
+        is_guess: True if the settings `joint` are uncertain: they are advised only if most joints have the same fault.
     """
 
     message: str
@@ -50,10 +50,10 @@ def mapping_line(keys: Mapping[str, object]) -> str:
 
 
 def joint_keys(entries: Mapping[str, Mapping[str, object]], joints: Sequence[str]) -> dict[str, object]:
-    """Return the content of the settings group `logs` that contains the given settings of single joints.
+    """Return the settings for the group `logs` from the settings of single joints: {"joints": {joint: settings}}.
 
-    If all joints have the same units and no other settings, the units are set once for the whole log. entries: settings
-    of each joint, by its name. joints: names of all joints.
+    If all joints have the same units and no other settings, {"units": ...} for the whole log is returned instead.
+    entries: {joint: settings}. joints: names of all joints.
     """
     first = next(iter(entries.values()))
     if first.keys() == {"units"} and all(entries.get(joint) == first for joint in joints):
@@ -113,9 +113,9 @@ class JointSignals(NamedTuple):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """Names of the measured signals: the logged ones of "q", "qd" and "tau".
+        """Names of the measured signals to check: "q", "tau" and, if logged, "qd".
 
-        The result is ("q",) for logs of position commands and for logs without torques.
+        For logs of position commands, and for logs without torques, only "q" is checked.
         """
         if self.trajectory.u is None and self.trajectory.tau.size:
             return self.trajectory.mapping.quantities
@@ -155,21 +155,21 @@ class JointSignals(NamedTuple):
 
 
 def is_factor(value: float, unit: float) -> bool:
-    """Return True if a measured ratio of dq/dt to qd equals, within 25 %, the conversion factor `unit` of two units."""
-    # Ratio of dq/dt to qd and conversion factor may differ by 25 %: noisy velocities make the ratio inexact, and
-    # conversion factors of different units differ by more than 25 %.
+    """Return True if a measured ratio `value` of dq/dt to qd equals a conversion factor `unit` within 25 %."""
+    # The ratio is inexact because velocities are noisy. A tolerance of 25 % is unambiguous, since conversion factors,
+    # such as 57.3 for q in degrees and qd in rad/s, differ from each other by more.
     return 0.8 < value / unit < 1.25
 
 
 def find_frozen(signals: JointSignals) -> str | Advice | None:
     """Return a finding if a signal is frozen while the joint moves: constant q or qd, or repeated old values.
 
-    Positions of servos are compared with their commands, other signals with the integral of qd.
+    Other signals of the joint show that it moves: the commands of a position servo, otherwise q and qd.
     """
     from scipy.integrate import cumulative_trapezoid
 
-    # `motion` [rad, m]: a constant qd is frozen if q changes otherwise by more than `motion`; a constant q is frozen if
-    # the integral of qd changes by more than `motion`.
+    # `motion` [rad, m] is a threshold. A constant qd is frozen if the difference of q and the integral of qd changes by
+    # more than `motion`. A constant q is frozen if the integral of qd changes by more than `motion`.
     t, q, qd, u, motion = signals.trajectory.t, signals.q, signals.qd, signals.signal("u"), 0.05
     if np.ptp(qd) == 0 and np.ptp(q - qd * (t - t[0])) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
@@ -179,7 +179,8 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     if np.ptp(q) == 0 and u.size and np.ptp(u) > COMMANDED:
         return f"q always {q[0]:g} while its command goes from {u.min():.3g} to {u.max():.3g}"
-    # Stale values are not searched if another unit explains the difference between qd and dq/dt.
+    # If qd and dq/dt are proportional with a factor far from 1, a wrong unit explains their difference, and stale
+    # values are not searched.
     is_other_unit = signals.correlation > SIGNALS.agreement and not 0.25 < signals.factor < 4
     has_motion = "qd" in signals.measured and not is_other_unit
     for name in signals.measured if has_motion or u.size else ():
@@ -187,7 +188,8 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
         if rows.size:
             value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
             message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"
-            # If most of the recording would be dropped, the column is not a measurement: there is no advice.
+            # If half or more of the samples are stale, the column is no measurement: dropping these samples is not
+            # advised.
             return Advice(message, keys={"dropouts": "dropped"} if len(rows) < len(t) / 2 else {})
     return None
 
@@ -270,8 +272,8 @@ def _words_text(signals: JointSignals, readings: Mapping[str, WordReading]) -> s
     values, what = unwrapped(raw, reading.size), "a register or an angle that starts again"
     if reading.key == "sign_bit":
         values, what = decoded(raw, reading.key, reading.size), "words with a sign bit"
-    # Jumps of the logged words are counted without the samples that are outliers of the decoded signal. Outliers of the
-    # logged words are not removed: among words with a sign bit, a genuine 0 looks like a lost sample.
+    # Jumps of the logged words are counted without outliers. The outliers are detected in the decoded signal, because
+    # among words with a sign bit a genuine 0 looks like a lost sample.
     count = jump_count(raw[~is_outlier(values, smooth=name == "q")], reading.size)
     is_angle = name in ("q", "u") and signals.kind != "prismatic"
     unit = signals.trajectory.mapping.unit(name, signals.joint) or ("rad" if is_angle else "as logged")
@@ -284,7 +286,8 @@ def find_jumps(signals: JointSignals) -> str | None:
     """Return a message if the position of the joint jumps, for example between joined recordings."""
     sound = ~is_outlier(signals.q, smooth=True)
     t, q = signals.trajectory.t[sound], signals.q[sound]
-    # If both neighbouring steps are similar, the joint moves fast in the unit of the log, such as the motor of a gear.
+    # A step is no jump if both neighbouring steps have at least a third of its size. Such steps are a fast motion, for
+    # example of a motor before its gear.
     steps = np.pad(np.abs(np.diff(q)), 1)
     rows = np.array([k for k in jumps(t, q) if 3 * min(steps[k], steps[k + 2]) < steps[k + 1]], int)
     if not rows.size:
@@ -297,12 +300,15 @@ def find_jumps(signals: JointSignals) -> str | None:
 def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
     """Return the decoding of a signal of the joint as register words; None if it does not consist of such words.
 
-    The registers of all joints are of one type, and a single jump, or noise at an end of the register, does not
-    determine the decoding of a joint. The result is therefore the most frequent of the decodings found for all joints
-    that removes the jumps of this joint. name: signal, "q", "qd", "tau" or "u".
+    A joint with a single jump, or with noise at an end of the register, may suggest a wrong decoding. The registers of
+    all joints have the same type, so the decodings of all joints are tried, the most frequent first. The result is the
+    first one that was found for this joint or removes more than half of its jumps.
+
+    name: signal, "q", "qd", "tau" or "u".
     """
     present, raw = _reading(signals, name), signals.raw(name)
-    # Two samples have a single step, which is their whole range.
+    # Decodings of other joints are tried only if the signal jumps, by more than 40 % of its range. Two samples show no
+    # jump: their only step always equals their range.
     if len(raw) < 3 or not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
         return present
     numbers = [k for k in range(len(signals.joints)) if k != signals.number]
@@ -332,7 +338,7 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
     for turn in turns:
         word = read_as_words(signals.raw(name)[is_valid], turn)
         if word is not None:
-            # A multiple 2^k of 360 without a stated unit is a number of revolutions in degrees.
+            # Without a stated unit, the angle is in degrees if the period or sign bit is 2^k revolutions of 360.
             is_power = np.isclose(np.log2(word.value / 360) % 1, [0, 1], atol=1e-6).any()
             in_degrees = len(turns) > 1 and bool(is_power)
             return WordReading(word.key, plain_number(word.value, 12), in_degrees)
@@ -359,15 +365,15 @@ def find_elastic(signals: JointSignals) -> str | None:
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    # Candidates for the resonance: at up to 1.5 times the highest excited frequency, it still changes the apparent
-    # inertia noticeably.
+    # Candidates for the resonance range up to 1.5 times the highest excited frequency. A higher resonance does not
+    # change the apparent inertia noticeably.
     for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
         # The apparent inertia H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance
         # f_0 would otherwise give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
         error, (motor, link) = _relative_error([factor, ones], factor * inertia)
-        # Solutions in which the link has less than a tenth of the motor's inertia are rejected: such a resonance is not
-        # visible.
+        # Solutions in which the link has less than a tenth of the motor's inertia are rejected: the resonance of such a
+        # link would not be visible in the motor's torque.
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
     # A joint counts as elastic if the RMS error of the rigid model is at least 10 %, and the RMS error of the elastic

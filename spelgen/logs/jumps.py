@@ -94,7 +94,8 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
         return outliers
     rows = np.flatnonzero(is_jump)
     first, last, window = rows[0], rows[-1], TUNING.jump_window
-    # An outlier of one or two samples at an end of the recording has only one jump: the signal begins or ends with it.
+    # One or two outliers at the beginning or end of a recording cause only one jump, since there is no signal on their
+    # other side.
     if first < 2 and sizes[first] > 4.0 * sizes[first + 1 : first + 1 + window].max():
         outliers[: first + 1] = True
     if last > len(sizes) - 3 and sizes[last] > 4.0 * sizes[last - window : last].max():
@@ -102,7 +103,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     for first, second in pairwise(rows):
         out, back = steps[first], steps[second]
         # `is_excursion`: an excursion consists of two opposite jumps of similar size, with at most five samples between
-        # them. A signal that returns later has jumped twice and has no outlier.
+        # them. If a signal returns only after more samples, its two jumps may be genuine, and there is no outlier.
         is_excursion = out * back < 0 and 0.5 < abs(out / back) < 2 and second - first <= 5
         if not is_excursion:
             continue
@@ -166,10 +167,10 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    In a block of k equal rows, all rows after the first are repeats if the arm moved while the block was written: the
-    position step at the end of the block then makes up for the k rows, as in 1, 1, 1, 4, 5 for k = 3. The number m of
-    copies is the median of k over these blocks, since a logger may write each row m times; m is 1 without such blocks.
-    In all other blocks, the arm was at rest: every m-th row is original, the rows between are repeats (none for m = 1).
+    A logger may write each row m times. A block is a run of k equal rows. In a block written during motion, all rows
+    after the first are repeats. The position step at the end of such a block is as large as k normal steps: 1, 1, 1, 4,
+    5 has k = 3. The number of copies m is the median of k over the blocks during motion, or 1 if there are none. In all
+    other blocks, the arm was at rest: every m-th row is original, the rows between are repeats.
 
     positions: number of leading columns that are positions.
     """
@@ -196,8 +197,8 @@ def held_samples(values: np.ndarray) -> int:
     if len(changes) < TUNING.jump_window:
         return 1
     sizes = np.abs(np.diff(values)[changes])
-    # Only blocks of equal samples that end with a change by several quantisation steps are counted: other blocks are
-    # genuine in a slow quantised signal.
+    # Only blocks of equal samples that end with a change by several quantisation steps are counted. In a slow quantised
+    # signal, blocks that end with a single quantisation step are genuine.
     large = sizes[1:] > 2.5 * sizes.min()
     if large.sum() < TUNING.jump_window:
         return 1
@@ -259,8 +260,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
             readings.append(Word("sign_bit", size, signed(values, size)))
         for reading in readings:
             jumps = np.abs(np.diff(reading.values))
-            # A decoding is rejected if its signal is still far from smooth at the rows of the logged jumps: these were
-            # then large steps of the motion, and not overflows or changes of sign.
+            # A decoding is rejected if the decoded signal still has large steps at the rows of the logged jumps. These
+            # jumps were then caused by the motion, and not by overflows or changes of sign.
             if np.median(jumps[rows]) > TUNING.jump * typical:
                 continue
             bends = np.abs(np.diff(reading.values, 2))

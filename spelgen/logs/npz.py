@@ -34,8 +34,8 @@ class NpzArrays:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self._arrays:
             member = self._members[name]
-            # The memory is bounded by the sizes that the archive states for its arrays. A wrong size is no risk:
-            # zipfile reads no more bytes than the archive states.
+            # The memory is bounded by the sizes that the archive states for its arrays. An archive that states too
+            # small a size is no risk, since zipfile reads no more bytes than stated.
             self._bytes += member.file_size
             if self._bytes > TUNING.npz_bytes:
                 got = f"{self._bytes / 1e9:.3g} GB of arrays"
@@ -81,8 +81,8 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     arrays, times = NpzArrays(file), mapping.columns.t
     if TRAJECTORY not in times:
         return [_table(None, arrays, joints, mapping)]
-    # A placeholder that occurs several times in a name must match the same text each time (by a back reference): a
-    # second wildcard could take exponential time on long names.
+    # If the placeholder occurs several times in a name, its first occurrence becomes a wildcard and the others back
+    # references to it. Several wildcards could take exponential time on long names.
     first, *others = map(re.escape, times.split(TRAJECTORY))
     pattern = re.compile(first + "(.+)" + r"\1".join(others), re.DOTALL)
     texts = [match[1] for match in map(pattern.fullmatch, arrays.names) if match]
@@ -140,15 +140,16 @@ def _equally_long(arrays: NpzArrays, names: Sequence[str], vectors: Collection[s
 
 
 def _longest(arrays: NpzArrays) -> pa.Table:
-    """Return a table, for the draft of a mapping, of the arrays whose number of rows is the largest in the archive.
+    """Return a table of all arrays that have the largest number of rows in the archive, for the draft of a mapping.
 
-    A matrix becomes a column of lists.
+    A matrix becomes a column of lists. Raises LogError for an array that may be transposed or one row too short.
     """
     shapes, faults = {}, []
     for name in arrays.names:
         try:
             shapes[name] = arrays[name].shape
-        # Other arrays, such as a dict with the settings of the recorder, are not needed.
+        # Arrays that are no numbers, such as a dict with the settings of the recorder, contain no signals and are
+        # skipped.
         except LogError as fault:
             faults.append(fault)
     collect([] if shapes else faults)
@@ -157,7 +158,9 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
     chosen = [x for x in columns if samples == (arrays[x].size if x in vectors else len(arrays[x]))]
     for name, shape in sorted(shapes.items(), key=lambda item: -len(item[1])):
-        # An array of images has a row per time, and is not needed. Simulations may have a state more than inputs.
+        # Other arrays with a row per time, such as images, are no signals. But a dimension of `samples` elsewhere is a
+        # transposed signal, and a dimension of `samples` +- 1 is a signal of other times: a simulation may have one
+        # state more than inputs.
         if name not in chosen and shape[:1] != (samples,) and any(abs(x - samples) < 2 for x in shape):
             do = (
                 "transpose it: rows are times"

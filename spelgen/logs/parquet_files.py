@@ -33,26 +33,26 @@ UNLESS_NORMALISED = "unless they are LeRobot's normalised values"
 
 
 def read_parquet(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a Parquet file, whose columns are read when they are needed."""
+    """Return the content of a Parquet file as a list of one table; columns are read only when they are needed."""
     schema = pa.parquet.read_schema(file)
 
     def read(names: list[str] | None) -> pa.Table:
         if names is not None:
             names = [x for x in schema.names if any(name == x or name.startswith(f"{x}.") for name in names)]
-        # Without pre-buffering, which would keep the compressed Parquet file in memory in addition to the table.
+        # Pre-buffering is switched off, since it would keep the compressed file in memory in addition to the table.
         return _flat(pa.parquet.read_table(file, columns=names, pre_buffer=False))
 
     return [LogTable(_flat(schema.empty_table()).schema, reading(file)(read), mapping)]
 
 
 def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a file with a JSON object per line and row.
+    """Return the content of a file with one JSON object per line as a list of one table with one row per object.
 
     A last line that is cut off is omitted, with a remark.
     """
     text = file.read_bytes()
     lines, _, last = text.rstrip().rpartition(b"\n")
-    # The last line of a recorder that was killed is cut off.
+    # If the recorder was killed, the last line of the file is incomplete.
     is_cut = bool(lines) and not last.endswith(b"}")
     table = pa.json.read_json(pa.BufferReader(lines if is_cut else text))
     remarks = (f"the last line is cut off and was left out: {last[:30].decode(errors='replace')}",) * is_cut
@@ -60,10 +60,10 @@ def read_json_lines(file: Path, joints: Sequence[str], mapping: LogMapping) -> l
 
 
 def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a JSON file: a list of objects, one per row, or lists of values.
+    """Return a list of one table, from a JSON file with a list of objects (rows), or with lists of values (columns).
 
-    The rows are the items of the longest list, or of all lists of its length. Names of nested values are joined by
-    points, such as `joints.elbow.position`; an object of a list is named by its `name`, else by its index.
+    The longest list states the number of rows; shorter lists are omitted. Names of nested values are joined by points,
+    such as `joints.elbow.position`; an object in a list is named by its value `name`, else by its index.
     """
     try:
         document = json.loads(file.read_bytes())
@@ -85,11 +85,12 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
 
 
 def _lists(document: object, name: str) -> Iterator[tuple[str, list[object]]]:
-    """Yield (name, items) of the lists in a JSON document, except for lists within items of a list of samples."""
+    """Yield (name, items) of the lists in a JSON document; lists within a sample (a value per joint) are omitted."""
     items: Iterable[tuple[str, object]] = document.items() if isinstance(document, dict) else ()
     if isinstance(document, list):
         objects = [x for x in document if isinstance(x, dict)]
-        # Objects of joints contain lists of samples; samples contain numbers, or a list with a value per joint.
+        # If an object contains a list longer than the list of objects, the objects are joints with lists of samples.
+        # Otherwise they are samples, which contain numbers, or a list with a value per joint.
         if any(isinstance(x, list) and len(x) > len(document) for item in objects for x in item.values()):
             items = [(str(x.get("name", k)), x) for k, x in enumerate(objects)]
         else:
@@ -118,7 +119,7 @@ def _flat(table: pa.Table) -> pa.Table:
 
 
 def _has_structs(kind: pa.DataType) -> bool:
-    """Return True for the type of lists of structs."""
+    """Return True if an Arrow type is a list of structs."""
     is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
     return bool(is_list and pa.types.is_struct(kind.value_type))
 
@@ -215,7 +216,7 @@ def _with_scale(
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
     may be normalised, if neither a unit nor a calibration is given.
     """
-    # Other elements are not positions of the arm, for example of a gripper, or velocities.
+    # Only the positions of the arm's joints are searched. Other elements may be of a gripper, or may be velocities.
     largest, used = 0.0, {mapping.column("q", joint) for joint in joints}
     for states in (_column(file, STATE) for file in files):
         if states is None:
@@ -258,7 +259,8 @@ def _calibration(folder: Path, motors: Sequence[str]) -> dict[str, MotorCalibrat
     for file in (folder / "calibration.json", folder / "meta" / "calibration.json"):
         if file.is_file():
             content = read_json(file, LogError)
-            # A file of another form is validated as a whole, which raises one error.
+            # A file that contains none of the motors has a wrong form: it is validated as a whole, which raises one
+            # error.
             content = {x: content[x] for x in motors if x in content} or content
             return validated(LogMapping, {"calibration": content}, YamlDocument(file, None)).calibration
     return {}

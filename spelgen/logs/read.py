@@ -50,7 +50,7 @@ def read_logs(
 
 
 class BoundedLogs(NamedTuple):
-    """Trajectories that fit into a limit of memory, and a note on how many samples were kept; no note if all were."""
+    """Trajectories within a limit of memory, and a note with the number of kept samples; no note if all were kept."""
 
     trajectories: list[Trajectory]
     notes: list[Diagnostic]

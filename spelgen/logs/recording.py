@@ -22,7 +22,7 @@ from spelgen.logs.trajectory import Trajectory, gap_ends
 from spelgen.logs.tuning import SIGNALS, TUNING
 from spelgen.logs.values import foreign_rows, is_split
 
-# [rad, m] Change of a command during which the position of a servo must change.
+# [rad, m] If the command of a servo changes by more than this and its position does not change, the position is frozen.
 COMMANDED = 0.2
 
 
@@ -203,9 +203,9 @@ def _remove_delays(rows: Rows) -> None:
 def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them. Commands may jump, or be 0 for some time. A
-    command is therefore an outlier only under two more conditions: its distance from the position is more than twice
-    the largest distance of the commands that are no outliers, and it is not 0 next to another 0.
+    Velocities of exactly 0 are no lost samples: a joint at rest has them. Genuine commands may jump, or be 0 in
+    successive samples. Commands are therefore removed from the mask if they are 0 next to another 0, or if they are
+    close to the position: at most twice as far as the farthest command that is no outlier.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
@@ -238,8 +238,8 @@ def stale_rows(
     if len(t) <= 20:
         return np.zeros(len(t), bool)
     if u.size:
-        # Positions lag behind their commands by less than 0.25 s, hence the margin. Dry friction holds servos of an
-        # SO-101 while their commands change by up to 0.13 rad, hence the bound `COMMANDED`.
+        # `margin`: positions lag behind their commands by less than 0.25 s. `COMMANDED` is above 0.13 rad, because dry
+        # friction may hold servos of an SO-101 at rest while their commands change by up to 0.13 rad.
         margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3))
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
     if quantity == "tau":
@@ -247,8 +247,8 @@ def stale_rows(
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
     from scipy.integrate import cumulative_trapezoid  # SciPy is slow to import, so it is imported only here
 
-    # If q or qd is frozen while the joint moves, the integral of qd drifts from q. Equal values are stale if this
-    # difference changes by more than 0.05 rad or m.
+    # If q or qd is frozen while the joint moves, the difference between q and the integral of qd changes. A block of
+    # equal values is stale if this difference changes by more than 0.05 rad or m within the block.
     return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
 
 
@@ -269,7 +269,7 @@ def _order_in_time(rows: Rows) -> None:
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
-    # the file has done so before, except if its first row has no time.
+    # the file has already done this, unless the first row of the file has no time.
     if len(rows.t) and abs(rows.t[0]) > 1e8:
         rows.t[:] -= rows.t[0]
     late = int(np.count_nonzero(np.diff(rows.t) < 0))
@@ -344,12 +344,13 @@ def _join_signals(rows: Rows) -> None:
 def _reconstructed(t: np.ndarray, layout: Layout) -> tuple[np.ndarray, str]:
     """Return evenly spaced times (T,) [s] in place of times t (T,) of a clock with a low resolution, and a message.
 
-    Raises LogError if a reconstructed time differs from the logged one by more than a tick of the clock.
+    A tick of the clock is its smallest time step. Raises LogError if a reconstructed time differs from the logged time
+    by more than a tick, or if the reconstructed times are implausible.
     """
     steps = np.diff(t)
     tick = float(steps[steps > 0].min(initial=np.inf))
-    # A time step of more than `TUNING.gap` ticks and mean steps is a gap, since the resolution of the clock does not
-    # explain it. Times are evenly spaced between gaps.
+    # Times are evenly spaced between gaps. A gap is a time step longer than `TUNING.gap` ticks of the clock and longer
+    # than `TUNING.gap` mean steps: the low resolution of the clock does not explain such a step.
     holes = np.flatnonzero(steps > TUNING.gap * max(tick, float(steps.mean()))) + 1
     times, rates = t.copy(), []
     for start, stop in pairwise([0, *holes.tolist(), len(t)]):
@@ -383,8 +384,9 @@ def _roughness(positions: np.ndarray) -> float:
 def _continues(rows: Rows) -> bool:
     """Return True if the motion continues at each row whose time is before the time of the row above.
 
-    There some joint moves, and the change of each position is at most twice its largest change in the rows around. A
-    time that follows a gap is a wrong time, after which the clock is right again.
+    The motion continues at a row if a joint moves in the rows around it, and each position changes by at most twice its
+    largest change in these rows. If the time steps forward by a gap and then back, only one time is wrong and the clock
+    was not set back: False is returned.
     """
     changes, steps = np.abs(np.diff(rows.positions, axis=0)), np.diff(rows.t)
     if len(changes) < 2 * TUNING.jump_window:

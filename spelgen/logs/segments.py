@@ -29,7 +29,7 @@ class Segment(NamedTuple):
         layout: columns of the file, with their units.
         rows: (T,) row numbers in the file, from 0.
         values: (T, C) values of the C columns of the layout, in SI units.
-        start: time [s] of the logged clock from which the times of the values are counted.
+        start: logged time [s] that was subtracted from the times in `values`.
     """
 
     recording: int
@@ -40,7 +40,7 @@ class Segment(NamedTuple):
     start: float
 
     def continued_by(self, other: "Segment") -> bool:
-        """Return True if `other`, of another file, continues this segment without a gap in times and positions."""
+        """Return True if `other`, from another file, continues this segment without a gap in time and position."""
         mine, others, count = self.layout, other.layout, 1 + len(self.layout.joints)
         if mine.file == others.file or (mine.columns, mine.mapping) != (others.columns, others.mapping):
             return False
@@ -54,11 +54,12 @@ class Segment(NamedTuple):
 
 
 class LogSegments:
-    """Collector of the segments of recordings; within a limit of memory it keeps every k-th segment.
+    """Collector of the segments of recordings, which keeps only every k-th segment if a limit of memory requires it.
 
     Segments are numbered in the order of the files. The attribute `every` is k: it is 1 at first, and is doubled
-    whenever the kept segments would exceed `kept_bytes`, so that they are evenly spread over all files. Without a
-    limit, each recording is one segment. The attribute `rows` is the number of rows of all added tables.
+    whenever the kept segments would need more than `kept_bytes` bytes. The kept segments are evenly spread over all
+    files. Without a limit, each recording is one segment. The attribute `rows` is the number of rows of all added
+    tables.
     """
 
     def __init__(self, kept_bytes: float = inf) -> None:
@@ -129,7 +130,7 @@ class LogSegments:
 
 
 def _joined_files(recordings: list[list[Segment]]) -> list[list[Segment]]:
-    """Return the segments of each recording, in the given order, after files that continue each other were joined."""
+    """Return the segments of each recording, in the given order; files that continue each other are one recording."""
     joined: list[list[Segment]] = []
     for group in sorted(recordings, key=lambda x: x[0].start + x[0].values[0, 0]):
         if not joined or not joined[-1][-1].continued_by(group[0]):

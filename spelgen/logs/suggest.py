@@ -39,8 +39,8 @@ WORDS = {
                 "电流 トルク 電流 토크 전류"),
     )
 }  # fmt: skip
-# Words in names of columns that mark commanded values, measured values, signals other than those of joints, and values
-# that a model computed, which are used only if the log has no others.
+# Words in column names by which signals are classified: commanded values, measured values, other signals than the
+# needed joint signals, and values that a model computed (used only if the log has no measured values).
 COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
@@ -53,9 +53,9 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
         "computed model predicted pred sim simulated g c f",
     )
 )
-# Letters that are quantities in names such as `i_actual` and `m_actual`.
+# {letter: quantity} for names such as `i_actual` (motor current) and `m_actual` (moment).
 LETTERS = {"i": "tau", "m": "tau"}
-# Letters in column names that are units only in brackets: without brackets they may be part of a name.
+# Letters that count as units only in brackets, as in `time (s)`: without brackets they may be part of a name.
 BARE = {"s", "n", "a", "m"}
 # Names of derivatives of positions, such as `d_theta` and `q_dot`.
 DERIVATIVE = r"(?<![^\W\d_])(?:d[ _]?(?:theta|pos|q)|(?:theta|pos|q)[ _]?dot)(?![^\W\d_])"
@@ -63,7 +63,7 @@ JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
 )
-# All words that state something about a signal; others may be the name of an arm.
+# All words that describe a signal. Any other word in a column name may be the name of an arm.
 KNOWN = COMMANDED.union(MEASURED, OTHERS, COMPUTED, *WORDS.values())
 FILTERED = {"filt", "filtered", "smooth", "smoothed"}
 CURRENT = {"current", "currents", "curr", "cur", "iq", "iqf", "strom", "corrente", "corriente", "ток", "i"}
@@ -128,9 +128,9 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
 
 
 def _names_signals(values: Sequence[object], joints: int) -> bool:
-    """Return True if the values of a column name the signal or the joint of each row, and rows have one signal each.
+    """Return True if the values of a column name the joint or the signal to which the other values of a row belong.
 
-    Such a value differs from the value of the row before, and each value occurs equally often.
+    In such a column, neighbouring rows differ, and each value occurs equally often. joints: number of joints.
     """
     counts = Counter(values).values()
     is_cycle = 1 < joints <= len(counts) <= len(values) / 2 and max(counts) - min(counts) <= 1
@@ -146,23 +146,24 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     if not commands:
         columns = _with_letters(columns, table)
     columns_of = _by_quantity(columns, commands, len(joints))
-    # A column named "load" is no torque: it is a register of a servo.
+    # A column named "load" does not count as torque here, since servos have a register with this name.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
     if not commands and not torques and len(_by_quantity(columns, True, len(joints))["u"]) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
-    # An arm at rest, whose columns are constant, is no candidate.
+    # Constant columns are omitted: they may belong to a second arm that is at rest.
     moving = [x for x in columns_of["q"] if len(set(_numbers(table, x.name).tolist())) > 1]
     _require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
-    # Of more numbered columns than joints, the moving ones belong to the arm: others are of a base or gripper at rest.
+    # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
+    # to a base or gripper at rest.
     moved = {x.number for x in _of_one_signal(moving, len(joints))}
     if len(moved) == len(joints):
         for quantity, named in columns_of.items():
             complete = [x for x in named if x.number in moved]
             columns_of[quantity] = complete if {x.number for x in complete} == moved else named
-    # Numbered columns are assigned to joints by cells that contain joint names, since the order in a log may differ
-    # from the arm's: ROS often sorts joints by name.
+    # The order of numbered columns may differ from the order of the arm's joints: ROS often sorts joints by name. If
+    # cells of the log contain joint names, they state the order.
     order = _order_in_cells(table, joints)
     signals = {x: _of_one_signal(named, len(joints)) for x, named in columns_of.items()}
     by_joint = {x: _by_joint(named, joints, order) for x, named in signals.items()}
@@ -214,7 +215,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
 
 
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
-    """Return the columns with quantities of names such as `t0`, `v0` and `u0`, which letters do not determine.
+    """Return the columns, with quantities for ambiguous names such as `t0`, `v0` and `u0`, derived from their values.
 
     Numbered columns `t` are torques. `v` and `u` are velocities if they are correlated with the derivatives of the
     positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
@@ -235,7 +236,7 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
         quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
         if letter != "t" and slope > 0.9:
             quantity = "qd"
-        # Temperatures `t0`, for example, are no torques if the log has torques.
+        # A quantity that the log already has is not assigned again: if there are torques, `t0` may be a temperature.
         present = {x.quantity for x in result if not x.words & (COMMANDED | OTHERS)}
         for k in named if quantity and quantity not in present else ():
             result[k] = result[k]._replace(quantity=quantity, words={str(quantity)})
@@ -243,9 +244,9 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
 
 
 def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
-    """Raise LogError if one of the columns `names` names the joint or the signal of each row of the log `file`.
+    """Raise LogError if one of the columns `names` states the joint or the signal of each row (see `_names_signals`).
 
-    joints: number of joints.
+    joints: number of joints. file: path of the log, for the error.
     """
     for name in names:
         if name in table.column_names and _names_signals(table[name].to_pylist(), joints):
@@ -258,10 +259,10 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
-    """Return the best of the candidates ``clocks`` for the column of times; with the name "" if there is none.
+    """Return the column of times, the best of the candidates ``clocks``; a column named "" if the log has no times.
 
-    Without candidates, it is a column whose values rise like a clock. If it contains whole seconds, and ``columns``
-    (all columns) has its nanoseconds, the name is "SEC + NSEC" of both.
+    Without candidates, a column whose values rise like a clock is returned. If the column contains whole seconds, and
+    another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
     # measurement. Without a stamp, the name with the fewest words is used.
@@ -272,7 +273,8 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     absent = ColumnName("", set(), "s")
     clock = min(seconds, key=lambda x: ("header" not in x.words, len(x.words)), default=absent)
     times = _numbers(table, clock.name)
-    # Seconds of a stamp are whole numbers that repeat.
+    # If times are whole numbers that repeat, they are the seconds of a stamp, and its nanoseconds are in another
+    # column.
     is_whole = (times == np.round(times)).all() and len(set(times.tolist())) < len(times)
     if not nanoseconds or not is_whole:
         return clock
@@ -303,9 +305,10 @@ def _numbers(table: pa.Table, name: str) -> np.ndarray:
 def _joint_lines(
     joint: str, by_joint: ByJoint, units: Mapping[str, str], common: Mapping[str, str]
 ) -> Iterator[str]:
-    """Yield the lines of a joint: its columns, and the conversions whose values the user must write.
+    """Yield the YAML lines of a joint: its columns and units, and conversions whose values the user must insert.
 
-    by_joint: {quantity: {joint: column}}. units: {quantity: unit} of the joint; common: the same of all joints.
+    by_joint: {quantity: {joint: column}}. units: {quantity: unit} of the joint. common: {quantity: unit} of the units
+    that all joints share; they are not repeated here.
     """
     entries = {quantity: named[joint].name for quantity, named in by_joint.items() if joint in named}
     yield from (f"  {json.dumps(joint)}:", f"    columns: {json.dumps(entries)}")
@@ -358,7 +361,7 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     joint = max(matches, key=lambda x: len(matches[x][0]), default="")
     bare = labels[joint].sub(" ", name) if joint else name
     numbers = re.findall(r"\d+", bare)
-    # A column with the name of a joint has its positions, except for `t` of a joint that is called t.
+    # A column named `t`, or with another word for time, contains times, even if a joint has the same name.
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
     last = re.fullmatch(r"(.*?)[\s_.]*?([^\W\d_]+(?:/s|[\s_](?:per[\s_])?s)?)[\W\d_]*", bare)
@@ -373,7 +376,8 @@ def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, wo
     # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
     for word in reversed(texts):
         if quantity is None and (quantity := next((x for x, y in WORDS.items() if word in y), None)):
-            # The values of `current_torque` and `current_as_torque` are no currents.
+            # Only a noun that is a current keeps the words for currents: `current_torque` and `current_as_torque` are
+            # torques.
             words = words if word in CURRENT else words - CURRENT
     quantity = quantity or next((x for x in UNIT_NAMES if mapped_unit(x, unit)), None)
     if quantity is None and words & MEASURED:
@@ -420,7 +424,7 @@ def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]
                 unit = f"{units[joint]['q']}/s"
             if unit is None and quantity == "tau" and column.words & CURRENT:
                 unit = "A"
-            # The unit of positions also applies to commands.
+            # Commands have the unit of the positions unless another unit is stated, so an equal unit is omitted.
             if unit is not None and (quantity != "u" or unit != units[joint].get("q")):
                 units[joint][quantity] = unit
     return units
@@ -459,7 +463,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
 def _names(table: pa.Table) -> list[str]:
     """Return the names of a table's columns; a column of lists is replaced by its elements, such as `q[0]`, `q[1]`.
 
-    Names that two columns have are omitted, and columns without values.
+    Names that occur more than once and columns without values are omitted.
     """
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -480,9 +484,9 @@ def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[Colum
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. Measurements are preferred to values that a model computed, torques to
-    currents, signals of joints to signals of motors, names with a word such as "actual" to others, values without a
-    filter to filtered ones, and names with few words to longer ones: `tau_J` to
+    differ only in the words of the joint. In this order, measurements are preferred to values that a model computed,
+    torques to currents, signals of joints to signals of motors, names with a word such as "actual" to other names,
+    unfiltered to filtered values, and names with few words to longer names. Example: `tau_J` is preferred to
     `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
@@ -507,7 +511,8 @@ def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> 
     """
     signals = _complete_signals(columns, joints)
     best = min(signals, key=_rank, default=frozenset[str]())
-    # The name of an arm states nothing about the signal. It may also be a number, which is not among the words.
+    # Column names of several arms differ only in words that do not describe a signal, such as "left", or in a number,
+    # which is not among the words.
     arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
     of_joint: dict[str, list[str]] = {}
     for column in chain.from_iterable(signals[x] for x in arms):
@@ -538,7 +543,8 @@ def _by_joint(
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}
-    # pandas numbers equal names from the second one: q, q.1, q.2.
+    # If columns have the same name, pandas appends numbers except to the first: q, q.1, q.2. The first then has the
+    # number -1.
     if len(numbered) == len(joints) - 1:
         numbered = {x.number: x for x in columns}
     if named or len(numbered) < len(joints):

@@ -206,8 +206,8 @@ def missing_columns(
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]
     of_joints = dict(zip(joints, zip(*of_quantity.values(), strict=True), strict=True))
     unlogged = [joint for joint, names in of_joints.items() if set(names) <= set(missing)]
-    # If only some joints have no column at all, the error states that these joints were not logged: a wrong column name
-    # would affect only one column of a joint, and a wrong pattern all joints.
+    # If all columns of a joint are missing, but not of all joints, the error states that this joint was not logged. The
+    # mapping is probably right: a wrong column name affects one column of a joint, a wrong pattern affects all joints.
     if unlogged and len(unlogged) < len(joints):
         logged = ", ".join(joint for joint in joints if joint not in unlogged)
         do = (
@@ -252,10 +252,11 @@ def _naming(unused: Collection[str]) -> str:
 
 
 def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
-    """Return {joint: pattern of its name}, as separate words in `names`: `q_1` has the joint 1, `q_12` has not.
+    """Return {joint: pattern that finds its name as a separate word}: the joint 1 is found in `q_1`, but not in `q_12`.
 
     A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
-    joints shoulder_pan_joint and joint_1_s. The first of these forms in which all joints are found is used.
+    joints shoulder_pan_joint and joint_1_s. The first of these three forms in which all joints are found in `names`,
+    the column names, is used.
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
@@ -263,7 +264,8 @@ def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, r
     letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
     forms = []
     for form in (words, distinct, letters):
-        # Numbers are no names: columns may be numbered in another order, which cells of the log may state.
+        # A shortened name must contain a letter. A bare number does not identify a joint, since the columns may be
+        # numbered in another order than the joints.
         if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
             parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}
             texts = {x: r"[\W_]?".join(re.escape(y.strip("_")) for y in of_x) for x, of_x in parts.items()}

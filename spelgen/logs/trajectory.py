@@ -129,7 +129,7 @@ class Trajectory:
 
     @cached_property
     def fingerprint(self) -> list[int]:
-        """Hashes of positions and of torques or commands (see `smallest_hashes`), which a copy has under any name."""
+        """Hashes of the samples (see `smallest_hashes`), by which a copy under another name is recognised."""
         return smallest_hashes(self.q, self.tau if self.u is None else self.u)
 
     def __repr__(self) -> str:
@@ -142,9 +142,9 @@ class Trajectory:
     def _as_array(self, column: str) -> np.ndarray:
         values: object = getattr(self, column)
         try:
-            if hasattr(values, "detach"):  # A tensor may be on a GPU, or require gradients.
+            if hasattr(values, "detach"):  # NumPy cannot convert a tensor on a GPU or with gradients.
                 values = values.detach().cpu()
-            if isinstance(values, np.ma.MaskedArray):  # Masked values become NaN; NumPy would return them.
+            if isinstance(values, np.ma.MaskedArray):  # Masked values become NaN; asarray ignores masks.
                 return np.asarray(np.ma.filled(values.astype(float), np.nan))
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
@@ -213,8 +213,8 @@ def gap_ends(t: np.ndarray, gap: float = GAP, hole: float = 0.0) -> list[int]:
     A gap is a time step longer than `gap` median steps and longer than `hole` [s].
     """
     steps = np.diff(t)
-    # Few recordings have gaps. For most of the others, a comparison of the longest with the shortest step shows that
-    # there is no gap, and saves the computation of the median, which takes most of the time.
+    # In most recordings the longest step is at most `gap` times the shortest step. There is then no gap, and the
+    # median, which takes most of the time, need not be computed.
     if not steps.size or steps.max() <= gap * steps.min():
         return [0, len(t)]
     return [0, *(np.flatnonzero(steps > max(gap * np.median(steps), hole)) + 1).tolist(), len(t)]

@@ -46,8 +46,8 @@ class LogTuning:
 class SignalCheckTuning:
     """Thresholds that several checks of logs use."""
 
-    # [1] Two signals count as proportional if their correlation is at least this number. A factor between signals
-    # counts as 1 if it differs from 1 by at most 1 minus this number.
+    # [1] Two signals count as proportional if their correlation is at least this number. The factor between two
+    # proportional signals counts as 1 if it is 1 +- 0.1, with 0.1 = 1 minus this number.
     agreement: float = 0.9
     # [rad, m] A joint is at rest in a log if the range of its positions is at most this number: noise of an encoder is
     # smaller.

@@ -63,7 +63,7 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def find_units(signals: JointSignals) -> str | Advice | None:
     """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd."""
     mapping, joint = signals.trajectory.mapping, signals.joint
-    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
+    # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
     if signals.step > SIGNALS.slowest_step:
         return None
     is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
@@ -73,7 +73,8 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
-            # Without velocities, whole numbers may be counts or degrees.
+            # Whole numbers may be counts of an encoder or degrees. Without velocities this is unknown: no unit is
+            # advised.
             if not _knows_ratio(signals):
                 return message
     # `distance`: implausibility of a combination of units. Of combinations whose distances differ by rounding only, the
@@ -87,11 +88,12 @@ def find_units(signals: JointSignals) -> str | Advice | None:
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
     units = " and ".join(f"{name} in {unit}" for name, unit in keys.get("units", {}).items())
-    # The unit advised for q also applies to commands, unless the commands move much less than q: they are then SI.
+    # The unit advised for q also applies to commands. But if the range of the commands is less than a third of the
+    # range of q, the commands are already in SI units, and the SI unit is advised for the commands.
     if keys and signals.trajectory.u is not None and np.ptp(signals.signal("u")) < np.ptp(signals.q) / 3:
         keys = keys | {"units": keys["units"] | {"u": "m" if signals.kind == "prismatic" else "rad"}}
-    # The range of positions does not distinguish degrees from the motion of a motor before a gear; a ratio to the
-    # velocities that differs from 1 does.
+    # Positions beyond two turns may be in degrees, or be measured at a motor before a gear. Only a ratio of dq/dt to qd
+    # that differs from 1 shows which is true; without it the unit is a guess.
     is_guess = is_far and not (_knows_ratio(signals) and abs(signals.factor) > 1.25)
     of_log = {"velocity": "differentiated"} if "sign" in keys else {}
     return Advice(f"{message}: {units}", keys, of_log, is_guess) if keys else None
@@ -118,10 +120,11 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     is_known = _knows_ratio(signals)
     positions, speeds = UNITS["prismatic" if signals.kind == "prismatic" else "revolute"]
     stated = mapping.unit("q", joint)
-    # A wrong unit in the mapping, such as deg for positions in rad, makes the motion of all joints implausibly small.
-    # The unit of the positions is then a better explanation than the unit of the velocities.
+    # If all joints move by less than 0.1 rad or m, the unit of positions in the mapping may be wrong, such as deg for
+    # positions in rad. Other units of positions are then preferred to other units of velocities.
     largest = float(np.ptp(signals.trajectory.q, axis=0).max())
-    # In a unit of positions in which no joint moves by 0.05 rad or m, the times are wrong and not the positions.
+    # A unit of positions in which no joint would move by 0.05 rad or m is not tested: a wrong unit of times is then a
+    # better explanation.
     smallest = 0.05 / largest if is_known and largest > 0 else 0.0
     for unit in positions if stated and is_known and largest < 0.1 else ():
         ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
@@ -204,8 +207,8 @@ def _rate_by_velocities(signals: JointSignals) -> float | None:
     is_common = factor > 0 and np.ptp(factors) < 0.05 * factor and signals.correlation > 0.98
     if not is_common or abs(steps - signals.step).max() > 0.5 * signals.step:
         return None
-    # A ratio of dq/dt to qd near 1 is more probably an error of the velocities than of the times. If the ratio is a
-    # factor between two units of time, such as 1000, the caller reports the unit.
+    # If the ratio of dq/dt to qd is between 1/1.5 and 1.5, wrong velocities are more probable than wrong times. If it
+    # is a factor between two units of time, such as 1000, the caller reports the unit.
     if abs(log(factor)) < log(1.5) or any(is_factor(factor, TIMES[unit]) for unit in TIMES):
         return None
     step = signals.step * factor
@@ -223,7 +226,7 @@ def time_unit(step: float) -> str | None:
 def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     """Return a finding if qd is not dq/dt, with advice if another sign or other columns correct it."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
-    # Times with a median step above 0.5 s are in another unit, so dq/dt is wrong. The check of times reports it.
+    # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
     if signals.step > SIGNALS.slowest_step:
         return None
     if np.isnan(correlation) or signals.is_at_rest or _is_below_resolution(signals):
@@ -238,14 +241,15 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         return Advice(message, keys={"velocity": "differentiated"})
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
     if len(signals.q) <= SIGNALS.increments:
-        # Increments are changes over ten samples. A log of at most ten samples has only one, the change from its first
-        # to its last sample, whose correlation is always 1 or -1: too little for advice.
+        # The correlation is computed from changes over ten samples. A log of at most ten samples has only one such
+        # change, so that the correlation is always 1 or -1 and does not justify advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
         return Advice(f"{message}; its sense is opposite", keys={"velocity": "differentiated"})
     trajectory, mapping, k = signals.trajectory, signals.trajectory.mapping, signals.number
-    # In synchronous motion the velocities of all joints are correlated, and only one of them has the right magnitude.
+    # In synchronous motion, the velocity columns of all joints are correlated with dq/dt of this joint. The right
+    # column also has the right magnitude: its squared difference from dq/dt is smallest.
     products, n = velocity_products(trajectory), len(signals.joints)
     squares, scalar_products = products.diagonal()[:n], products[:n, n + k]
     nearest = int((squares - 2 * scalar_products).argmin())
@@ -262,7 +266,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
 
 
 def _is_below_resolution(signals: JointSignals) -> bool:
-    """Return True if dq/dt is mostly smaller than the smallest change of qd, so that both cannot be compared.
+    """Return True if the RMS of dq/dt is below the smallest change of qd, so that dq/dt and qd cannot be compared.
 
     An example is a joint that the controller holds, whose position varies by a few steps of its encoder.
     """
@@ -308,8 +312,8 @@ def _velocity_lag(signals: JointSignals) -> float:
     power = float(speed @ speed)
     lag = float(speed @ difference) / power if power else 0.0
     residual = difference - lag * speed
-    # The delay must explain 75 % of the squared difference between q and the integral of qd: noise also results in an
-    # apparent delay, but explains little of the difference.
+    # The delay must explain 75 % of the squared difference between q and the integral of qd. An apparent delay that is
+    # due to noise explains much less.
     return lag if residual @ residual < 0.25 * difference @ difference else 0.0
 
 
@@ -332,7 +336,7 @@ def find_copied(signals: JointSignals) -> str | None:
 
 
 def find_held(signals: JointSignals) -> str | None:
-    """Return a message if the values of a measured signal of the joint are each repeated in consecutive rows."""
+    """Return a message if the logger repeats each value of a measured signal of the joint in several rows."""
     rate = signals.trajectory.sample_rate
     for name in signals.measured:
         often = held_samples(signals.signal(name))
@@ -354,7 +358,7 @@ def find_too_rare(signals: JointSignals) -> str | Advice | None:
     message = find_held(signals)
     if message is None or shows_accelerations(rate / max(repeated.values())):
         return None
-    # If only velocities are repeated in several rows, they can be computed from the positions instead.
+    # If only values of qd are repeated, the advice is to compute velocities from the positions.
     is_mended = all(often == 1 for name, often in repeated.items() if name != "qd")
     return Advice(message, keys={"velocity": "differentiated"}) if is_mended else message
 
@@ -372,8 +376,7 @@ def is_one_sided(values: np.ndarray, share: float = 0.05) -> np.ndarray:
 def find_unsigned_velocity(signals: JointSignals) -> str | None:
     """Return a message if the velocities of the joint have no sign: qd is |dq/dt|."""
     trajectory, qd, share = signals.trajectory, signals.qd, 0.05
-    # The check is omitted for velocities with a sign: logged velocities in both directions, and velocities computed
-    # from positions.
+    # Only logged velocities that are nearly all of one sign are tested. Velocities computed from positions have a sign.
     if "qd" not in trajectory.mapping.quantities or not is_one_sided(qd, share) or len(qd) < 3:
         return None
     speed = np.gradient(signals.q, trajectory.t)

@@ -76,16 +76,17 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
 
 
 def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
-    """Return a mask (T,) of the rows that contain positions only, or no values: they are from another publisher.
+    """Return a mask (T,) of the rows of another publisher, which contain positions only, or no values.
 
-    Their velocities and torques are absent, or exactly 0 in many single rows between other rows.
+    Velocities and torques of such a row are absent. They may also be exactly 0, if many such rows (more than 2 %) are
+    scattered between other rows.
 
     data: (T, 1 + C), times and C signals. joints: number of joints, whose positions are the first signals.
     """
     signals = data[:, 1 + joints :]
     empty, zero = np.isnan(signals).all(axis=1), (signals == 0).all(axis=1)
-    # An arm at rest whose motors are off has more such rows in succession, and coarse signals of an arm that reverses
-    # have few: less than 2 % of all rows.
+    # Rows of zeros may also be genuine. If the arm is at rest and its motors are off, they are in long runs. If a
+    # moving arm reverses and its signals are coarse, they are less than 2 % of all rows.
     if signals.shape[1] > joints and zero.sum() > max(TUNING.jump_window, 0.02 * len(data)):
         runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
         if runs > TUNING.jump_window and zero.sum() < 4 * runs:
@@ -220,13 +221,15 @@ def _floats(values: Column, name: str, layout: Layout, rows: Rows) -> np.ndarray
     number.
     """
     try:
-        # Integers beyond 2^53, such as times in nanoseconds, are rounded: a safe cast would raise an error for them.
+        # The cast of integers is not safe: it rounds integers beyond 2^53, such as times in ns. A safe cast would raise
+        # an error.
         floats = values.cast(pa.float64(), safe=not pa.types.is_integer(values.type))
         return np.asarray(floats.to_numpy(zero_copy_only=False))
     except (pa.ArrowException, ValueError) as error:
         # The row of the first value that is no number is searched, since Arrow's error does not state it.
         texts = values.to_pylist() if pa.types.is_string(values.type) else []
-        # Numbers with decimal commas are no error; "1,234" may be one thousand, unless other numbers have more digits.
+        # Numbers with decimal commas are accepted. But if all of them have the form "1,234", they may be thousands: an
+        # error.
         with_comma = [text for text in texts if text and "," in text]
         is_decimal = not all(re.fullmatch(r"-?[1-9]\d{0,2},\d{3}", text) for text in with_comma)
         if is_decimal and all(re.fullmatch(DECIMAL_COMMA, text) for text in texts if text):

@@ -129,7 +129,7 @@ def _slide(values: np.ndarray, window: int, stride: int, decimation: int) -> tor
 
 
 class Split(NamedTuple):
-    """Split of logs: trajectories for training, others for validation, and a note that names the latter."""
+    """Split of logs into trajectories for training and for validation. note: which ones are for validation."""
 
     training: tuple[Trajectory, ...]
     validation: tuple[Trajectory, ...]
