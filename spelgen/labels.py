@@ -152,10 +152,10 @@ def thousandths(joint_types: Sequence[str]) -> str:
 
 
 def observed(predictor: str) -> str:
-    """Return the name for predictions of ``predictor`` that include the disturbance of a momentum observer."""
+    """Return the name of ``predictor`` with a momentum observer, whose disturbance is added to the predictions."""
     return f"{predictor} + observer"
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor: the model with a disturbance observer, or any without one."""
+    """Return True if charts show a predictor: all without disturbance observer, and the model with one."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

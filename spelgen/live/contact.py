@@ -43,13 +43,13 @@ class ContactObserver:
         baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
-        level: Mean square of the normalised residual in about the last half second, (n,). If the level exceeds 1, the
-            variance of the residual is multiplied by the level, since residuals are larger in some motions, for example
-            if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that a
-            contact does not raise the threshold before it is detected. The squares are limited to `TUNING.level_limit`,
-            so that slow contacts raise the thresholds by a factor of at most two.
-        normalised: Magnitude of the external torque beyond the bound at rest, divided by its standard deviation, which
-            is compared with `NoiseLevels.thresholds`, (n,) [1].
+        level: Mean square of the torque residual divided by its standard deviation, over about the last half second,
+            (n,) [1]. A level above 1 multiplies the variance of the residual: residuals are larger in some motions, for
+            example if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that
+            a contact does not raise the threshold before it is detected. The squares are limited to
+            `TUNING.level_limit`, so that slow contacts raise the thresholds by a factor of at most two.
+        normalised: Excess of the external torque's magnitude over `NoiseLevels.resting_torque`, divided by the standard
+            deviation of the torque residual, (n,) [1]. A joint is in contact above `NoiseLevels.thresholds`.
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -82,7 +82,7 @@ class ContactObserver:
         self.touched = np.abs(signal) > threshold
         normalised = np.maximum(np.abs(signal) - resting, 0.0) / noise
         self.normalised = normalised / factor
-        # A detected contact does not change the level.
+        # For a joint in contact the present level is added instead of the squared residual, which is not noise then.
         limited = np.minimum(np.square(normalised), TUNING.level_limit)
         self.squares = self.squares + np.where(self.touched, self.level, limited)
         self.count += 1
@@ -90,7 +90,7 @@ class ContactObserver:
         return ContactState(-signal, threshold, self.touched, force)
 
     def end_block(self) -> None:
-        """Update the level of the residual at the end of a block of samples."""
+        """Update the attribute `level` (mean square of the residual) at the end of a block of samples."""
         self.level = self.level + (1 - math.exp(-TUNING.block / TUNING.level)) * (self.recent - self.level)
         self.recent = self.squares / self.count
         self.squares, self.count = np.zeros_like(self.squares), 0
@@ -102,8 +102,8 @@ class ContactObserver:
 
         The residual is the low-pass filtered difference between the measured torque and the sum of the torques of
         model, payload and drift. It estimates the external torque with a reversed sign. The variance has three terms:
-        for changing accelerations, for an unknown friction state and for the uncertain payload. The caller adds the
-        noise variance of the observer.
+        for changing accelerations, for an unknown friction state and for the uncertain payload. It does not contain
+        the noise variance of the observer, which `step` adds.
 
         t, at, payload, drift: see `step`.
         """
@@ -143,10 +143,9 @@ class ContactObserver:
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
         )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        # Measured torques that lag behind the motion cause an error of the residual, which is proportional to the
-        # change `jerk` of dp/dt. This error passes the observer's low-pass filter and persists for its time constant:
-        # the variance of the residual therefore contains the square of `jerk` for the present error, and this square
-        # after the filter (`self.jerk`) for the persisting error.
+        # If measured torques lag behind the motion, the residual has an error proportional to `jerk`, the change of
+        # dp/dt. The low-pass filter of the observer prolongs this error by about its time constant. The variance
+        # therefore contains jerk^2 for the present error, and the low-pass filtered jerk^2 (`self.jerk`) for past ones.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

@@ -183,8 +183,8 @@ class Estimator:
             payload = Payload("not yet", payload.log_odds, payload.limit)
         self.payload = payload
         if (before.status == "payload") != (self.payload.status == "payload"):
-            # The drift filter has assumed a wrong payload so far, and has attributed its torques to friction. The drift
-            # filter is restarted from the friction scale of the payload filter.
+            # A payload is reported for the first time, or no longer. Until now the drift filter assumed a wrong payload
+            # and attributed its torques to friction. It restarts with the friction scale of the payload filter.
             joints = slice(10, 10 + self.model.n)
             self.drift = JointFilters.of_drift(self.levels.drift)
             self.drift.x[:, 0] = main.x[joints]
@@ -192,9 +192,9 @@ class Estimator:
         return self.payload
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float = 0.0) -> np.ndarray:
-        """Return the torques for a motion with the estimated payload and friction drift, (n,) [Nm, N].
+        """Return the torques that a motion requires with the estimated payload, friction and disturbance, (n,) [Nm, N].
 
-        Like the logged torques, they are torques of the joints or of the motors.
+        If the logs contain motor torques, motor torques are returned; otherwise joint torques.
 
         Args:
             q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (n,) each.

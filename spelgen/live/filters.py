@@ -96,7 +96,7 @@ class Blocks:
 
 
 class LoadFilter:
-    """Kalman filter of the payload's parameters theta, and of friction scale a, offset b and disturbance d of n joints.
+    """Kalman filter of the payload's parameters theta, and of friction change a, offset b and disturbance d per joint.
 
     The measurement equation and its symbols are in the docstring of the module.
 
@@ -107,7 +107,7 @@ class LoadFilter:
     Attributes:
         x: State (theta, a, b, d), (10 + 3 n,).
         P: Covariance of x, (10 + 3 n, 10 + 3 n).
-        log_likelihood: Log likelihood of all measurements since it was set to zero.
+        log_likelihood: Log likelihood of all measurements since this attribute was last reset to zero.
         surprise: Sum of the normalised squared residuals of moving joints in the last block.
         disturbance: Stationary variance of d, (n,).
     """
@@ -139,7 +139,7 @@ class LoadFilter:
     def update(self, block: Block, joint: int) -> None:
         """Update the state with the torque residual y (`block.y`) of one joint.
 
-        A joint at rest updates only its own disturbance d (see the module).
+        A joint at rest updates only its disturbance d, since friction at standstill is unknown.
 
         block: means over a block of samples. joint: index of the joint.
         """
@@ -151,13 +151,14 @@ class LoadFilter:
         residual = float(block.y[joint] - self.x[columns] @ row)
         # The influence of an outlier is bounded by a larger variance, which corresponds to Huber's weights.
         variance = max(expected, residual**2 / TUNING.outlier**2)
-        # Products have the order of the C code, so that rounding errors are equal.
+        # The factors are multiplied in the same order as in the exported C code, so that rounding errors are equal.
         weight = 1 / variance
         gain = covariance * weight
         if block.moving[joint]:
             self.surprise += residual**2 / expected
             self.x += gain * residual
-            # The product is exactly symmetric. An asymmetry of P from rounding errors would grow with each update.
+            # This outer product is exactly symmetric; the product of gain and covariance would be so only up to
+            # rounding errors, and the resulting asymmetry of P would grow with each update.
             product = np.outer(covariance, covariance) * weight
             recurring = TUNING.recurring * (noise + self.disturbance[joint])
             kept = recurring / max(float(row[:10] @ self.P[:10, :10] @ row[:10]), recurring)
@@ -205,20 +206,23 @@ class JointFilters:
 
     @classmethod
     def of_drift(cls, noise: BlockNoise) -> JointFilters:
-        """Return the estimator's drift filters with two states: friction change a (a random walk) and disturbance d."""
+        """Return the estimator's drift filters with two states: friction change a (a random walk) and disturbance d.
+
+        noise: noise of the torque residual of blocks of the drift filter.
+        """
         deviations = np.stack([np.full_like(noise.white, TUNING.friction), noise.disturbance], axis=-1)
         return cls(deviations, noise.white, noise.time_constant, drifts=True)
 
     def update(self, block: Block, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the states at a block of samples, update them with a torque, and return residual and variance.
+        """Predict the states to a block of samples, and update them with the torque residual of the block.
 
         Args:
             block: Means of the terms of the momentum balance.
             torque: Torque residual of the block minus the torque of the payload, (n,) [Nm, N].
 
         Returns:
-            Difference of `torque` from its prediction, and the predicted variance of this difference, (..., n) each,
-            with an axis (...) for filters with different noise.
+            Prediction error (`torque` minus its prediction) [Nm, N], and its predicted variance, (..., n) each. The
+            leading axes (...) are the filters with different noise.
         """
         decay = np.ones_like(self.x)
         decay[..., -1] = np.exp(-block.duration / self.time_constant)
@@ -254,7 +258,7 @@ class PayloadEstimate:
 
     Attributes:
         filters: the filter without a hypothesis, then the two copies, if any.
-        moved: time in motion since the start or the last change of the payload [s].
+        moved: time in motion since the first sample or the last change of the payload [s].
         changed: True if a change of the payload was accepted, until the caller sets it to False.
         misfit: mean of the normalised squared residuals of moving joints in about the last second [1].
     """

@@ -20,7 +20,7 @@ IGNORED: tuple[Refusal, ...] = ("not finite", "repeated", "reversed", "jump")
 class DelayLine:
     """Delay of measured signals by a constant time, with linear interpolation between samples.
 
-    It aligns motion and torques, of which one is measured later than the other. delay: time [s].
+    It synchronizes positions and torques if one of the two is measured later. delay: time [s].
     """
 
     def __init__(self, delay: float) -> None:
@@ -49,10 +49,10 @@ class Intake:
 
     Args:
         levels: limits by which samples are refused, and the delay of torques.
-        bristles: break-away displacements.
+        bristles: break-away displacements of the K bristles of each drive.
 
     Attributes:
-        counts: {result of the check: number of samples}.
+        counts: number of samples for each result of the check, such as {"used": 120, "jump": 1}.
         bounds: Lower and upper bound of the friction state of each of K bristles, (2, n, K) [rad, m].
         aligned: q, qd and tau of the last used sample, (3, n), at the same time: q and qd are delayed if measured
             torques lag behind the motion, tau is delayed if they precede it.
@@ -81,7 +81,8 @@ class Intake:
             tau: measured torques, (n,) [Nm, N].
 
         Returns:
-            "used", or the reason why nothing of the sample (`IGNORED`) or only a part of it is used (other reasons).
+            "used" if the sample is used; otherwise the reason of its refusal. Nothing of the sample is used if the
+            reason is in `IGNORED`; otherwise a part of the sample is used.
         """
         refusal = self._check(t, q, qd, tau)
         # After `TUNING.restart` consecutive samples that are refused as "reversed" or "jump", a permanent change of the

@@ -40,7 +40,7 @@ Folds = Sequence[tuple[RigidBodyDynamics, Sequence[Trajectory]]]
 def noise_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit: stored in its run folder, or estimated from its logs and then stored.
 
-    Raises RunError if they cannot be read, or if there are neither stored levels nor logs.
+    Raises RunError if stored levels cannot be read, or if there are neither stored levels nor logs.
     """
     levels = stored_levels(fit)
     if levels is None:
@@ -54,8 +54,8 @@ def noise_levels(fit: Fit) -> NoiseLevels:
     return levels
 
 
-# These fits use one thread, like the fit of the run. With torch 2.13, the factorisation of a batch of large matrices
-# does not end if the number of threads was raised before, as at the end of a fit.
+# The number of torch's threads is 1 for all fits together. Otherwise each fit would raise it again at its end, and with
+# torch 2.13 the factorisation of a batch of large matrices in the next fit would never end.
 @threads_of_torch(1)
 def cross_validated_levels(fit: Fit) -> NoiseLevels:
     """Return the noise levels of a fit, estimated by cross-validation on its logs.
@@ -152,10 +152,9 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # `levels` has no noise values at first, but the limits by which samples are accepted or refused: the noise is
-    # estimated from the accepted samples.
-    # The torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, torques may
-    # exceed `limit`, for example under a payload, and are no saturation.
+    # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
+    # them. A torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, `limit` is
+    # a guess: torques above it (for example under a payload) do not count as saturated up to `TUNING.jump` times it.
     limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
@@ -178,13 +177,13 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
 def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
-    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. A
-    trial is an estimate x of the payload from several consecutive blocks, where x is the mass (k = 1), or mass and
-    first moments (k = 4). The logs are without payload, so x is an error, with the normalised square x^T P^-1 x / k.
-    Its mean over the trials is computed for each k and each length of trials; each mean includes `prior_trials`
-    imaginary trials of the value `prior_variance`. The factor is the largest of these means, since errors that are
-    correlated over time may give a larger mean for longer trials. The degrees of freedom are the number of trials in
-    this mean, imaginary ones included.
+    The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
+    factor is found by trials: each trial estimates the payload from several consecutive blocks. The logs are without
+    payload, so the estimate x is an error, with the normalised square s = x^T P^-1 x / k; x is the mass (k = 1), or
+    mass and first moments (k = 4). The mean of s is computed for each k and each number of blocks per trial, because
+    errors are correlated over time. As a prior, each mean includes `prior_trials` imaginary trials with s =
+    `prior_variance`. The factor is the largest mean; its degrees of freedom are the number of trials in this mean,
+    including the imaginary trials.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -287,7 +286,10 @@ def _with_observer(levels: NoiseLevels, tested: Sequence[Sequence[HeldOutSample]
 
 
 def _observed(levels: NoiseLevels, samples: Sequence[HeldOutSample]) -> np.ndarray:
-    """Return external torques, and `ContactObserver.normalised`, at T held-out samples, (2, T, n)."""
+    """Apply the momentum observer to T held-out samples.
+
+    Returns the external torques [Nm, N] and `ContactObserver.normalised` [1], stacked, (2, T, n).
+    """
     observer, drift = ContactObserver(levels, TUNING.alarms_per_minute), JointFilters.of_drift(levels.drift)
     rows = []
     for t, at, is_resumed, block in samples:
@@ -301,7 +303,7 @@ def _observed(levels: NoiseLevels, samples: Sequence[HeldOutSample]) -> np.ndarr
 
 
 def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str, object]:
-    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels` for the peaks of all logs.
+    """Return the distribution of the largest peaks: `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. An
     exponential distribution is fitted to the largest peaks and gives the contact thresholds. Peaks differ between logs,
@@ -324,7 +326,9 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
 
 
 def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, object]:
-    """Return `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`, from the largest of all peaks.
+    """Fit an exponential distribution to the largest peaks; return its start, scale and number of peaks.
+
+    The keys are the fields `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     peaks: largest normalised residuals of each log in W time windows, (W, n) [1]; they are multiplied by `factor`.
     """
@@ -334,10 +338,10 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, and the standard error of each is 1 / sqrt(count) of its value. The scales
-    # are shrunk towards their mean; the weight of the mean is the variance of the error divided by the variance over
-    # the joints (James and Stein, 1961). This weight is at most 1 - 1 / n, so that `peak_count` is at most n `count`,
-    # the number of peaks of all n joints.
+    # The scales of the joints are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the
+    # errors, the scales are shrunk towards their mean (James and Stein, 1961). The weight of the mean is the error
+    # variance divided by the variance over the joints. It is at most 1 - 1 / n, so that `peak_count` is at most n
+    # `count`, the number of peaks of all n joints.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)
@@ -346,7 +350,7 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
 
 
 def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> dict[str, np.ndarray]:
-    """Return the noise of the momentum observer in motion and at rest, as fields of `NoiseLevels`.
+    """Return the noise of the momentum observer in motion and at rest, as {field of `NoiseLevels`: value}.
 
     The noise variance of a joint at the velocity qd is s^2 (1 + (r exp(-|qd| / v))^2). The likelihood is maximized over
     a grid of the ratio r and the velocity scale v of the additional noise near standstill; the noise s in motion is

@@ -113,7 +113,7 @@ class NoiseLevels(BaseModel):
 
     @property
     def supported_alarms(self) -> float:
-        """Lowest rate of false alarms that can be estimated from the training logs: one in their duration [1/min]."""
+        """Lowest rate of false alarms that the training logs suffice for: one alarm in their total duration [1/min]."""
         return 1 / self.minutes
 
     def contact_thresholds(self, alarms_per_minute: float) -> np.ndarray:
@@ -125,10 +125,10 @@ class NoiseLevels(BaseModel):
         return np.stack([moving, moving + self.resting], axis=1)
 
     def resting_torque(self, qd: np.ndarray) -> np.ndarray:
-        """Return the bound of the friction error near standstill, (..., n) [Nm, N], at velocities qd, (..., n).
+        """Return the additional contact threshold near standstill, (..., n) [Nm, N], at velocities qd, (..., n).
 
-        A contact threshold is the sum of this bound and a multiple of the standard deviation of the noise (see
-        `thresholds`).
+        It bounds the friction error near standstill. A contact threshold is the sum of this bound and a multiple of the
+        standard deviation of the noise (see `thresholds`).
         """
         return np.asarray(self.resting * np.exp(-np.abs(qd) / self.resting_speed))
 
@@ -140,11 +140,11 @@ class NoiseLevels(BaseModel):
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
-        Peaks (see the class) above `peak_start` have an exponential distribution, whose scale is estimated from m =
-        `peak_count` peaks. With the prior density 1 / scale of the uncertain scale, a peak above `peak_start` exceeds
-        it by more than x with the probability (1 + x / (m `peak_scale`))^-m. The threshold, at least 1, is `peak_start`
-        + x, with the x for which this probability times `tail_peaks`, the rate of peaks above `peak_start` [1/min], is
-        the rate of false alarms.
+        Peaks (see the class) above `peak_start` have an exponential distribution. Its scale is uncertain, because it is
+        estimated from m = `peak_count` peaks. With the prior density 1 / scale, the probability that a peak above
+        `peak_start` also exceeds `peak_start` + x is p(x) = (1 + x / (m `peak_scale`))^-m. There are `tail_peaks` such
+        peaks per minute. The threshold is `peak_start` + x, at least 1, where x solves
+        `tail_peaks` p(x) = `alarms_per_minute`.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].
         """

@@ -1,10 +1,10 @@
 """Estimate of a physically consistent payload, or of "no payload", from the state of the payload filter.
 
-The payload filter gives a Gaussian of the ten inertial parameters theta. Without the filter's prior, it is the
-likelihood of theta. The prior of a payload is a Wishart distribution of the pseudo-inertia with 6 degrees of freedom.
-The negative log posterior is then convex, and its minimum is physically consistent (Wensing, Kim and Slotine, IEEE RA-L
-3:60, 2018). Priors whose means have different masses are compared with "no payload" by Laplace's approximation of the
-evidence (MacKay, Neural Computation 4:415, 1992).
+The payload filter gives a Gaussian of the ten inertial parameters theta. Divided by the filter's prior, this Gaussian
+is the likelihood of theta. It is combined with another prior, a Wishart distribution of the pseudo-inertia with 6
+degrees of freedom. The negative log posterior is then convex, and its minimum is physically consistent (Wensing, Kim
+and Slotine, IEEE RA-L 3:60, 2018). Several priors with different mean masses are used. The hypotheses "payload" and "no
+payload" are compared by Laplace's approximation of the evidence (MacKay, Neural Computation 4:415, 1992).
 """
 
 import math

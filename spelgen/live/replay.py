@@ -91,7 +91,7 @@ class LogEstimate:
         lines += [f"  a payload was reported first at {at:.1f} s" for at in reports]
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
         for event in self.contacts:
-            # Until its report, a payload is an external torque.
+            # The torque of a payload that is not reported yet counts as an external torque and looks like a contact.
             is_load = any(event.begin < at < event.end + TUNING.merged for at in (*reports, *self.changes))
             name = "load before its report" if is_load else "contact"
             pairs = zip(event.joints, event.torques, strict=True)
@@ -123,7 +123,10 @@ def payload_content(payload: Payload) -> dict[str, object]:
 
 
 def payload_sentence(payload: Payload) -> str:
-    """Return a text for users: mass and centre of mass of a payload with 95 % intervals, or its mass limit."""
+    """Return a text for users: mass and centre of mass of a payload with 95 % intervals.
+
+    Without a reported payload, the text has the upper limit of its mass instead.
+    """
     if payload.status == "payload":
         low, high = payload.mass_interval
         center = ", ".join(
@@ -189,14 +192,14 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     """Return the indices of the samples at which the load changes.
 
-    Each sample with `load_changed` is returned, except for a change between two loads that are both no payload: the
-    status before it is not "payload", and the status after it is "no payload". Such loads differ by less than the
-    errors of the model.
+    All samples with `load_changed` are returned, with one exception: if no payload was reported before a change, and
+    the status after it is "no payload", the two loads differ by less than the errors of the model.
 
     states: estimates after each sample of a log.
     """
     changed = [k for k, state in enumerate(states) if state.load_changed]
-    # Each segment ends with the sample before the next change; its last estimate is the most certain one.
+    # The changes divide the log into segments of constant load. The last estimate of a segment uses all its samples and
+    # is the most accurate.
     ends = [*(k - 1 for k in changed), len(states) - 1]
     reports = [states[end].payload.status for end in ends]
     return [

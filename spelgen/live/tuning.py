@@ -52,11 +52,11 @@ class LiveTuning:
     # range. It is larger, because samples are averaged in blocks, and the errors in a block are correlated.
     uncertainty: float = 3.0
 
-    # [1] Fraction of the variance of torque errors that recurs if the motion recurs. More motion does not reduce this
-    # part: it is the lower bound of the variance of the torque of the estimated payload, divided by the variance of
-    # torque errors. Without this bound, the squared error of the payload estimated for an arm without payload, divided
-    # by its variance, grows in proportion to the time, to 20 after ten minutes of repeated logs of a UR10e. With 0.03,
-    # 20 minutes of repeated logs of other arms give payloads of 6 to 60 g.
+    # [1] Fraction of the variance of torque errors that is the same in each repetition of a motion, and is therefore
+    # not averaged out by more motion. The variance of the torque of the estimated payload has a lower bound: this
+    # fraction times the variance of torque errors. Without the bound, the normalised squared error of a payload that is
+    # estimated for an arm without payload increases with time, to 20 after ten minutes of repeated logs of a UR10e.
+    # With 0.03, 20 minutes of repeated logs of other arms give payloads of 6 to 60 g.
     recurring: float = 0.1
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
@@ -81,20 +81,20 @@ class LiveTuning:
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
     # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
-    # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt, with the
-    # bandwidth of the observer and with twice this bandwidth. The estimates lag by 1 / bandwidth and half of this, so
-    # 0.5 times their difference is the error for a lag of torques of 1 / (4 bandwidth) = 12 ms.
+    # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt: one with
+    # the bandwidth B of the observer, one with 2 B. The first estimate lags by 1 / B and the second by 1 / (2 B), so
+    # their difference is the error for torques that lag by 1 / (2 B). `jerk` = 0.5 assumes half this lag, 12 ms.
     jerk: float = 0.5
-    # [s] Time constant of the recent level of the residual (`ContactObserver.level`), and [1] upper limit of its
-    # squares. In recordings of an AIRBOT, whose first joint vibrates at 6 Hz in some motions, 73 % of the contacts of
-    # 10 % of the effort limit are detected within 150 ms, and 60 % without the level, at the same rate of false alarms.
+    # [s] Time constant of `ContactObserver.level`, and [1] upper limit of the squared residuals of which it is the
+    # mean. In recordings of an AIRBOT, the first joint vibrates at 6 Hz in some motions. Of the contacts with 10 % of
+    # the effort limit, 73 % are detected within 150 ms; without the level 60 %, at the same rate of false alarms.
     level: float = 0.5
     level_limit: float = 4.0
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
     # that logs without noise give positive thresholds.
     min_observer_noise: float = 1e-3
-    # [s] Time constant with which the estimated disturbance is subtracted from the external torque. Contacts are
-    # detected in less time, so that the disturbance does not absorb them.
+    # [s] Time constant of the low-pass filter of the estimated disturbance, which is subtracted from the external
+    # torque. Contacts are detected in less time, so that they are not subtracted with the disturbance.
     baseline: float = 0.3
     # [1] Smallest factor by which thresholds from the training logs are multiplied, because the errors of a model are
     # larger on other days.
@@ -122,9 +122,9 @@ class LiveTuning:
     payload_odds: float = -5.0
     no_payload_odds: float = 3.0
 
-    # [1] A payload is reported first if the mean normalised squared residual of the payload filter
-    # (`PayloadEstimate.misfit`) is at most `misfit`, since a payload explains the torques of a contact badly. On a
-    # UR10e it is 0.5 to 2.2 when a payload is found, and 3.7 to 59 when a contact would be reported as a payload.
+    # [1] A new payload is reported only if the mean normalised squared residual of the payload filter
+    # (`PayloadEstimate.misfit`) is at most `misfit`. A contact gives larger residuals, since no payload explains its
+    # torques. On a UR10e the residual is 0.5 to 2.2 with a payload, and 3.7 to 59 with a contact.
     misfit: float = 3.0
 
     # [1] Degrees of freedom of the Wishart prior of the payload's pseudo-inertia.
@@ -153,9 +153,9 @@ class LiveTuning:
     # have too few trials for an estimate.
     prior_variance: float = 2.25
     prior_trials: int = 4
-    # [1] The grid of the noise of the momentum observer near standstill, s^2 (1 + (r exp(-|qd| / v))^2)
-    # (`live.levels`): velocity scales v divided by the largest speed, and ratios r of additional noise at rest to noise
-    # s in motion.
+    # [1] The noise variance of the momentum observer at the velocity qd is s^2 (1 + (r exp(-|qd| / v))^2). Grid of its
+    # parameters (`live.levels`): velocity scales v divided by the largest speed, and ratios r between the additional
+    # noise at rest and the noise s in motion.
     resting_speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     resting_ratios: tuple[float, ...] = (0, 1, 2, 4, 8, 16)
 

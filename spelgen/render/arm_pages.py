@@ -51,7 +51,10 @@ def inspection_page(
 
 
 def motion_page(excitation: Excitation, arm: Arm) -> str:
-    """Return the page about a proposed motion of `arm`, including the approach to its first position."""
+    """Return the page about a proposed motion of `arm`, including the approach to its first position.
+
+    excitation: the proposed motion and the approach.
+    """
     motion = excitation.approach.then(excitation.motion)
     # Charts subsample their lines, but the animation shows every point. Therefore the motion is subsampled here.
     # `step` is rounded up, so that at most 2 * TUNING.points points remain.

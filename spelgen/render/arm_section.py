@@ -71,7 +71,10 @@ class AnimatedArm:
 
 
 def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
-    """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M."""
+    """Return the table of the mass matrix M for a page: n rows of n cells, one cell per entry of M.
+
+    structure: zero, constant and varying entries of M.
+    """
     # `spelgen inspect` prints the same facts, so that pages and the terminal give the same explanation of an entry.
     every_fact = facts(arm, structure)
     cells = {}
@@ -84,7 +87,7 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
 
 
 def _explanation(entry: MassEntry, every_fact: Sequence[Fact]) -> str:
-    """Return the explanation of an entry of M: the joints that it depends on, and the facts that mention it."""
+    """Return the explanation of an entry of M: its joints, and the facts about the entry among ``every_fact``."""
     name = entry_name(entry.row, entry.column)
     predicates = {"zero": "is always zero", "constant": "is constant"}
     default = f"depends on {joints_in_ranges(entry.joints)} only"
@@ -101,7 +104,7 @@ def _explanation(entry: MassEntry, every_fact: Sequence[Fact]) -> str:
 def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) -> AnimatedArm:
     """Return the animated picture of an arm with the given motions.
 
-    Without motions the arm moves through its joint ranges.
+    Without motions the arm moves through its joint ranges. urdf: URDF with the shapes of the links.
     """
     shapes = scene(urdf, arm.joint_names)
     motions = motions or [_sweep(arm)]
@@ -110,9 +113,10 @@ def arm_section(arm: Chain, urdf: Path, motions: Sequence[AnimatedMotion] = ()) 
 
 
 def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
-    """Return the animated motions of an evaluation: predicted motions, then the motions with a torque residual.
+    """Return the animated motions of an evaluation: predicted motions, then measured motions with predicted torques.
 
-    The colour of a link shows the position error of a predicted motion, or the torque residual.
+    The colours of the links show the errors of the predicted positions, or of the predicted torques. traces: curves of
+    the evaluation.
     """
     motions = []
     for example in traces.trajectories:
@@ -132,8 +136,8 @@ def evaluated_motions(traces: Traces) -> list[AnimatedMotion]:
 def _colour(error: np.ndarray) -> np.ndarray:
     """Return colours (T, n) of the links of the animated arm, as numbers, for relative errors (T, n) of its joints.
 
-    A colour is proportional to the magnitude of the error; 1: an error of 0.5. Position errors are divided by the
-    extent of the motion, torque residuals by the standard deviation of the torque, see `evaluated_motions`.
+    A colour is |error| / 0.5: an error of 0.5 has the colour 1. The errors are position errors divided by the extent
+    of the motion, or torque residuals divided by the standard deviation of the torque (see `evaluated_motions`).
     """
     return np.asarray((np.abs(error) / 0.5).round(3))
 

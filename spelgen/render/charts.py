@@ -109,7 +109,7 @@ class Line:
         return _floats(self.y)
 
     def path(self, x_axis: Axis, y_axis: Axis) -> str:
-        """Return the curve as an SVG path: its segments between gaps, rounded to tenths of a pixel."""
+        """Return the curve in these axes as an SVG path: its segments between gaps, rounded to tenths of a pixel."""
         x, y = _floats(self.x), _floats(self.y)
         # The drawn samples are evenly spaced and include the last sample, so that the line ends at the last value.
         rows = np.linspace(0, len(x) - 1, min(len(x), TUNING.points)).round().astype(int)
@@ -260,13 +260,16 @@ def _spaced(pixels: np.ndarray) -> str:
 
 
 def _shown(columns: Sequence[np.ndarray], positive: bool) -> np.ndarray:
-    """Return the finite values of several arrays as one vector; if `positive`, only the positive values."""
+    """Return the finite values of all arrays in `columns` as one vector; if `positive`, only the positive values."""
     values = np.concatenate([np.zeros(0), *columns])
     return np.asarray(values[np.isfinite(values) & ((values > 0) | (not positive))])
 
 
 def _axis(values: np.ndarray, start: float, end: float, *, pad: float, log: bool) -> Axis:
-    """Return an axis for values (T,), from `start` to `end` [pixels], with margins of `pad` times the range."""
+    """Return an axis for values (T,), from `start` to `end` [pixels], with margins of `pad` times the range.
+
+    log: whether the axis is logarithmic.
+    """
     low, high = float(values.min()), float(values.max())
     if log:
         low = max(low, high * 10.0**-TUNING.decades)

@@ -32,7 +32,10 @@ def write_estimate(fit: Fit, levels: NoiseLevels, results: Sequence[LogEstimate]
 
 
 def mass_chart(result: LogEstimate) -> Chart | None:
-    """Return the chart of payload mass over time, with its interval; None if no payload was found."""
+    """Return the chart of payload mass over time, with its 95 % interval; None if no payload was found.
+
+    result: estimates along a log.
+    """
     mass = np.array([state.payload.mass for state in result.states])
     # Without a payload there is no chart, since a line of zeros would suggest a measured mass.
     if not mass.any():
@@ -52,7 +55,8 @@ def mass_chart(result: LogEstimate) -> Chart | None:
 def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
     """Return two charts per joint: external torque with the thresholds of contact, and friction drift [%].
 
-    The friction drift is the relative difference between the estimated friction and the friction of the model.
+    The friction drift is the relative difference between the estimated friction and the friction of the model. fit: fit
+    of the model with which the estimates were made. result: estimates along a log.
     """
     contacts = [state.contact for state in result.states]
     threshold = np.array([contact.threshold for contact in contacts])

@@ -159,7 +159,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
 
 
 def _with_units(values: Sequence[float], unit: str, joint_types: Sequence[str]) -> list[str]:
-    """Return the text of one value per joint, such as "0.12 Nm".
+    """Return the text of each of `values`, one per joint, with its unit, such as "0.12 Nm".
 
     unit: format string, such as "{0.torque}", whose argument is the entry of `UNITS` for the type of the joint.
     """

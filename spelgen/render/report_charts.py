@@ -33,7 +33,10 @@ def style(predictor: str) -> str:
 
 
 def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
-    """Return {section of the report: charts}; the value is None or empty if the evaluation has no curves for it."""
+    """Return {section of the report: charts}; None or empty for a section without curves in the evaluation.
+
+    traces: curves of the evaluation. spec: specification of the model, with names and types of the joints.
+    """
     joints = named_joints(spec.joint_names, spec.joint_types)
     # Every section has a value, None by default, because an undefined name is an error in the template.
     drawn = dict.fromkeys(("growth", "mass", "friction"))
@@ -54,9 +57,10 @@ def evaluation_charts(traces: Traces, spec: ModelSpec) -> dict[str, object]:
 
 
 def _motion_title(example: PredictedMotion, spec: ModelSpec) -> str:
-    """Return the title of the charts of a predicted motion or a replayed log.
+    """Return the title of the charts of ``example``, a predicted motion or a replayed log.
 
-    It states the relative error of a prediction, or the RMS position error of a replayed log [mrad, mm].
+    It states the relative error of a prediction, or the RMS position error of a replayed log [mrad, mm]. spec:
+    specification of the model, with the types of the joints.
     """
     which = example.which.capitalize()
     if example.start is None:
@@ -147,7 +151,10 @@ def mass_panels(trace: MassTrace, joint_types: Sequence[str]) -> list[Panel]:
 
 
 def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
-    """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model."""
+    """Return the chart of training and validation loss over the epochs, with a line at the epoch of the best model.
+
+    metrics: epoch, training loss and validation loss of each epoch. best_epoch: epoch of the best model.
+    """
     columns = [(record["epoch"], record["loss"], record["validation"]) for record in metrics]
     epochs, *losses = array(columns).T
     # The vertical line at the best epoch extends from the smallest to the largest loss: on a logarithmic axis it cannot
@@ -164,7 +171,8 @@ def loss_chart(metrics: Sequence[Content], best_epoch: int) -> Chart:
 def torque_panels(trace: TorqueTrace, joints: Sequence[NamedJoint]) -> list[Panel]:
     """Return the charts of each joint along a trajectory: torque, residual, and terms of the model's torque.
 
-    The chart of the torque shows the measured and the predicted torque.
+    The chart of the torque shows the measured and the predicted torque. trace: torques along the trajectory. joints:
+    names and units of the joints.
     """
     measured, predicted = trace.measured, trace.predicted[MODEL]
     curves = [("measured", measured, "truth"), ("predicted", predicted, "predicted")]

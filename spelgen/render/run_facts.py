@@ -46,7 +46,7 @@ def training_facts(fit: Fit) -> dict[str, str]:
         "validation logs": _names(record.validation),
         "filter": f"{preprocessing.cutoff:g} Hz, zero phase" if preprocessing.filtered else "none",
     }
-    # A fit to torques uses single samples.
+    # Only fits to windows have a number of windows. A fit to torques uses single samples.
     if record.objective != "torque":
         facts["windows"] = (
             f"{record.training_windows:,} for training, {record.validation_windows:,} for validation"
@@ -78,7 +78,8 @@ def _names(trajectories: Sequence[str]) -> str:
 def commands(run: RunFolder, spec: ModelSpec, record: Record) -> list[str]:
     """Return the commands of a shell that reproduce a run, for its page.
 
-    The run does not record the paths of its logs, so the commands contain the placeholder LOGS.
+    The run does not record the paths of its logs, so the commands contain the placeholder LOGS. spec: specification of
+    the model. record: options and results of the training.
     """
     # Options of `spelgen build` with default values are omitted, to keep the command short.
     options = asdict(spec.options)
@@ -101,7 +102,7 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record) -> list[str]:
     options |= record.options | asdict(record.preprocessing)
     for key, value in _changed(options, defaults).items():
         train += f" --set {shlex.quote(f'{key}={value}')}"
-    # A mapping in the run folder has replaced the mapping in the settings of the robot, so the command must specify it.
+    # If the run folder contains a mapping, the run used it in place of the mapping in the settings of the robot.
     if run.mapping.exists():
         train += f" --mapping RUN/{run.mapping.name}"
     return [f"{build} -o module.py", train, "spelgen evaluate RUN2 --data LOGS", "spelgen report RUN2"]

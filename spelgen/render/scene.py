@@ -128,7 +128,7 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
     """Return the names of the links that the animated picture of an arm shows, parents first.
 
     The picture shows the links from the root to each of the `joints`, all links that move with the joints, and links
-    that are fixed to another shown link.
+    that are fixed to another shown link. robot: the URDF with all its links.
     """
     leading = {joint.name for name in joints for joint in robot.path_to(robot.joint[name].child)}
     carried = set()
@@ -146,8 +146,9 @@ def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
 def _tubes(robot: Robot, name: str, names: Sequence[str], radius: float) -> Shape:
     """Return the shape of a link without meshes: tubes from the link's origin to its child joints.
 
-    A last link has a tube to its centre of mass. The joint of the link is drawn as a drum about its axis. names: the
-    drawn links. radius: radius of the tubes [m].
+    A link without child joints has a tube to its centre of mass. The joint of the link is drawn as a drum about the
+    joint axis. robot: the URDF. name: name of the link. names: names of all drawn links. radius: radius of the tubes
+    [m].
     """
     joint, inertial = robot.joint_above.get(name), robot.link[name].inertial
     below = [joint for joint in robot.joints_below[name] if joint.child in names]

@@ -14,17 +14,17 @@ from spelgen.runtime.rows import Joint, Link, vector
 class ChainConfiguration(NamedTuple):
     """Configuration cache of ``BodyChain``: its quantities that depend on q only, in the base frame.
 
-    Four point masses suffice to represent a rigid body (see ``BodyChain``). Coordinates of a point, and
-    velocities computed from them, are multiplied by the square root of its mass: products of two such
-    factors are second moments and energies.
+    Four point masses represent a rigid body (see ``BodyChain``). Coordinates and velocities of a point
+    mass are multiplied by the square root of its mass. The product of two such coordinates is a second
+    moment of mass, and the product of two such velocities is twice a kinetic energy.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
     mass: Tensor  # sqrt(mass) of the point masses in `place`, (..., 1, B bodies, 4 points) [kg^(1/2)]
     axes: Tensor  # twist of each body relative to its parent per unit joint rate, (..., 6, B bodies)
-    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each body,
-    # times sqrt(mass), (..., B, 12 B). A body has 3 coordinates of each of its 4 point masses: coordinate,
-    # body and point are the order of the 12 B entries.
+    # Derivatives of the coordinates of all point masses with respect to the joint displacement of each
+    # body, times sqrt(mass), (..., B, 12 B). The last axis is a flattened array (3 coordinates, B bodies,
+    # 4 point masses).
     jacobian: Tensor
     # Minus the acceleration of gravity, times sqrt(mass), for 3 coordinates of 4 point masses of each of
     # B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
@@ -35,11 +35,12 @@ class BodyChain(nn.Module):
     """A tree of bodies: each rotates about or translates along an axis of the body or base that carries it.
 
     Twists are (angular, linear) in the base frame (Featherstone, Rigid Body Dynamics Algorithms, 2008);
-    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four point
-    masses that have the same pseudo-inertia P: the columns (position, 1) * sqrt(mass) of a matrix Q with Q
-    Q^T = P. Only the frames are computed recursively. A sum over the bodies that a joint carries, or over the
-    joints that carry a body, is one product with a matrix of zeros and ones: for small arms the time depends
-    on the number of tensor operations, not on their size.
+    frames are 4 x 4 matrices (Uicker, J. Appl. Mech. 34:418, 1967). Each body is represented by four
+    point masses that have the same pseudo-inertia P: the columns (position, 1) * sqrt(mass) of a matrix Q
+    with Q Q^T = P. Only the frames are computed recursively. Sums over the bodies that a joint carries,
+    or over the joints that carry a body, are computed as one product with a matrix of zeros and ones.
+    This is fast for small arms, for which the time depends on the number of tensor operations and not on
+    their size.
     """
 
     def __init__(
@@ -65,8 +66,9 @@ class BodyChain(nn.Module):
         rate[:, 1, 0], rate[:, 0, 1], rate[:, 2, 3] = turns, -turns, 1 - turns
         first, second = (start @ rate).flatten(1), (start @ rate @ rate).flatten(1)
         by_feature = [-second, turns.unsqueeze(-1) * first, (1 - turns).unsqueeze(-1) * first]
-        # The 4 x 4 frame of each body relative to its parent is linear in cos, sin and value of the joint
-        # displacement: `table`, (16 bodies, 3 bodies), has the coefficients and `fixed` the constant terms.
+        # For the joint displacements x of all bodies, the 4 x 4 frames of the bodies relative to their
+        # parents are linear in cos x, sin x and x. `table`, (16 bodies, 3 bodies): coefficients; `fixed`:
+        # constants.
         blocks = [torch.ops.aten.block_diag([*x.unsqueeze(-1)]) for x in by_feature]
         self.table = nn.Buffer(torch.cat(blocks, dim=1))
         self.fixed = nn.Buffer((start.flatten(1) + second).flatten())
@@ -123,14 +125,17 @@ class BodyChain(nn.Module):
     def motion(self, cache: ChainConfiguration, qd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return velocities of bodies and point masses (see the class) at qd, (..., n) [rad/s, m/s].
 
+        cache: configuration cache at q.
+
         Returns:
             velocities of the four point masses of each body times sqrt(mass), (..., 3, bodies, 4); twists
             of the bodies, (..., 6, bodies); time derivatives of the joint axes, (..., 6, bodies)
             (Featherstone, eq. 2.31).
         """
         rates = qd @ self.ratios.mT
-        # Sums over the joints that carry a body: the Jacobian is zero for other joints, and twists are
-        # multiplied by the mask `carriers`, (bodies, bodies).
+        # The velocity of a body is the sum of the contributions of the joints that carry the body. The
+        # Jacobian is zero for all other joints; in the sum of twists, the mask `carriers`, (bodies,
+        # bodies), excludes them.
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
@@ -139,12 +144,12 @@ class BodyChain(nn.Module):
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
     def accelerations(self, cache: ChainConfiguration, qd: Tensor) -> Tensor:
-        """Return sqrt(mass) (a - g) of the point masses that represent the bodies, with a at qdd = 0.
+        """Return sqrt(mass) (a - g) of the point masses of the bodies, at joint accelerations qdd = 0.
 
-        a is the acceleration of a point mass and g the vector of gravity. ``cache.jacobian`` times the
-        returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body.
-        ``ratios``, (bodies, n), transposed maps this torque to the n joints: it adds mimic joints to
-        their leaders.
+        a is the acceleration of a point mass and g the acceleration of gravity. ``cache.jacobian`` times
+        the returned vector is the Coriolis, centrifugal and gravity torque at the joint of each body. The
+        product of ``ratios``^T, (n, bodies), and this torque is the torque of the n joints, in which the
+        torques of mimic joints are added to their leaders.
 
         Args:
             cache: configuration cache at q.
@@ -247,8 +252,9 @@ class InertialParameters(nn.Module):
         row, column = torch.triu_indices(4, 4)
         self.triangle = nn.Buffer(torch.eye(16, dtype=torch.float64)[4 * row + column])
         pseudo = torch.stack([pseudo_inertia(link) for link in links])
-        # The upper triangular C with C C^T is needed; torch computes only L L^T, with lower L, and U^T U.
-        # C is the L of the matrix with rows and columns in reverse order, reversed again.
+        # An upper triangular C with C C^T = P is needed, but torch computes L L^T with a lower triangular
+        # L. Therefore the rows and columns of P are reversed, L is computed, and its rows and columns are
+        # reversed.
         self.factors = nn.Buffer(torch.linalg.cholesky(pseudo.flip(-1, -2)).flip(-1, -2))
         self.raw = nn.Parameter(torch.zeros(len(links), 10, dtype=torch.float64))
 

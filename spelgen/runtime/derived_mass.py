@@ -78,8 +78,9 @@ class ConstantMass(LinearMass):
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return M, (..., n, n), and as intermediate values the encoding of q, (..., 2 n), unchanged.
 
-        M comes from the parameter cache ``parameters``, (n, n), and is expanded to the batch of the encoding.
-        ``kinetic_vjp`` uses only the shape of the encoding, because the derivatives of M are zero.
+        M is the parameter cache ``parameters``, (n, n), expanded to the batch dimensions of ``encoded``,
+        the encoding of q. The derivatives of M are zero, so ``kinetic_vjp`` uses only the shape of the
+        encoding.
         """
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
@@ -100,14 +101,14 @@ class DerivedMass(LinearMass):
     the emitted module that places functions and constants in the matrix; the functions are outputs of
     ``network``.
 
-    If M is not clearly positive definite, it is moved towards a constant matrix C = L L^T. C is
-    ``entries`` with the nominal mean of each function (``Function.mean``) and the initial constants,
-    without armature. The result is M' = C + t (M - C), which is positive definite for all q and all
-    parameters. The factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin``
-    is below 1. Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X|
-    is an upper bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives
-    of M' are t times the derivatives of M. The zeros of M and the linear relations between entries of M
-    are valid for C, and therefore for M', too.
+    For some q and parameters M may be indefinite. The model therefore uses M' = C + t (M - C), which is
+    positive definite for all q and all parameters. C = L L^T is a constant matrix: ``entries`` with the
+    nominal mean of each function (``Function.mean``) and the initial constants, without armature. The
+    factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin`` is below 1.
+    Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X| is an upper
+    bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives of M' are t
+    times the derivatives of M. The zeros of M and the linear relations between entries of M are valid for
+    C, and therefore also for M'.
     """
 
     def __init__(
@@ -129,10 +130,9 @@ class DerivedMass(LinearMass):
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # The norm |X| of the class is the Frobenius norm of D X D, with D = diag(C)^(-1/2), divided by
-        # the smallest eigenvalue of D C D. It is an upper bound of the spectral norm of L^-1 X L^-T, with
-        # C = L L^T. `unit`, (n, n), has all factors: the Frobenius norm of the elementwise product of
-        # `unit` and X is |X| / (1 - margin).
+        # |X| of the class is computed as ||D X D||_F / (smallest eigenvalue of D C D), D =
+        # diag(C)^(-1/2). `unit`, (n, n), contains the factors of the entries of X, so that |X| / (1 -
+        # margin) is the Frobenius norm of the elementwise product of `unit` and X.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -269,8 +269,9 @@ class DenseMass(nn.Module):
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n), see the class.
+        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n).
 
+        M is a block of the large matrix; C, U and e are defined in the class.
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
@@ -278,8 +279,9 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return U without its unit diagonal, (..., 3 n, 3 n), and e, (..., 3 n), see the class.
+        """Return the lower triangular factor U without its unit diagonal, and the diagonal factor e.
 
+        The shapes are (..., 3 n, 3 n) and (..., 3 n). M is computed from both factors (see the class).
         raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and softplus^-1(e).
         """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
@@ -331,7 +333,10 @@ class DenseMass(nn.Module):
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n)."""
+        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+
+        intermediates: second result of ``forward`` at q.
+        """
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)

@@ -107,11 +107,11 @@ class FrictionLaws(nn.Module):
 
     A joint has K bristles: elements that are elastic up to a break-away displacement and slide beyond it,
     with displacements z, (..., n, K) [rad, m] (Maxwell-slip elements: Lampaert, Al-Bender and Swevers, A
-    Generalized Maxwell-Slip Friction Model, 2003). They may return their elastic energy. Reversals within the
-    break-away displacement give closed hysteresis loops, so a joint that is held by stiction does not creep
-    under an oscillating load. The factor ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k
-    over the bristles of the joint. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or
-    if z is unknown.
+    Generalized Maxwell-Slip Friction Model, 2003). Reversals within the break-away displacement give
+    closed hysteresis loops, so that the position of a joint in stiction does not drift under an
+    oscillating load. The factor ``direction``, from -1 to 1, is sum_k fraction_k z_k / breakaway_k over
+    the bristles of the joint. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if
+    z is unknown.
 
     The trained parameters are logarithms of the constants, and logits of the bristle fractions. For large r
     the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction,
@@ -119,9 +119,9 @@ class FrictionLaws(nn.Module):
     rest. Powers replace exponentials, so that a control loop takes a third of the time.
     """
 
-    # (name, group, unit of the constant, initial value of the constant) of each trained parameter.
-    # Initial values are in units of the joint's typical friction and typical speed; a constant has its
-    # initial value if its parameter is zero.
+    # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Fits
+    # select parameters by group. Initial values are in units of the joint's typical friction and typical
+    # speed. A constant has its initial value if its parameter is zero.
     parameter_groups: tuple[tuple[str, str, str, float], ...] = (
         ("raw_viscous", "sizes", "Nm s/rad, N s/m", 1.0),
         ("raw_saturation", "effects", "Nm, N", 1.0),
@@ -199,7 +199,8 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        # `reach` is empty, (n, 0), since there are no bristles.
+        # Without bristles there are no fractions to train: the parameter is replaced by an empty buffer,
+        # (n, 0).
         self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:

@@ -15,7 +15,7 @@ class MotorInputs(nn.Module):
     """A constant input matrix G, (n, n): entry (i, j) is the torque of joint i per input of motor j.
 
     Motors may drive several joints (couplings). A joint without a motor is passive: its row of G is zero. A
-    trained gain is a positive factor of the given entry, so training cannot change the sign of an entry.
+    trained entry is its initial value times a positive factor, so training cannot change its sign.
 
     Args:
         gains: rows of G, with the initial values of trained entries.
@@ -151,9 +151,9 @@ class PositionServo(nn.Module):
 
 
 def beyond(distance: Tensor, dead_zone: Tensor) -> Tensor:
-    """Return the distances that exceed a dead zone, (..., n): x - dead_zone above it, x + dead_zone below it.
+    """Return the parts of distances x beyond a dead zone, (..., n), with the signs of the distances.
 
-    The result is 0 within the dead zone.
+    The result is x - dead_zone above the dead zone, x + dead_zone below it, and 0 within it.
 
     Args:
         distance: signed distances x from the middle of the dead zone, (..., n) [rad, m].

@@ -30,10 +30,10 @@ class NetworkDynamics(PortHamiltonian):
 
     Args:
         joints: joints of the arm.
-        mass: M(q).
+        mass: mass matrix M(q), see ``Mass``.
         potential: network of V / potential_scale, with the encoding of q as input.
         potential_scale: unit of V [J].
-        friction: D(q, qd).
+        friction: dissipation matrix D(q, qd), see ``NetworkFriction``.
         inputs: constant input matrix G; None: each input drives its own joint.
     """
 
@@ -139,11 +139,17 @@ class DenseInputDynamics(NetworkDynamics):
         return torch.diag_embed(self._gains(self.at(q)))
 
     def input_force(self, cache: NetworkConfiguration, qd: Tensor, tau: Tensor) -> Tensor:
-        """Return the joint torques G(q) tau of the inputs tau, (..., n) [Nm, N]; qd has no effect."""
+        """Return the joint torques G(q) tau of the inputs tau, (..., n) [Nm, N]; qd has no effect.
+
+        cache: configuration cache at q.
+        """
         return self._gains(cache) * tau
 
     def input_torque(self, cache: NetworkConfiguration, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G(q) tau = force, for joint torques force, (..., n)."""
+        """Return the inputs tau, (..., n), that solve G(q) tau = ``force``, (..., n) [Nm, N].
+
+        force: joint torques. cache: configuration cache at q.
+        """
         return force / self._gains(cache)
 
 
@@ -210,7 +216,8 @@ class JointFriction(NetworkFriction):
     ) -> Tensor:
         """Return D(q, qd) times ``right``, (..., n, columns), with the dissipation matrix D, (..., n, n).
 
-        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s].
+        encoded: encoding of q, (..., 2 n). qd: velocities, (..., n) [rad/s, m/s]. parameters: parameter
+        cache.
         """
         layers, viscous, smoothing = parameters
         smooth_speed = torch.sqrt(qd * qd + smoothing)
@@ -224,10 +231,10 @@ class JointFriction(NetworkFriction):
 class DenseFriction(NetworkFriction):
     """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
 
-    L, (axes n, axes n), is lower triangular with ``axes`` rows per joint: 1, or 3 for the axes of the
-    joint frame as in the model of Duong et al. (IEEE T-RO 40:3695, 2024). A joint rotates about or moves
-    along its last axis only, so only the row of the last axis of each joint is computed: the result is D,
-    (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
+    L is a lower triangular matrix. It has one row per joint (``axes`` = 1), or one row per axis of each
+    joint frame (``axes`` = 3, the model of Duong et al., IEEE T-RO 40:3695, 2024). A joint moves only
+    about or along its last axis, so only the row of this axis is computed for each joint, (n, axes n),
+    and D is (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:

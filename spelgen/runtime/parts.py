@@ -48,7 +48,7 @@ class Mass(Protocol):
 
 def applied(matrix: Tensor, vector: Tensor) -> Tensor:
     """Return the product of a matrix, (..., n, m), and a vector, (..., m)."""
-    # For one state (a vector) the product is a single operation; for a batch, two reshapes are added.
+    # A single vector needs no reshapes, which a batch of vectors needs before and after the product.
     if vector.dim() == 1:
         return matrix @ vector
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)

@@ -64,7 +64,7 @@ class PortHamiltonian(nn.Module):
 
         Args:
             q: positions, (..., n), or a configuration cache, which is returned unchanged.
-            others: other vectors of the caller, such as qd and tau, (..., n); only their dtype and shape are
+            others: further vectors, such as qd and tau, (..., n), of which only dtype and shape are
                 checked.
             prepared: parameter cache that ``prepare`` returned; None: the method calls ``prepare``.
         """

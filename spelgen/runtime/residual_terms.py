@@ -116,13 +116,13 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
-        # R is linear in its functions and constants. `inverse`, (functions + constants, n, n): 1 /
-        # |coefficient| of each function and constant in each entry of R, of which `bounds` computes the
-        # minimum. 1e30 for a zero coefficient has no influence on the minimum.
+        # `inverse`, (functions + constants, n, n): 1 / |coefficient| of each function and constant in
+        # each entry of R. `bounds` computes minima over the entries; 1e30 for a coefficient of zero has
+        # no influence on the minima.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. The terms in a row of R (function or constant, times
-        # its coefficient) have equal parts of this: `part` is 0.9 divided by the largest number of terms
-        # in a row.
+        # R may reduce the armature by at most 90 %. A term is a function or constant times its
+        # coefficient. Each term may reduce the armature by the fraction `part`: 0.9 / largest number of
+        # terms in a row of R.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
@@ -137,10 +137,10 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). A + R is
-        positive definite if no function or constant exceeds its bound: ``part`` (0.9 / largest number of
-        terms in a row of R) times the minimum of sqrt(d_i d_j) / |its coefficient in R_ij| over the
-        entries of R in which it occurs. d_i is 1 / (sum of row i of |A^-1|).
+        R is the residual term of M, linear in its functions and constants (see the class). The bound of a
+        function or constant with the coefficients k_ij in R_ij is part * min_ij sqrt(d_i d_j) / |k_ij|,
+        with ``part`` = 0.9 / (largest number of terms in a row of R) and d_i = 1 / (sum of row i of
+        |A^-1|). A + R is positive definite if no function or constant exceeds its bound.
 
         Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
         dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
@@ -238,8 +238,8 @@ class ResidualTerms(nn.Module):
     def nonlinear(self, cache: ResidualConfiguration, qd: Tensor) -> Tensor:
         """Return the contribution of residual terms to Coriolis, centrifugal and gravity torque, (..., n).
 
-        It is dR/dt qd [Nm, N], with the residual term R of M, minus d/dq (``gradient``) of the residual
-        terms of 1/2 qd^T M qd - V. cache: configuration cache at q. qd: velocities, (..., n).
+        It is dR/dt qd - g [Nm, N]. R is the residual term of M, and g, from ``gradient``, is d/dq of the
+        residual terms of 1/2 qd^T M qd - V. cache: configuration cache at q. qd: velocities, (..., n).
         """
         if self.mass is None or cache.slope is None:
             return -self.gradient(cache, qd)
@@ -292,7 +292,10 @@ class ResidualDynamics(RigidBodyDynamics):
         return prepared._replace(residual=self.residuals.prepare(prepared.armature))
 
     def configuration(self, q: Tensor, prepared: RigidParameters) -> RigidConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m], in which M includes the residual R(q)."""
+        """Return the configuration cache at q, (..., n) [rad, m], in which M includes the residual R(q).
+
+        prepared: cache from ``prepare``.
+        """
         cache = super().configuration(q, prepared)
         if self.residuals is None:
             return cache

@@ -17,7 +17,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """Parameter cache of ``RigidBodyDynamics``: quantities that depend on trained parameters only."""
 
-    points: Tensor  # point masses: block diagonal matrix of Q of ``BodyChain``, (4 bodies, 4 bodies)
+    points: Tensor  # block diagonal matrix of the point masses Q of each body (``BodyChain``), (4 B, 4 B)
     armature: Tensor  # rotor inertia on the joint side, added to M, (n, n)
     friction: FrictionConstants
     residual: Parameters = None  # parameter cache of the residual terms
@@ -235,7 +235,8 @@ class RigidBodyDynamics(PortHamiltonian):
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state, (..., n, K) [rad, m], after a joint displacement, (..., n) [rad, m].
 
-        z is the friction state before it. The result is exact for a displacement without reversals.
+        z is the friction state before the displacement. The result is exact for a displacement without
+        reversals.
         """
         moved = z + self._motor(displacement).unsqueeze(-1)
         return moved.clamp(-self.friction.reach, self.friction.reach)
@@ -244,5 +245,6 @@ class RigidBodyDynamics(PortHamiltonian):
         """Return the generalized force G (tau - b) + k qd of the inputs tau, (..., n) [Nm, N].
 
         G is the input matrix, b the torque offset of the sensors, k the friction compensation of the drives.
+        cache: configuration cache at q.
         """
         return super().input_force(cache, qd, tau - self.torque_offset) + self.friction_compensation * qd

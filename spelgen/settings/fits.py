@@ -70,10 +70,10 @@ class GaussianPrior(Group):
         shared_friction: Logarithm of a factor on all friction of all joints.
         friction_compensation: Torque per velocity with which a drive compensates friction, divided by typical friction
             per typical speed. It is fitted only if the logs, or implausible masses, indicate such a torque.
-        degrees_of_freedom: Not a standard deviation. If a standard deviation is estimated from fitted parameters, its
-            initial value has the weight of this number of further parameters. The standard deviation of each single
-            body is estimated with the same weight, so that the prior of its parameters is a Student-t distribution with
-            this number of degrees of freedom.
+        degrees_of_freedom: Not a standard deviation but a weight: in the estimate of a standard deviation, its initial
+            value has the weight of this number of fitted parameters. The standard deviation of each single body is
+            estimated with the same weight, so that the prior of its parameters is a Student-t distribution with this
+            number of degrees of freedom.
     """
 
     bodies: Positive = 0.75
@@ -107,7 +107,7 @@ class FitConfig(Group):
     @classmethod
     def _refuse_foreign(cls, options: object) -> object:
         for name in options if isinstance(options, Mapping) else ():
-            # An unknown option may be an option of other objectives, which the message names.
+            # The option may exist for other objectives only. The message then states these objectives.
             if name not in cls.model_fields:
                 owners = OWNERS.get(name)
                 if owners is None:
@@ -166,7 +166,7 @@ class TorqueFit(FitConfig):
     Attributes:
         prior: Prior of the parameters of rigid-body models.
         adapt: Parameters of a fitted model to update. `load`: the last body, with a load at the tip (in models of
-            networks: M and V); `friction`: friction and torque offsets; `unit`: all, for another unit of the same arm.
+            networks: M and V); `friction`: friction and torque offsets; `unit`: all, for another arm of the same model.
         evaluations: Largest number of evaluations of the loss.
         weight_decay: Factor of half the sum of squared weights.
         urdf_weight: Factor of the squared difference from the URDF's M and gravity; 0: no regularization.
@@ -297,8 +297,8 @@ def fit_config(
     for name, (condition, _, excluded) in UNLESS.items():
         if options.get(condition, settings.get(condition)) == excluded:
             settings.pop(name, None)
-        # If an option of the caller has no effect with a setting of the robot, the setting is ignored: with the option
-        # `batch`, `optimizer: lbfgs` is ignored.
+        # Options of the caller override settings of the robot. For example, the option `batch` has no effect with the
+        # setting `optimizer: lbfgs`, so this setting is ignored if the caller specifies `batch`.
         elif name in options and condition not in options and settings.get(condition) == excluded:
             settings.pop(condition)
     config = validated(config_type, settings | options)

@@ -67,12 +67,13 @@ Accepted = Literal[
 
 
 def _scaled(value: object, validate: Callable[[object], str]) -> str:
-    """Return a validated unit, which may have a factor, such as "0.01 deg"."""
+    """Return a unit that ``validate`` accepts, with its factor if it has one, such as "0.01 deg"."""
     match = isinstance(value, str) and re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value)
     return f"{match[1]} {validate(match[2])}" if match and float(match[1]) else validate(value)
 
 
-# A unit with a factor is none of the literals, so that it is serialised as a text.
+# pydantic would warn if a field with a Literal type contained another value. A unit with a factor is such a value, so
+# units are serialised as plain texts.
 _SCALED = WrapValidator(_scaled), PlainSerializer(str, when_used="unless-none")
 Time = Annotated[Literal["s", "ms", "us", "ns"], *_SCALED]
 Position = Annotated[Literal["rad", "deg", "turns", "mrad", "counts", "normalised", "m", "mm"], *_SCALED]
@@ -95,7 +96,8 @@ def plain_unit(text: str) -> str:
     factor = ""
     if match:
         unit = match["unit"] or match[4]
-        # Values "x1000" are a thousand times as large, and values in "0.01 deg" are counts of hundredths of a degree.
+        # "Nm x1000" means that logged values are a thousand times as large as in Nm: the factor is 1 / 1000. "0.01 deg"
+        # means that logged values are hundredths of a degree: the factor is 0.01.
         size = float(match[2] or match[5])
         factor = f"{1 / size if size > 1 and (match['x'] or match[5]) else size:.9g} "
     unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", unit)
@@ -103,7 +105,7 @@ def plain_unit(text: str) -> str:
 
 
 def mapped_unit(quantity: str, unit: str) -> str | None:
-    """Return the unit of a mapping, such as "0.01 deg", of a unit in the form of `plain_unit`; None if it is unknown.
+    """Convert a unit from the form of `plain_unit` to the form of a mapping, such as "0.01 deg"; None if unknown.
 
     quantity: "t", "q", "qd", "tau" or "u".
     """
@@ -289,7 +291,7 @@ class JointLog(Group):
         return self
 
 
-# Settings are immutable, so that one object serves all joints.
+# One default object is shared by all joints without settings. This is safe, because settings are immutable.
 _DEFAULT = JointLog()
 
 
@@ -329,7 +331,8 @@ class LogMapping(Group):
     @field_validator("calibration", mode="before")
     @classmethod
     def _is_by_motor(cls, content: object) -> object:
-        # Older calibrations of LeRobot are lists of all motors, and data recorded with them are in degrees.
+        # Older versions of LeRobot wrote calibrations as lists of all motors, and data in degrees. Such a calibration
+        # is an error, because data in degrees need no calibration.
         motors = content.values() if isinstance(content, dict) else ()
         if not all(isinstance(x, dict | MotorCalibration) for x in motors):
             raise ValueError(
@@ -353,7 +356,7 @@ class LogMapping(Group):
         return list(product(self.quantities, joints))
 
     def joint(self, name: str) -> JointLog:
-        """Return the settings of the columns of a joint, by its name in the URDF; the defaults if it has none."""
+        """Return the settings of the columns of a joint (name in the URDF); defaults if the joint has no settings."""
         return self.joints.get(name, _DEFAULT)
 
     def log_name(self, joint: str) -> str:
@@ -382,8 +385,8 @@ class LogMapping(Group):
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
         """Return the mapping with other names of columns.
 
-        columns: {joint: {quantity: name of the column}}. If a name is None, the column of the joint has the default
-        name, from the attribute `columns` of the mapping, which is for all joints.
+        columns: {joint: {quantity: name of the column}}. If a name is None, the name for all joints is used (attribute
+        `columns` of the mapping).
         """
         joints = dict(self.joints)
         for joint, names in columns.items():

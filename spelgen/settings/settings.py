@@ -62,8 +62,8 @@ class JointSettings(Group):
     @property
     def armature(self) -> float:
         """Rotor inertia on the joint side of the gear [kg m^2]."""
-        # The rotor accelerates `gear` times as fast as the joint, and the gear multiplies the torque for this by
-        # `gear`.
+        # gear^2: the rotor accelerates `gear` times as fast as the joint, and the gear multiplies the torque of the
+        # rotor by `gear`.
         return self.rotor_inertia * self.gear**2
 
     @field_validator("coulomb")
@@ -106,9 +106,8 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # Attributes with double underscores raise AttributeError, because copy and pickle search for some of them. The
-        # attributes `__pydantic...` are exceptions: pydantic reads the values of a group through these, so that the
-        # errors of the group must be raised.
+        # copy and pickle test whether attributes such as `__deepcopy__` exist, and expect AttributeError if they do
+        # not. pydantic reads the values of a group through its attributes `__pydantic...`: this raises the errors.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)
@@ -268,7 +267,7 @@ def _require_joints(
 ) -> None:
     """Raise SettingsError, or SpelgenErrors for several errors, if a joint in a settings file is not among `names`.
 
-    found: (location, name) of each joint in the file.
+    found: (location, name) of each joint in the file. document: the file, for the lines in errors.
     """
     collect([unknown_name(place, "joint", x, names, document) for place, x in found if x not in names])
 

@@ -55,7 +55,8 @@ class TrainingSettings(Group):
     @field_validator("*")
     @classmethod
     def _belongs(cls, value: object, info: ValidationInfo) -> object:
-        # `info.data` contains the values of the preceding fields: `objective`, the first field, is in it.
+        # pydantic validates the fields in their order, and `info.data` contains the validated ones. `objective` is the
+        # first field, so its value is known.
         objective, owners = info.data.get("objective"), OWNERS.get(str(info.field_name))
         if objective and owners and objective not in owners:
             raise ValueError(
@@ -65,7 +66,7 @@ class TrainingSettings(Group):
 
     @property
     def options(self) -> dict[str, object]:
-        """{name: value} of the settings that are not None and that are options of fits, for one or more objectives."""
+        """{name: value} of all settings that are options of a fit (of any objective) and are not None."""
         return self.model_dump(include=set(OWNERS), exclude_none=True)
 
     @property

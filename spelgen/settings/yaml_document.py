@@ -57,13 +57,12 @@ class YamlDocument:
             return yaml.SafeLoader("").construct_document(self.root)
         except yaml.YAMLError as error:
             raise _yaml_error(error, self.path) from error
-        # The loader of PyYAML raises ValueError for some values, for example for the date 2025-99-99: each is an error
-        # of the file, too.
+        # PyYAML raises ValueError, and no YAMLError, for some values such as the date 2025-99-99.
         except ValueError as error:
             raise SettingsError(f"not plain YAML: {error}", file=self.path) from error
 
     def line(self, location: Location) -> int | None:
-        """Return the line of a key or list item, or of the group that would contain it; None for an empty file."""
+        """Return the line of a key or list item; if it is absent, the line of its group. None for an empty file."""
         if self.root is None:
             return None
         node, line = self.root, int(self.root.start_mark.line) + 1
@@ -79,8 +78,8 @@ class YamlDocument:
 def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | None:
     """Return two nodes of an entry of a YAML mapping or list: the node whose line is reported in errors, and its value.
 
-    The first node is the key of an entry of a mapping; an item of a list is returned twice. The result is None if the
-    entry does not exist. key: key in a mapping, or index in a list.
+    For an entry of a mapping, the first node is its key. For an item of a list, both nodes are the item. The result is
+    None if the entry does not exist. key: key in a mapping, or index in a list.
     """
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
@@ -92,7 +91,7 @@ def _entry(node: yaml.Node, key: int | str) -> tuple[yaml.Node, yaml.Node] | Non
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """The safe loader of PyYAML, for which tags, aliases, deep nesting, repeated keys and 1:50 are errors."""
+    """PyYAML's safe loader; tags, aliases, deep nesting, repeated keys, and numbers such as 1:50 are errors, too."""
 
     depth = 0
 
@@ -220,7 +219,8 @@ def unknown_name(
 ) -> SettingsError:
     """Return the error for a name that is not among `names`; it suggests the most similar known name.
 
-    location: keys and indices that lead to the name in the document. noun: "key" or "joint", for the message.
+    noun: "key" or "joint", for the message. location: keys from the root of ``document`` to the name. document: the
+    YAML file; None if the name is not from a file.
     """
     error = _error_at(location, document, f"unknown {noun} {name!r}")
     error.element, error.do = dotted(location[:-1]), suggestion(name, names)

@@ -52,7 +52,8 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
 def _with_settings(path: Path, settings: dict[str, object], arm: Arm) -> Arm:
     """Write `settings` next to the URDF `path`; return the arm that is loaded from both files.
 
-    An angle of the URDF is rounded to a multiple of pi/2 if the two differ by less than the angle tolerance of ``arm``.
+    Angles of the URDF that differ from a multiple of pi/2 by less than the angle tolerance of ``arm`` are rounded to
+    this multiple.
     """
     write_text(path.with_suffix(".yaml"), yaml.safe_dump(settings, sort_keys=False, allow_unicode=True))
     return load_arm(path, angle_tolerance=arm.angle_tolerance)
@@ -142,10 +143,10 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
 def perturbed_urdf(robot: Path, error: float, seed: int) -> bytes:
     """Return the URDF without friction, visuals and collisions, and with perturbed inertials.
 
-    Per link, the mass and the ratio of the inertia about the centre of mass to the mass are scaled by independent
-    factors exp(error N(0, 1)); the centre of mass is shifted by error N(0, 1) times the body's radius of gyration,
-    along each axis of the link frame. An inertia tensor that no body can have is replaced by a physically consistent
-    one.
+    Each link has two independent random factors exp(error N(0, 1)): one scales the mass, the other the inertia about
+    the centre of mass divided by the mass. The centre of mass is shifted by error N(0, 1) times the body's radius of
+    gyration, along each axis of the link frame. Physically inconsistent inertia tensors are replaced by consistent
+    ones.
 
     Args:
         robot: URDF or xacro file, which was read before.

@@ -34,7 +34,7 @@ class SimulatedLogs(list[Trajectory]):
 
     @classmethod
     def split(cls, logs: Sequence[Trajectory], test_fraction: float) -> SimulatedLogs:
-        """Return the logs, of which the last `test_fraction` are test trajectories and at least one is for training."""
+        """Split logs: the last fraction `test_fraction` are test trajectories; at least one log is for training."""
         trained = len(logs) - min(round(test_fraction * len(logs)), len(logs) - 1)
         return cls(logs[:trained], logs[trained:])
 
@@ -46,7 +46,10 @@ class SimulatedLogs(list[Trajectory]):
 
 
 def sample_times(simulation: SimulationSettings) -> np.ndarray:
-    """Return the times of the samples of one simulated trajectory, (T,) [s], which start at 0."""
+    """Return the times of the samples of one simulated trajectory, (T,) [s], which start at 0.
+
+    simulation: settings with the duration and the sample rate.
+    """
     return np.arange(round(simulation.duration * simulation.sample_rate) + 1) / simulation.sample_rate
 
 

@@ -58,9 +58,9 @@ def _commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return simulated positions (T, n) [rad, m]; the arm starts at rest at the first command.
 
-    Method: semi-implicit Euler with dry friction as impulses. The impulse of a joint's dry friction stops it, within
-    the bounds of Coulomb friction (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with
-    Temporal Coherence, 2005).
+    Method: semi-implicit Euler with dry friction as impulses. In each step, the impulse of a joint's dry friction stops
+    the joint, if the impulse does not exceed Coulomb friction times the step length; otherwise it has this magnitude
+    (projected Gauss-Seidel, as in physics engines: Catto, Iterative Dynamics with Temporal Coherence, 2005).
 
     Args:
         arm: The arm.
@@ -77,9 +77,9 @@ def _positions(arm: Chain, settings: Settings, t: np.ndarray, u: np.ndarray) -> 
     interval = t[1] - t[0]
     steps = int(np.ceil(interval / TUNING.servo_step))
     h, delay = interval / steps, round(settings.simulation.delay * steps / interval)
-    # The damping torque is taken at the mean of the velocities before and after the step (implicit midpoint rule). For
-    # the damping D and a step of length h, its term with the unknown change dv of the velocity is h D dv / 2, so that h
-    # D / 2 is added to the mass matrix.
+    # The damping torque is computed for the mean velocity of a step (implicit midpoint rule). With the damping D and
+    # the step length h, its impulse is -h D (qd + dv / 2). The change dv of the velocity is unknown, so the term with
+    # dv is added to M dv: the matrix of the linear equations for dv is M + h D / 2.
     damping = np.diag(h / 2 * (kd + friction.viscous))
     impulses = -h * np.stack([friction.forward, friction.backward])
     q, qd, positions = u[0].copy(), np.zeros(u.shape[1]), np.empty_like(u)

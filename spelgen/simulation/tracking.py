@@ -70,7 +70,8 @@ def track(
     train, test = [], []
     for number, path in enumerate(paths(arm, settings, ticks)):
         bandwidth = settings.tracking.bandwidths[number % len(settings.tracking.bandwidths)]
-        # 1 / (M^-1)_jj is the inertia at joint j while all other joints move freely.
+        # The gains of a joint's controller are computed from the inertia at joint j while all other joints move freely,
+        # which is 1 / (M^-1)_jj.
         inertia = 1 / np.diag(np.linalg.inv(dynamics.mass_matrix(middle)))
         recording = record(dynamics, friction, drives.inputs, path, settings, inertia, 2 * np.pi * bandwidth)
         log = measured(recording, settings.tracking, f"traj_{number:02d}")
@@ -153,7 +154,7 @@ def record(
 def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Trajectory:
     """Return the log of a recording: low-pass filtered positions, velocities by central differences, and torques.
 
-    tracking: contains the cutoff frequency of the filter. name: name of the log.
+    tracking: settings with the cutoff frequency of the filter. name: name of the log.
     """
     sample_rate = 1.0 / (recording.t[1] - recording.t[0])
     q = low_pass_regular(recording.encoders, sample_rate, tracking.cutoff)
@@ -161,7 +162,7 @@ def measured(recording: Recording, tracking: TrackingSettings, name: str) -> Tra
 
 
 def quantized(q: np.ndarray, tracking: TrackingSettings) -> np.ndarray:
-    """Return positions q (T, n) or (n,) rounded to multiples of the encoders' resolution (in `tracking`)."""
+    """Return positions q (T, n) or (n,), rounded to the resolution of the encoders in the settings ``tracking``."""
     return np.round(q / tracking.resolution) * tracking.resolution
 
 

@@ -108,7 +108,7 @@ def _rows(arm: Chain, generator: random.Random) -> np.ndarray:
     """Return the energy regressor at a random configuration: (n(n+1)/2 + 1, 10 B) for n joints and B bodies.
 
     A row has the coefficients of the inertial parameters in an entry of M; the last row, in the potential energy V. The
-    elements are rational numbers of FLINT (fmpq).
+    elements are rational numbers of FLINT (fmpq). generator: source of the random configuration.
     """
     parameters = 10 * len(arm.bodies)
     positions = []

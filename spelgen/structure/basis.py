@@ -151,7 +151,8 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
 
     A set is sorted first by its joint closest to the root: joints near the tip come first. Sets with the same joint
-    closest to the root are sorted by size, small sets first (see the module).
+    closest to the root are sorted by size, small sets first (see the module). spans: samples of M and the spans of its
+    changes.
     """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
@@ -166,10 +167,11 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield two lists of candidates for f_j that depend on ``joints`` only: single entries of M, then sums of entries.
+    """Yield two lists of candidates for a function f_j of ``joints`` only: single entries of M, then sums of entries.
 
-    A candidate is a weighted sum of the entries of M, which varies only with the positions of ``joints``. It is given
-    by its weights, (entries,), in the prime field and in double precision. Sums of few entries are first.
+    f_j is a function in the minimal form of M (see the module). A candidate is a weighted sum of the entries of M,
+    which varies only with the positions of ``joints``. It is given by its weights, (entries,), in the prime field and
+    in double precision. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
@@ -192,9 +194,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # The functional `row` is M at `entry`, the only entry outside `bound`, minus a combination of the entries in
-        # `bound`, which changes like M at `entry` if joints outside `joints` move. `coefficients` are the coefficients
-        # of this combination in double precision.
+        # The functional `row` is a difference: M at `entry`, the only entry outside `bound`, minus a weighted sum of
+        # the entries in `bound`. If joints outside `joints` move, both change equally, so the difference is constant.
+        # `coefficients` are the weights of the sum in double precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -206,7 +208,8 @@ def _candidates(
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
 
-    The first array has elements of the prime field, the second one the same numbers in double precision.
+    The first array has elements of the prime field, the second one the same numbers in double precision. The rows and
+    columns of the entries are ``spans.keys``.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1

@@ -157,7 +157,8 @@ def _folded(values: np.ndarray) -> np.ndarray:
 def _product(a: np.ndarray, b: np.ndarray | np.uint64) -> np.ndarray:
     """Return the elementwise product a b modulo 2^61 - 1, (...,), in 64-bit arithmetic.
 
-    With a = a1 2^31 + a0 and b = b1 2^31 + b0: a b = a1 b1 2^62 + (a1 b0 + a0 b1) 2^31 + a0 b0, with 2^61 = 1.
+    With a = a1 2^31 + a0 and b = b1 2^31 + b0: a b = a1 b1 2^62 + (a1 b0 + a0 b1) 2^31 + a0 b0.
+    Modulo 2^61 - 1, 2^61 is 1, so that the powers of 2 in the sum are reduced without a division.
     """
     a_high, a_low, b_high, b_low = a >> _BITS_31, a & _LOW_31, b >> _BITS_31, b & _LOW_31
     middle = a_high * b_low + a_low * b_high

@@ -157,9 +157,10 @@ def _default_inertia(arm: Chain, index: int) -> list[float]:
 
 
 def _min_eigenvalue(mass: np.ndarray) -> float:
-    """Return the smallest generalised eigenvalue of S samples of M relative to the mean of the samples.
+    """Return the smallest eigenvalue of M, relative to the mean of M, over S samples (generalised eigenvalue).
 
-    The result is 0 if the mean is not positive definite. mass: lower triangles of M, (S, n(n+1)/2).
+    It is positive if all samples of M are positive definite, and 0 if their mean is not positive definite. mass: lower
+    triangles of M, (S, n(n+1)/2).
     """
     n = isqrt(2 * mass.shape[1])
     matrices = np.zeros((len(mass), n, n))
@@ -175,7 +176,10 @@ def _min_eigenvalue(mass: np.ndarray) -> float:
 
 
 def _gravity_torque(arm: Chain, q: np.ndarray, inertias: list[list[float]]) -> np.ndarray:
-    """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N]."""
+    """Return the root mean square over S positions q, (S, n), of the gravity torque dV/dq, (n,) [Nm, N].
+
+    inertias: ten inertial parameters of each body.
+    """
     # [rad, m] Step of the central differences for dV/dq. The derivative has a relative error of 1e-8, which is small
     # enough for scales.
     step = 1e-4

@@ -61,7 +61,7 @@ class _Inertia(NamedTuple):
 
 
 class _Pose(NamedTuple):
-    """A rotation and a translation: from a joint frame to the frame of the parent body, or by the joint's motion.
+    """A rotation and a translation: the pose of a joint frame in the frame of the parent body, or a joint's motion.
 
     rotation: rows of the rotation matrix. Elements 0, 1 and -1 of rotation and translation are Python integers, so that
     products with them are recognized and not computed.
@@ -152,7 +152,7 @@ def coefficients(
 def _joint_transforms(arm: Chain, positions: Sequence[Position], number: Number) -> list[_Pose]:
     """Return the transform of each body in its joint's frame due to ``positions``: rotation about z or translation.
 
-    number: function that converts an exact constant to a number of the computation.
+    number: conversion of the exact constants of the arm to the number type of `positions`.
     """
     bases = base_denominators(arm)
     transforms = []

@@ -35,9 +35,8 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
     n = len(arm.coordinates)
     positions = []
     for index in range(n):
-        # Revolute joints use the cosine and sine of q, prismatic joints the value of q; each `Position` has all three.
-        # The value is an independent random number, since it cannot be computed from elements of the prime field as an
-        # angle.
+        # A `Position` has a cosine and a sine, for revolute joints, and a value of q, for prismatic joints. The value
+        # is an independent random number: in a prime field there is no angle that belongs to a cosine and a sine.
         c, s = field.random_circle_points(rng, 2 * samples)
         value = random_residues(rng, (2 * samples,))
         moved = [Residues(_one_moved(x, index, 1 + n)) for x in (c, s, value)]
@@ -119,10 +118,10 @@ def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[
 
 
 def _one_moved(values: np.ndarray, index: int, blocks: int) -> np.ndarray:
-    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S), see the module.
+    """Return the values of coordinate ``index`` in all blocks of S samples, (blocks, S).
 
-    values: 2 S random values, (2 S,). Block ``index`` + 1, the only block in which this coordinate differs from block
-    0, gets the last S values. All other blocks get the first S values.
+    Samples consist of blocks (see the module). In block ``index`` + 1 only this coordinate differs from block 0: this
+    block gets the last S of the random ``values``, (2 S,), and all other blocks get the first S values.
     """
     base, moved = np.split(values, 2)
     result = np.tile(base, (blocks, 1))

@@ -19,7 +19,9 @@ PARAMETERS = ("kp", "kd", "armature", "dry")
 
 
 class ServoRank(NamedTuple):
-    """Ratios of servo parameters that logs of commanded positions can identify.
+    """Identifiable ratios between the parameters of position servos, from logs of commanded positions.
+
+    The parameters of a joint are kp, kd, armature and dry friction.
 
     Attributes:
         groups: sets of joints (0-based). Within a set, all ratios of two kp are identifiable, so that one known kp,
@@ -33,10 +35,10 @@ class ServoRank(NamedTuple):
 
 
 def servo_rank(arm: Chain) -> ServoRank:
-    """Return the ratios of servo parameters that logs can identify, for an arm whose joints all have position servos.
+    """Return the identifiable ratios between servo parameters, for an arm whose joints all have position servos.
 
-    They are computed from the null space of the equations (see the module) at random states, for random true
-    parameters.
+    The ratios, such as kd / kp of a joint or kp of one joint / kp of another, are computed from the null space of the
+    equations of motion under servo torques (see the module), at random states and for random true parameters.
     """
     random, n = np.random.default_rng(0), len(arm.coordinates)
     # There are about twice as many equations as unknowns, so that the number of samples does not limit the rank.
@@ -61,8 +63,7 @@ def servo_rank(arm: Chain) -> ServoRank:
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
     # [1] Two relative changes of parameters along a null vector, at most 1, count as equal if they differ by less than
-    # `equal`. It is far above the rounding errors of null vectors, about 1e-13: a thousand times the rounding errors of
-    # the system matrix.
+    # `equal`. Rounding errors are far smaller: about 1e-16 in the system matrix, and 1e-13 in its null vectors.
     equal, kp = 1e-6, changes[:, :1]
     # `same`, (n, n): True for two joints whose kp change by the same factor in the whole null space.
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal

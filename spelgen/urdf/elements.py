@@ -15,7 +15,7 @@ JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 
 
 def read_name(notes: Notes, xml: etree._Element) -> str | None:
-    """Return the name of an element; if it has none, add an error to the defects ``notes`` and return None."""
+    """Return the name of an element; if it has none, add an error to ``notes`` (list of defects) and return None."""
     return Element(notes, xml, f"<{xml.tag}>").name()
 
 
@@ -99,7 +99,7 @@ def read_joint(notes: Notes, xml: etree._Element) -> UrdfJoint | None:
     dynamics = motion.child("dynamics")
     damping, friction = dynamics.number("damping") or 0.0, dynamics.number("friction") or 0.0
     mimic = _read_mimic(joint.child("mimic")) if kind in MOVING else None
-    # Only motions need the soft limits, so that their errors become warnings, too.
+    # Errors in soft limits become warnings, too, because soft limits restrict motions only.
     safety = Element(optional, xml, joint.where).child("safety_controller")
     low, high = safety.number("soft_lower_limit"), safety.number("soft_upper_limit")
     # Exporters write two zeros for no soft limits.
@@ -180,8 +180,8 @@ def _read_mimic(mimic: Element) -> Mimic | None:
 def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) -> Transmission:
     """Return the transmission of a <transmission> element (<type>, <joint>, <actuator>) of ROS or ros2_control.
 
-    Unknown joints and unusable numbers are added to ``notes`` as warnings. The unusable numbers are also stored in the
-    field ``errors`` of the transmission, for callers that need the transmission.
+    Unknown joints and unusable numbers are added to ``notes`` as warnings. The unusable numbers are also stored as
+    errors in the field ``errors`` of the transmission.
 
     Args:
         notes: list to which the warnings are added.
@@ -210,5 +210,5 @@ def read_transmission(notes: Notes, xml: etree._Element, joints: Sequence[str]) 
 
 
 def _reduction_tag(element: etree._Element) -> str:
-    """Return the name of the element of the reduction in the dialect of a joint or actuator of a transmission."""
+    """Return the tag of the gear reduction in a <joint> or <actuator> of a transmission; URDFs have two spellings."""
     return "mechanicalReduction" if element.find("mechanical_reduction") is None else "mechanical_reduction"

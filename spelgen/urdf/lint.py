@@ -16,8 +16,8 @@ _SMALLEST_INERTIA = 1e-15
 
 _LARGEST_LENGTH = 20.0  # [m] a larger offset of a frame or centre of mass is probably in mm
 # [1] Largest plausible distance of a centre of mass from the frame of its link, divided by the sum of the offsets of
-# all joints and the travel of prismatic ones. It is at most 4.5 in 147 URDFs of arms (robots/rpr.urdf, whose values are
-# published); with centres of mass in cm, it is above 5 in 98 % of them.
+# all joints and the travel of prismatic ones. The largest value in 147 URDFs of arms is 4.5 (in robots/rpr.urdf, whose
+# values are published). With centres of mass in cm, 98 % of these URDFs would have a value above 5.
 _LARGEST_COM = 5.0
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
@@ -146,8 +146,8 @@ def _lint_units(joint: UrdfJoint) -> Iterator[Finding]:
         ("degrees", "limit", "a position", max(limits, default=0.0), "rad", 8 * pi, 2 * pi),
         ("millimetres", "origin", "xyz", max(map(abs, joint.xyz)), "m", _LARGEST_LENGTH, inf),
     )
-    # Angles in radians are rarely whole numbers: in the URDFs of ../shared no angle of an <origin> of at least 2 rad is
-    # one, and no position limit between 2 pi and 1000.
+    # Angles in radians are rarely whole numbers. In the URDFs of ../shared, none of the angles of an <origin> above 2
+    # rad and none of the position limits between 2 pi and 1000 is a whole number.
     for code, element, quantity, size, unit, largest, largest_whole in sizes:
         if size > largest or (size >= largest_whole and size.is_integer()):
             message = f"{quantity} of {size:g} {unit}: perhaps {code}"

@@ -74,8 +74,8 @@ def read_urdf(path: Path) -> Robot:
 def _diagnostics(notes: Notes, robot: Robot) -> tuple[Diagnostic, ...]:
     """Return the diagnostics of reading and of ``lint`` in the order of lines.
 
-    If <inertia> is absent, the tensor is zero: reading has added a diagnostic for this, so that the diagnostic of
-    ``lint`` is omitted.
+    An absent <inertia> is read as a tensor of zeros, with a diagnostic. The diagnostic of ``lint`` about the tensor of
+    zeros would repeat it and is omitted.
     """
     absent = {remark.line for remark in notes.diagnostics if remark.code == "inertial-without-inertia"}
     warnings = [x for x in lint(robot) if x.code != "zero-inertia" or x.line not in absent]

@@ -79,9 +79,9 @@ class UrdfJoint(NamedTuple):
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """Position limits in increasing order [rad, m]; None if one of both is absent.
+        """Position limits in increasing order [rad, m]; None if the lower or the upper limit is absent.
 
-        Limits in reverse order, of which the URDF reader warns, are used as swapped by all steps.
+        A lower limit above the upper limit causes a warning of the URDF reader; the two limits are then swapped here.
         """
         if self.lower is None or self.upper is None:
             return None

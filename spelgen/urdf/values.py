@@ -25,8 +25,9 @@ MAX_NAME = 256
 # [rad, m; Nm, N; rad/s, m/s] A limit of at least this magnitude means that the joint has no limit: exporters write 1e9,
 # 1e16 or DBL_MAX in this case.
 UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
-# {element of a joint or inertial: its optional attributes, of which a misspelt one would be ignored silently}. In
-# contrast to SDF, these elements have no text and no children. Readers of <origin> refuse all unknown attributes.
+# {element of a joint or inertial: its optional attributes}. An attribute with a similar name is an error, because a
+# misspelt optional attribute would be ignored silently. Text or children in these elements, which SDF has, are errors.
+# The list for <origin> is empty, because `elements` refuses all its unknown attributes.
 _LEAVES = {
     "origin": (),
     "axis": (),
@@ -36,8 +37,8 @@ _LEAVES = {
     "mass": (),
     "inertia": ("ixy", "ixz", "iyz"),
 }
-# [1] Two names of at least this similarity are spellings of one name. In the URDFs of ../shared
-# (arms and cases), no element or attribute beyond the URDF format resembles an absent one of the format as much.
+# [1] A name with at least this similarity to a name of the URDF format is treated as its misspelling. In the URDFs
+# of ../shared (arms and cases), all names that are not part of the format have smaller similarities.
 _SIMILARITY = 0.75
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 
@@ -106,8 +107,8 @@ class Element:
             self.notes.warn(children[1].sourceline, "repeated-element", self.where, message)
         child = Element(self.notes, children[0] if children else None, f"{self.where} {tag}")
         if self.xml is not None:
-            # Unusable limits and friction count as absent, and other content is an error: the geometry, for example,
-            # would be wrong without a message.
+            # Misspelt limits and friction count as absent, with a warning. Other misspelt content is an error, because
+            # defaults in its place, such as a pose of zero, would make the model wrong.
             ignored = Notes(self.notes.path)
             replace(child, notes=ignored)._find_ignored(tag, self.xml)
             if tag in ("limit", "dynamics"):
@@ -117,7 +118,7 @@ class Element:
         return child
 
     def _find_ignored(self, tag: str, parent: etree._Element) -> None:
-        """Add errors for content of ``parent`` that is probably meant as the element ``tag``, and would be ignored."""
+        """Add errors for content that would be ignored: a misspelt element ``tag`` in ``parent``, or content in it."""
         if self.xml is None:
             for sibling in parent.iterchildren(etree.Element):
                 name = etree.QName(sibling).localname
@@ -135,7 +136,7 @@ class Element:
                     self.error(f"the attribute {key!r}", repr(name), "correct or remove it")
 
     def text(self, key: str) -> str | None:
-        """Return the text of an attribute; None if the attribute or the element is absent."""
+        """Return the text of the attribute ``key``; None if the attribute or the element is absent."""
         # An absent element counts as an element without attributes, so that callers need no branch for it.
         text: str | None = None if self.xml is None else self.xml.get(key)
         return text
@@ -153,7 +154,7 @@ class Element:
         return None
 
     def triple(self, key: str, default: Vector = (0.0, 0.0, 0.0)) -> Vector:
-        """Return the three numbers in an attribute, or the default if it is absent.
+        """Return the three numbers in the attribute ``key``, or ``default`` if the attribute is absent.
 
         For an unusable text, add an error and return the default.
         """
@@ -161,7 +162,7 @@ class Element:
         return (values[0], values[1], values[2]) if values else default
 
     def number(self, key: str) -> float | None:
-        """Return the number in an attribute; None if it is absent.
+        """Return the number in the attribute ``key``; None if the attribute is absent.
 
         For an unusable text, add an error and return None.
         """
@@ -169,7 +170,7 @@ class Element:
         return values[0] if values else None
 
     def limit(self, key: str) -> float | None:
-        """Return a limit of a joint; None if it is absent, inf, nan, or at least the magnitude in ``UNLIMITED``.
+        """Return the limit in the attribute ``key``; None if it is absent, inf, nan, or at least ``UNLIMITED[key]``.
 
         For an unusable text, add an error and return None.
         """
@@ -180,7 +181,7 @@ class Element:
         return values[0] if values and abs(values[0]) < UNLIMITED[key] else None
 
     def number_in_text(self, tag: str) -> float | None:
-        """Return the number in the text of a child element, or None if it is absent.
+        """Return the number in the text of the child element ``tag``; None if the child or its text is absent.
 
         For an unusable text, add an error and return None.
         """
@@ -190,7 +191,7 @@ class Element:
         return values[0] if values else None
 
     def _numbers(self, text: str | None, key: str, count: int = 1, bounded: bool = True) -> list[float]:
-        """Return the ``count`` finite numbers in a text.
+        """Return the ``count`` finite numbers in a text, the value of the attribute or child element ``key``.
 
         The list is empty if the text is None. It is also empty, and an error is added, if the text does not consist of
         ``count`` finite numbers. bounded: if True, magnitudes above MAX_MAGNITUDE are errors; False for limits of
@@ -223,7 +224,7 @@ class Element:
         return values
 
     def _is_unexpanded(self, text: str, key: str) -> bool:
-        """Whether a text contains a xacro expression; if it does, an error is added."""
+        """Whether a text contains a xacro expression; if it does, an error about the attribute ``key`` is added."""
         is_unexpanded = "${" in text or "$(" in text
         if is_unexpanded:
             do = "expand the file with the xacro command first"
