@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
-COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION, LOADS = "small-motion", "different-loads"
 # Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
@@ -106,13 +106,10 @@ class TorqueLogs:
         motion = joined_samples([empty, *self._samples]).thinned(6000)
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
-        # The model is fitted only to logs without errors: wrong velocities give wrong friction, and other faults wrong
-        # hints.
+        # The model is fitted only to logs without errors, since faults give wrong hints.
         # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
         self._guessed = summary.guessed
-        is_sound = len(summary.errors) <= bool(self._guessed) and not any(
-            x.code == WRONG_VELOCITY for x in summary.notes
-        )
+        is_sound = len(summary.errors) <= bool(self._guessed)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         moving = self._moving.samples()

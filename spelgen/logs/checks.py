@@ -42,7 +42,7 @@ from spelgen.logs.unit_checks import (
 )
 from spelgen.settings.log_mapping import SCALES
 
-ELASTIC = "elastic-joint"
+ELASTIC, WRONG_VELOCITY = "elastic-joint", "velocity-is-no-derivative"
 # Advice for a fault of some recordings: settings that correct these recordings would be wrong for the others.
 OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
@@ -245,7 +245,7 @@ CHECKS: list[Check[JointSignals]] = [
         do="check the logger, and the names of the columns under 'logs'",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity, expected="dq/dt",
+        WRONG_VELOCITY, "warning", find_wrong_velocity, expected="dq/dt",
         unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
@@ -269,8 +269,12 @@ class LogChecks:
         self._count = 0
         self._fingerprints = Fingerprints()
 
-    def add(self, trajectory: Trajectory) -> None:
-        """Apply all checks that need no robot to a trajectory, and collect the findings."""
+    def add(self, trajectory: Trajectory) -> Trajectory:
+        """Apply all checks that need no robot to a trajectory, and collect the findings.
+
+        The result is the trajectory with dq/dt in place of velocities that are wrong for an unknown reason, for checks
+        with a model of the robot.
+        """
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
@@ -285,10 +289,14 @@ class LogChecks:
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = velocity_agreement(products)
+        wrong = []
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             signals = JointSignals(trajectory, k, kind, self._joints, factors, correlations[:, k])
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
+                if check.code == WRONG_VELOCITY and not (advice.joint or advice.keys):
+                    wrong.append(k)
+        return trajectory.differentiated(wrong) if wrong else trajectory
 
     def _add(self, group: str, check: AnyCheck, advice: Advice, trajectory: Trajectory) -> None:
         occurrence = advice, f"trajectory {trajectory.name}", trajectory.file
