@@ -12,7 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import UNITS, PositionUnit, TorqueUnit, position_factors
+from spelgen.identification.column_faults import GIVE_GEAR, UNITS, PositionUnit, TorqueUnit, position_factors
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
@@ -106,13 +106,15 @@ class TorqueLogs:
         motion = joined_samples([empty, *self._samples]).thinned(6000)
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
+        moving = self._moving.samples()
         # The model is fitted only to logs without errors, since faults give wrong hints.
         # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
         self._guessed = summary.guessed
+        if summary.is_presumed and moving is not None:
+            summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]
         is_sound = len(summary.errors) <= bool(self._guessed)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
-        moving = self._moving.samples()
         if moving is None:
             message = f"no samples for identify and for fits of torques: they need {NEEDED}"
             summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
@@ -356,9 +358,39 @@ class TorqueLogs:
             ]
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
-        wide = [k for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
         candidates = position_factors(problem.arm, problem.unchanged.scale[0])
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
+
+    def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
+        """Return an error; the error that most positions are in degrees is replaced if the torques contradict degrees.
+
+        The positions may be the positions of the motors, before gears. If gear ratios of the joints explain the
+        torques much better than degrees, they are advised. If neither explains the torques, no setting is advised.
+        """
+        problem = self._problem(samples)
+        if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
+            return error
+        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
+        coarse = problem.thinned(2 * GEOMETRY.coarse_samples).with_hysteresis()
+        factors = position_factors(problem.arm, problem.unchanged.scale[0])
+        unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
+        fault = PositionUnit([], [turning], PositionUnit([]))
+        best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
+        if best.cost > unit.cost - GEOMETRY.needed or 2 * best.errors.mean() > unit.errors.mean():
+            return error
+        if best.errors.max() <= GEOMETRY.explained:
+            found = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
+            return found if isinstance(found, LogError) else error
+        # the log may have another fault in addition to positions in degrees
+        converted = self._problem(unit.hypothesis.signals(problem.samples))
+        if converted is not None:
+            _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
+            if better and better[0].errors.max() <= GEOMETRY.unexplained:
+                return error
+        message, _, unit_text = error.got.partition(": ")
+        do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
+        return replace(error, got=message, do=do)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

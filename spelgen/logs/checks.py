@@ -77,16 +77,18 @@ class Check(Generic[Subject]):
 AnyCheck = Check[Any]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions have an unknown unit, which the torques may show.
+    guessed: names of joints whose positions have an unknown unit, which the torques may show. is_presumed: True
+    if the unit of most positions is advised by their range only, so that the torques may contradict it.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
+    is_presumed: bool = False
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
@@ -321,11 +323,12 @@ class LogChecks:
             advice, where, file = occurrences[0]
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
+            if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
                 # The unit, after the colon of the message, is not certain.
                 message, _, _ = message.partition(": ")
                 summary.guessed.update(names)
                 entries = {}
+            summary.is_presumed |= advice.is_guess
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
             if names[0] in self._joints:
@@ -344,6 +347,11 @@ class LogChecks:
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
 
+    def _limited(self, joint: str) -> list[str]:
+        """Return the names of the joints in `_kin` with limited motion: positions beyond two turns show a unit."""
+        kinds = dict(zip(self._joints, self._kinds, strict=True))
+        return [x for x in self._kin(joint) if kinds[x] != "continuous"]
+
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return the settings of the group `logs` that correct a fault which several joints have in common.
 
@@ -356,7 +364,7 @@ class LogChecks:
         units, kin = entries[first].get("units", {}), self._kin(first)
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
-        is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
+        is_shared = "units" in entries[first] and 2 * len(entries) > len(self._limited(first))
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})
