@@ -430,7 +430,9 @@ class PositionUnit(WrongScale):
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
         # `_descended` reverses the senses of several joints.
-        forms: list[Form] = [(x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]]
+        forms: list[Form] = [
+            (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
+        ]
         # the largest motion is at least 0.05 rad or m, and at most two turns
         common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
         costs = np.array([[problem.fit(scaled(x * ones, form)).cost for form in forms] for x in common])
@@ -448,14 +450,16 @@ class PositionUnit(WrongScale):
             lowest[lowest.argmin()] = np.inf
             sides.append(lowest.min() - GEOMETRY.ambiguous + GEOMETRY.right_angle)
         fault = self if min(sides) > best.cost + GEOMETRY.right_angle else self._open_fault or self
-        if len(joints) == 1:
-            units = UNITS[problem.arm.joint_types[joints[0]]]
-            exact = [np.log(SCALES.get(x, 1.0) / present) for x in units]
-            unit = problem.fit(scaled(min(exact, key=lambda x: abs(x - exponents)[0]), form, fault))
-            if unit.cost < best.cost + GEOMETRY.right_angle:
-                return unit
+        scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
+        exact = np.log(np.array(scales)[:, None] / present)
+        nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
+        unit = problem.fit(scaled(nearest, form, fault))
+        if len(joints) == 1 and unit.cost < best.cost + GEOMETRY.right_angle:
+            return unit
         ratios = [float(f"{x:.3g}") for x in np.exp(-exponents) / present]
-        return problem.fit(scaled(-np.log(ratios * present), form, fault))
+        # a ratio within 2 % of a unit is the unit
+        is_unit = np.abs(nearest - exponents) < 0.02
+        return problem.fit(scaled(np.where(is_unit, nearest, -np.log(ratios * present)), form, fault))
 
     def _descended(
         self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], exponents: np.ndarray, form: Form
@@ -473,7 +477,10 @@ class PositionUnit(WrongScale):
             signs = 1 - 2 * np.eye(len(exponents))
             others: list[Form] = [(x * sense, (x if power else 1) * torque_sense, power) for x in signs]
             best = min(others, key=lambda x: problem.fit(scaled(exponents, x)).cost)
-            if len(exponents) == 1 or problem.fit(scaled(exponents, best)).cost > fit.cost - GEOMETRY.ambiguous:
+            if (
+                len(exponents) == 1
+                or problem.fit(scaled(exponents, best)).cost > fit.cost - GEOMETRY.ambiguous
+            ):
                 break
             form = best
         return fit, exponents, form
@@ -497,7 +504,9 @@ class PositionUnit(WrongScale):
                 ratios.setdefault(sense, []).append(f"{abs(1 / motion[k]):.3g}")
         for sense, gears in ratios.items():
             times = ", ".join(dict.fromkeys(gears))
-            texts.append(f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear")
+            texts.append(
+                f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear"
+            )
         return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 

@@ -17,7 +17,7 @@ from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.least_squares import varying
-from spelgen.identification.load_changes import LoadChange, load_changes
+from spelgen.identification.load_changes import LoadChange, load_changes, torque_change
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
-SMALL_MOTION, LOADS = "small-motion", "different-loads"
+SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-changed"
 # Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
@@ -309,6 +309,10 @@ class TorqueLogs:
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
+        change = self._torque_change(problem) if CHANGED not in accepted else None
+        if change is not None:
+            yield change
+            return
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
@@ -328,6 +332,23 @@ class TorqueLogs:
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
+
+    def _torque_change(self, problem: GeometryProblem) -> LogError | None:
+        """Return an error if the scale or zero of torques changes within a recording, else None."""
+        change = None if self._guessed else torque_change(problem)
+        if change is None:
+            return None
+        name, file = self._sources[change.recording]
+        joints, torque = ", all joints", f"{change.factor:.2g} times those before it"
+        if change.joint is not None:
+            joints = f", joint {problem.arm.joint_names[change.joint]!r}"
+        if change.offset:
+            torque = f"another zero than before it, by {change.offset:.2g}"
+        return LogError(
+            f"torques that are, from about {change.time:.2g} s after the start on, {torque}", file=file,
+            element=f"trajectory {name}{joints}, tau", expected="one scale and zero of the torques in a recording",
+            do=f"use the part before or after it; --accept {CHANGED} if it is right",
+        )  # fmt: skip
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
