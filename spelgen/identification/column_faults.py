@@ -414,8 +414,7 @@ class PositionUnit(WrongScale):
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
         """Return the least-squares fit with the best factor on the positions of each of m joints.
 
-        For a single joint, a unit in `UNITS` is preferred if its cost is about equal. Other factors are rounded to
-        three digits.
+        Units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
         """
         scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
         span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
@@ -453,37 +452,38 @@ class PositionUnit(WrongScale):
         scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
-        unit = problem.fit(scaled(nearest, form, fault))
-        if len(joints) == 1 and unit.cost < best.cost + GEOMETRY.right_angle:
-            return unit
-        ratios = [float(f"{x:.3g}") for x in np.exp(-exponents) / present]
-        # a ratio within 2 % of a unit is the unit
-        is_unit = np.abs(nearest - exponents) < 0.02
-        return problem.fit(scaled(np.where(is_unit, nearest, -np.log(ratios * present)), form, fault))
+        rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
+        unit = problem.fit(scaled(np.where(np.abs(nearest - exponents) < 0.1, nearest, rounded), form, fault))
+        return (
+            unit
+            if unit.cost < best.cost + GEOMETRY.right_angle
+            else problem.fit(scaled(rounded, form, fault))
+        )
 
     def _descended(
-        self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], exponents: np.ndarray, form: Form
+        self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
     ) -> tuple[HypothesisFit, np.ndarray, Form]:
         """Return the fit of lowest cost near initial exponents (m,) of the factors, its exponents, and its form.
 
-        The senses of several joints are reversed one by one, as long as this lowers the cost: mirror images of some
-        arms have about the same cost.
+        The senses of several joints are reversed one by one while the torques are not explained and the cost falls.
         """
-        for _ in range(len(exponents) + 1):
+
+        def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
             at = partial(scaled, form=form)
-            start, _ = problem.descend(at, exponents, largest=0.5, smallest=0.002)
-            exponents, fit = problem.descend(at, start, largest=0.5, smallest=0.002)
-            sense, torque_sense, power = form
-            signs = 1 - 2 * np.eye(len(exponents))
-            others: list[Form] = [(x * sense, (x if power else 1) * torque_sense, power) for x in signs]
-            best = min(others, key=lambda x: problem.fit(scaled(exponents, x)).cost)
-            if (
-                len(exponents) == 1
-                or problem.fit(scaled(exponents, best)).cost > fit.cost - GEOMETRY.ambiguous
-            ):
+            exponents = start
+            for _ in range(3):
+                exponents, fit = problem.descend(at, exponents, largest=0.5, smallest=0.002)
+            return fit, exponents, form
+
+        best = lowest(form)
+        while len(start) > 1 and best[0].errors.max() > GEOMETRY.explained:
+            _, _, (sense, torque_sense, power) = best
+            reversed_forms = [(x * sense, x**power * torque_sense, power) for x in 1 - 2 * np.eye(len(start))]
+            other = min(map(lowest, reversed_forms), key=lambda x: x[0].cost)
+            if other[0].cost > best[0].cost - GEOMETRY.ambiguous:
                 break
-            form = best
-        return fit, exponents, form
+            best = other
+        return best
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
