@@ -5,6 +5,7 @@ One model of recordings with different loads, or of torques before and after a c
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,10 @@ TOGETHER = 20
 """Number of recordings that are compared at a time. It bounds the number of columns of the least-squares problem."""
 SAMPLES = 1200
 """Largest number of samples of these recordings."""
-SLIGHT = 15.0
-"""Decrease of the cost by an approximate change of the torques below which the exact decrease is not computed."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
+Candidate = tuple[float, int, float, int | None]
+"""Change of the cost, recording, time [s] and joint (None: all joints) of a possible change of the torques."""
 
 
 class LoadChange(NamedTuple):
@@ -70,7 +71,7 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     # The first effects of `FRICTION` are the armature, viscous and Coulomb friction.
     friction = rows[..., last + 10 + n : last + 10 + 3 * n]
     common, offset, other_friction, load = (
-        _refit(subset, fit, columns, recordings)
+        _refit(subset, fit, columns, [subset.samples.recording == x for x in recordings])
         for columns in (rows[..., :0], offsets, friction, rows[..., last : last + 4])
     )
     if load.misfit > min(offset.misfit, other_friction.misfit, common.misfit - GEOMETRY.needed):
@@ -120,37 +121,37 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     and more than other friction of the joints together with offsets that drift: a load that the arm picks up, friction
     that falls as the drives warm up, and drifting sensors are no changes of the torques' unit.
     """
-    subset = problem.thinned(SAMPLES).with_hysteresis()
+    subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
     fit = subset.fit(subset.unchanged)
     residual = subset.residual(subset.unchanged, fit.parameters)
-    torque = residual + subset.unchanged.signals(subset.samples).tau
-    variance = len(residual) * np.maximum(subset.unchanged.signals(subset.samples).tau.var(axis=0), 1e-30)
-    found = list[tuple[float, int | None, int, float]]()
+    tau = subset.unchanged.signals(subset.samples).tau
+    single, common = list[Candidate](), list[Candidate]()
     for recording in np.unique(subset.samples.recording).tolist():
         rows = subset.samples.recording == recording
         times = subset.samples.times[rows]
-        # A time is tested after each twentieth of the samples.
-        splits = len(times) * np.arange(2, 19) // 20
         if len(times) < 4 * FEWEST or not times.any():
             continue
-        falls = _falls(torque[rows], residual[rows], splits) / variance
-        floor = GEOMETRY.error_floor
-        errors = np.maximum(fit.errors - falls, 0.0) + floor
-        misfits = subset.count / 2 * np.log(errors / (fit.errors + floor))
+        # A time is tested after each twentieth of the samples.
+        splits = len(times) * np.arange(2, 19) // 20
+        falls = (
+            _falls((residual + tau)[rows], residual[rows], splits)
+            / np.maximum(tau.var(axis=0), 1e-30)
+            / len(tau)
+        )
+        errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
+        misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
         split, joint = np.unravel_index(misfits.argmin(), misfits.shape)
-        found.append((float(misfits[split, joint]), int(joint), recording, float(times[splits[split]])))
-        split = misfits.sum(axis=1).argmin()
-        found.append((float(misfits[split].sum()), None, recording, float(times[splits[split]])))
-    best, decrease = None, GEOMETRY.needed
-    for is_single in (True, False):
-        likely = [x for x in found if (x[1] is not None) == is_single]
-        misfit, joint, recording, time = min(likely, default=(0.0, None, 0, 0.0), key=lambda x: x[0])
+        single.append((float(misfits.min()), recording, float(times[splits[split]]), int(joint)))
+        total = misfits.sum(axis=1)
+        common.append((float(total.min()), recording, float(times[splits[total.argmin()]]), None))
+    changes = []
+    for candidates in filter(None, (single, common)):
+        misfit, recording, time, joint = min(candidates, key=itemgetter(0))
         # The exact comparison takes time: it is omitted if the residual shows hardly any change.
-        if misfit < -SLIGHT:
-            change, fall = _change(subset, fit, torque, (recording, time, joint))
-            if fall > decrease:
-                best, decrease = change, fall
-    return best
+        if misfit < -GEOMETRY.needed:
+            changes.append(_change(subset, fit, residual + tau, recording, time, joint))
+    fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
+    return change if fall > GEOMETRY.needed else None
 
 
 def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
@@ -176,73 +177,72 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
 
 
 def _change(
-    problem: GeometryProblem, fit: HypothesisFit, torque: np.ndarray, where: tuple[int, float, int | None]
-) -> tuple[TorqueChange, float]:
-    """Return the change of the torques at a time, and the fall of the cost compared with a load or other friction.
+    problem: GeometryProblem,
+    fit: HypothesisFit,
+    torque: np.ndarray,
+    recording: int,
+    time: float,
+    joint: int | None,
+) -> tuple[float, TorqueChange]:
+    """Return the fall of the cost, compared with a load or other friction, by a change of torques, and this change.
 
-    where: recording, time [s], and joint with the change, None for all joints.
+    torque: torques of the model of `fit`, (S, n) [Nm, N]. recording, time, joint: see `TorqueChange`.
     """
-    recording, time, joint = where
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
     chosen = np.arange(n) if joint is None else np.array([joint])
     part = (problem.samples.recording == recording)[:, None, None]
     late = part & (problem.samples.times >= time)[:, None, None]
     offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
+    columns = [torque[..., None] * offsets.any(axis=2)[..., None] * late]
+    columns += [offsets * late] if joint is not None else []
+    whole = [np.ones(len(rows), bool)]
+    refits = [_refit(problem, fit, x, whole) for x in columns]
+    best = min(refits, key=lambda x: x.misfit)
+    quantity = float(best.quantities[0, 0])
+    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    change = TorqueChange(recording, time, joint, factor, offset)
+    # Other faults of the log leave a large residual.
+    if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
+        return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * part
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
-    factor = torque[..., None] * offsets.any(axis=2)[..., None]
-    joined = problem.selected(np.full(len(rows), True))
-    joined.samples = joined.samples._replace(recording=np.zeros(len(rows), int))
-    alternatives = [
-        rows[..., :0],
-        rows[..., last : last + 4] * late,
-        np.concatenate([friction, drift], axis=2),
-    ]
-    bound = min(_refit(joined, fit, columns, [0]).misfit for columns in alternatives)
-    scaled = _refit(joined, fit, factor * late, [0])
-    refit, ratio, offset = scaled, 1 + float(scaled.quantities[0, 0]), 0.0
-    if joint is not None:
-        shifted = _refit(joined, fit, offsets * late, [0])
-        if shifted.misfit < scaled.misfit:
-            refit, ratio, offset = shifted, 1.0, float(shifted.quantities[0, 0])
-    variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
-    # Other faults of the log leave a large residual.
-    is_explained = np.mean(np.square(refit.residual).mean(axis=0) / variance) <= GEOMETRY.explained
-    return TorqueChange(recording, time, joint, ratio, offset), (bound - refit.misfit) * bool(is_explained)
+    others = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)
+    return min(_refit(problem, fit, x, whole).misfit for x in others) - best.misfit, change
 
 
 class _Refit(NamedTuple):
-    """Fit of torques with D additional quantities of each of R recordings.
+    """Fit of torques with D additional quantities of each of R parts of the samples, such as recordings.
 
     Attributes:
         misfit: negative log likelihood.
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
         residual: torques of the model minus the logged torques, (S, n) [Nm, N].
-        quantities: (R, D) quantities of the recordings.
+        quantities: (R, D) quantities of the parts.
         covariance: (R, D, R, D) covariance of the quantities.
     """
 
     misfit: float
+    errors: np.ndarray
     residual: np.ndarray
     quantities: np.ndarray
     covariance: np.ndarray
 
 
 def _refit(
-    problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, recordings: Sequence[int]
+    problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, parts: Sequence[np.ndarray]
 ) -> _Refit:
-    """Return the fit of the torques with additional quantities of each recording.
+    """Return the fit of the torques with additional quantities of each of R parts of the samples.
 
     Args:
-        problem: problem with the samples of the recordings.
+        problem: problem with the samples.
         fit: its fit without additional quantities.
-        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's recording.
-        recordings: indices of the R recordings.
+        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's part.
+        parts: masks (S,) of the samples of the parts.
     """
     count, size = len(fit.parameters), columns.shape[2]
-    number = problem.samples.recording[:, None, None]
-    joined = np.concatenate([columns * (number == recording) for recording in recordings], axis=2)
+    joined = np.concatenate([columns * part[:, None, None] for part in parts], axis=2)
     variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
     # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
     for _ in range(3):
@@ -251,6 +251,6 @@ def _refit(
         residual = problem.residual(problem.unchanged, parameters) + joined @ change[count:]
         errors = np.square(residual).mean(axis=0) / variance
         fit = replace(fit, errors=errors, parameters=parameters)
-    shape = len(recordings), size
+    shape = len(parts), size
     added = covariance[count:, count:].reshape(*shape, *shape)
-    return _Refit(problem.misfit(errors), residual, change[count:].reshape(shape), added)
+    return _Refit(problem.misfit(errors), errors, residual, change[count:].reshape(shape), added)

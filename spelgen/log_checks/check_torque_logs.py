@@ -398,7 +398,9 @@ class TorqueLogs:
         unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
         fault = PositionUnit([], [turning], PositionUnit([]))
         best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
-        is_explained = unit.errors.max() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
+        is_explained = (
+            unit.errors.max() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
+        )
         if best.cost > unit.cost - GEOMETRY.needed or is_explained:
             return error
         if best.errors.max() <= GEOMETRY.explained:
