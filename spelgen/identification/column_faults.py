@@ -18,6 +18,7 @@ from spelgen.settings.log_mapping import SCALES
 
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 Form = tuple[np.ndarray, np.ndarray, int]
+LARGEST_GEAR = 500.0  # [1]
 GIVE_GEAR = (
     "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
     "the gear ratio"
@@ -448,7 +449,9 @@ class PositionUnit(WrongScale):
         if len(joints) == 1:
             lowest[lowest.argmin()] = np.inf
             sides.append(lowest.min() - GEOMETRY.ambiguous + GEOMETRY.right_angle)
-        fault = self if min(sides) > best.cost + GEOMETRY.right_angle else self._open_fault or self
+        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        is_sure = min(sides) > best.cost + GEOMETRY.right_angle and np.exp(-exponents).max() < LARGEST_GEAR
+        fault = self if is_sure else self._open_fault or self
         scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
