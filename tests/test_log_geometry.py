@@ -380,7 +380,10 @@ def test_the_sense_of_a_joint_is_more_likely_than_an_exchange_that_explains_litt
         present.changed(order, source=present.source[:, ::-1]),
         present.changed(sense, scale=sign),
     )
-    fits = [HypothesisFit(x, cost, 0.0, *np.zeros((3, 1))) for x, cost in zip(hypotheses, (0, -30, -14), strict=True)]
+    fits = [
+        HypothesisFit(x, cost, 0.0, *np.zeros((3, 1)))
+        for x, cost in zip(hypotheses, (0, -30, -14), strict=True)
+    ]
     assert [x.hypothesis.faults for x in _likely(fits[0], fits)] == [(sense,), (order,)]
     assert [x.hypothesis.faults for x in _likely(fits[0], [fits[1], replace(fits[2], cost=-5.0)])] == [
         (order,)

@@ -410,7 +410,7 @@ class TorqueLogs:
         converted = self._problem(unit.hypothesis.signals(problem.samples))
         if converted is not None:
             _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
-            if better and better[0].errors.max() <= GEOMETRY.unexplained:
+            if better and better[0].errors.mean() <= GEOMETRY.explained:
                 return error
         message, _, unit_text = error.got.partition(": ")
         do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
