@@ -39,7 +39,7 @@ class WrongOrder(Fault):
         """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
-        # exchanged columns of only the motion, or only the torques, are less frequent than those of whole joints
+        # exchanged columns of only the motion, or only the torques, are less frequent than exchanged whole joints
         self.rarity = 0 if len(rows) == 2 else 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:

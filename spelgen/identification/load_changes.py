@@ -202,7 +202,7 @@ def _change(
     quantity = float(best.quantities[0, 0])
     factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
     change = TorqueChange(recording, time, joint, factor, offset)
-    # Other faults of the log leave a large residual.
+    # Other faults of the log cause a large residual.
     if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
         return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * part
