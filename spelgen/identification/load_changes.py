@@ -173,7 +173,7 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
             rest**2 / count + slope**2 / np.maximum(squares - sum_**2 / count, 1e-9 * squares + 1e-30)
         )
 
-    return explained(before) + explained(total - before) - explained(total)
+    return np.asarray(explained(before) + explained(total - before) - explained(total))
 
 
 def _change(
@@ -192,7 +192,7 @@ def _change(
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
     chosen = np.arange(n) if joint is None else np.array([joint])
     part = (problem.samples.recording == recording)[:, None, None]
-    late = part & (problem.samples.times >= time)[:, None, None]
+    late = part * (problem.samples.times[:, None, None] >= time)
     offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
     columns = [torque[..., None] * offsets.any(axis=2)[..., None] * late]
     columns += [offsets * late] if joint is not None else []
