@@ -475,7 +475,10 @@ class PositionUnit(WrongScale):
             at = partial(scaled, form=form)
             exponents = start
             for _ in range(3):
-                exponents, fit = problem.descend(at, exponents, largest=0.5, smallest=0.002)
+                # ratios from 1.5 to 1000, as of mm
+                exponents, fit = problem.descend(
+                    at, exponents, largest=0.5, smallest=0.002, allowed=lambda x: np.clip(x, -7.0, -0.4)
+                )
             return fit, exponents, form
 
         best = lowest(form)
