@@ -176,6 +176,40 @@ def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_t
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize(("third", "is_motor_torque"), [(-121.0, False), (121.0, True)])
+def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp_path):  # noqa: F811
+    """If all joints are logged at their motors, the lines have the gear ratios that explain the torques."""
+    log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, third, 80.0])
+    tau = log.tau / (gears if is_motor_torque else 1.0)
+    wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=tau)
+    error = told(arm, wrong)
+    assert "--accept joint-unit" in error
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    again, (read,) = mended(arm, error, tmp_path / "log.csv")
+    assert (np.abs(read.q - log.q).max(axis=0) < 0.02 * np.ptp(log.q, axis=0)).all()
+    assert check_logs([read], again).errors == ()
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
+    """Joints at their motors with the torques of other joints: neither degrees nor another unit is advised."""
+    log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, 121.0, 80.0])
+    wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[:, [2, 0, 3, 1]])
+    error = told(arm, wrong)
+    assert "'units: {" not in error and "counts_per_turn', 2 pi times the gear ratio" in error
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize("reversed_joint", [None, 1])
+def test_degrees_are_advised_also_if_a_joint_has_another_fault(arm, reversed_joint):  # noqa: F811
+    log = recorded(arm, 18, noise=0.01)
+    sign = np.where(np.arange(log.q.shape[1]) == reversed_joint, -1.0, 1.0)
+    degrees = 180 / np.pi
+    error = told(arm, replace(log, q=degrees * log.q, qd=degrees * log.qd, tau=log.tau * sign))
+    assert "units: {q: deg, qd: deg/s}" in error and "counts" not in error.partition("write")[2]
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # noqa: F811
     """Torques in percent of each joint's rated torque get one gain per joint; their ratios are right to about 30 %."""
     log, gains = recorded(arm, 16, noise=0.01), np.array([1.3, 0.02, 0.4, 0.006])

@@ -9,6 +9,7 @@ from test_log_geometry import arm, pick_and_place, recorded  # noqa: F401
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor_dynamics import regressor
+from spelgen.errors import LogError
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.logs.read import read_logs
 
@@ -95,6 +96,45 @@ def test_training_is_told_of_different_loads(arm):  # noqa: F811
     first, second, *_ = parts(recorded(arm, 5))
     notes = require_sound_logs([loaded(arm, first, 2.0), second], arm)
     assert "different-loads" in [note.code for note in notes]
+
+
+@pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
+@pytest.mark.parametrize("joint", [None, 0, 1])
+@pytest.mark.parametrize("factor", [0.7, 1.5])
+def test_torques_whose_scale_changes_within_a_recording_are_an_error(arm, joint, factor):  # noqa: F811
+    """The error names the joint and the time of the change, also in one of several recordings."""
+    log = recorded(arm, 6)
+    late = log.t[:, None] > 0.6 * log.t[-1]
+    changed = late if joint is None else late & (np.arange(log.q.shape[1]) == joint)
+    wrong = replace(log, tau=log.tau * np.where(changed, factor, 1.0))
+    with pytest.raises(LogError, match="--accept torque-changed") as caught:
+        require_sound_logs([wrong], arm)
+    assert ("all joints" if joint is None else repr(arm.chain.joint_names[joint])) in str(caught.value)
+    time, ratio = re.search(r"from about (\S+) s .* (\S+) times", str(caught.value)).groups()
+    assert abs(float(time) - 12.0) <= 1.0 and (float(ratio) > 1) == (factor > 1)
+
+
+@pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
+def test_another_zero_of_a_torque_within_a_recording_is_an_error(arm):  # noqa: F811
+    log, k = recorded(arm, 7), 1
+    late = (log.t[:, None] > 8.0) & (np.arange(log.q.shape[1]) == k)
+    (error,) = check_logs([replace(log, tau=log.tau + late * log.tau[:, k].std())], arm).errors
+    assert "another zero" in str(error) and repr(arm.chain.joint_names[k]) in str(error)
+
+
+@pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
+@pytest.mark.parametrize("seed", [8, 9])
+def test_a_load_that_is_picked_up_or_warm_friction_is_no_change_of_torques(arm, seed):  # noqa: F811
+    log = recorded(arm, seed)
+    size, late = log.tau.std(axis=0), log.t[:, None] > 9.0
+    warm = 0.15 * size * np.exp(-log.t / 6.0)[:, None]
+    for tau in (
+        log.tau,
+        np.where(late, loaded(arm, log, 2.0).tau, log.tau),
+        log.tau + warm * np.sign(log.qd),
+        log.tau + 0.3 * size * log.t[:, None] / log.t[-1],
+    ):
+        assert not any("torque-changed" in str(x) for x in check_logs([replace(log, tau=tau)], arm).errors)
 
 
 def test_recordings_of_a_ur10e_with_loads_are_found(shared):

@@ -16,6 +16,8 @@ from scipy.signal import lfilter
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.errors import SpelgenError
+from spelgen.identification.geometry_search import _likely, kinds_of_faults
+from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.log_checks.check_logs import check_logs, require_sound_logs
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -358,6 +360,41 @@ def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
     sound = replace(log, qd=qd)
     assert "velocity-is-no-derivative" not in [x.code for x in check_logs([sound], arm).findings]
     assert "--accept joint-sense" in told(arm, flipped(sound, 1, True, False))
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
+    """The derivatives of positions are used in place of velocities that are wrong for no known reason."""
+    log, rng = recorded(arm, 21), np.random.default_rng(21)
+    noise = rng.normal(size=len(log.t)) * log.qd[:, joint].std()
+    for velocity in (1.5 * log.qd[:, joint], noise):
+        sound = replace(log, qd=np.where(np.arange(log.q.shape[1]) == joint, velocity[:, None], log.qd))
+        report = check_logs([sound], arm)
+        assert report.errors == ()
+        assert "velocity-is-no-derivative" in [x.code for x in report.findings]
+        for k in range(2):
+            assert "--accept joint-sense" in told(arm, flipped(sound, k, True, False))
+
+
+def test_the_sense_of_a_joint_is_more_likely_than_an_exchange_that_explains_little_more(arm):
+    """An exchange of columns may explain errors of the friction model better, by less than wrong hypotheses do."""
+    order, _, _, _, sense, *_ = kinds_of_faults(arm.chain)
+    present = Hypothesis.unchanged(arm.chain)
+    sign = np.ones_like(present.scale)
+    sign[1, 0] = -1.0
+    hypotheses = (
+        present,
+        present.changed(order, source=present.source[:, ::-1]),
+        present.changed(sense, scale=sign),
+    )
+    fits = [
+        HypothesisFit(x, cost, 0.0, *np.zeros((3, 1)))
+        for x, cost in zip(hypotheses, (0, -30, -14), strict=True)
+    ]
+    assert [x.hypothesis.faults for x in _likely(fits[0], fits)] == [(sense,), (order,)]
+    assert [x.hypothesis.faults for x in _likely(fits[0], [fits[1], replace(fits[2], cost=-5.0)])] == [
+        (order,)
+    ]
 
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from spelgen.arm.arm import Chain
 from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
@@ -17,6 +17,8 @@ from spelgen.logs.joint_signals import plain_number
 from spelgen.settings.log_mapping import SCALES
 
 UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
+Form = tuple[np.ndarray, np.ndarray, int]
+LARGEST_GEAR = 500.0  # [1]
 GIVE_GEAR = (
     "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
     "the gear ratio"
@@ -37,6 +39,8 @@ class WrongOrder(Fault):
         """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
+        # exchanged columns of only the motion, or only the torques, are less frequent than exchanged whole joints
+        self.rarity = 0 if len(rows) == 2 else 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each pair of joints, the least-squares fit of the log's torques with their columns exchanged.
@@ -381,8 +385,8 @@ def rounded_factor(factor: float) -> float:
 class PositionUnit(WrongScale):
     """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
 
-    The unit of all joints of a type is one of `UNITS`. The factor of a single joint is optimised, since its positions
-    may be the positions of its motor, before a gear of any ratio.
+    The unit of all joints of a type is one of `UNITS`. The factors of groups of joints are optimised, since their
+    positions may be the positions of motors, before gears of any ratio.
     """
 
     code = "joint-unit"
@@ -392,23 +396,23 @@ class PositionUnit(WrongScale):
     def __init__(
         self,
         factors: Sequence[np.ndarray],
-        joints: Sequence[int] = (),
+        groups: Sequence[list[int]] = (),
         open_fault: PositionUnit | None = None,
     ) -> None:
         """Define the candidates for other units of the positions of n joints.
 
         Args:
             factors: candidates for the factors of all joints of a type, (2, n) each.
-            joints: indices of the joints whose factor is also optimised separately.
-            open_fault: fault that replaces this one if the log does not determine the factor. None: this object is such
-                a fault; it advises the user to specify the unit or the gear ratio.
+            groups: indices of the joints of each group whose factors are also optimised.
+            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
+                a fault, and no setting is advised for it.
         """
         super().__init__(factors)
-        self._joints, self._open_fault = joints, open_fault
+        self._groups, self._open_fault = groups, open_fault
         self.advice = "" if open_fault else GIVE_GEAR
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with other units of all joints, and with the best factor of each single joint.
+        """Yield the least-squares fits with other units of all joints, and with the best factors of each group.
 
         A single joint is omitted if the hypothesis of `base` already changes its unit.
         """
@@ -416,46 +420,87 @@ class PositionUnit(WrongScale):
         # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
         if base.errors.max() <= GEOMETRY.explained:
             return
-        for k in self._joints:
-            if abs(base.hypothesis.scale[0, k]) == abs(problem.unchanged.scale[0, k]):
-                yield self._single(problem, base, k)
+        is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
+        yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
 
-    def _single(self, problem: GeometryProblem, base: HypothesisFit, joint: int) -> HypothesisFit:
-        """Return the least-squares fit with the best factor on the positions of one joint.
+    def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
+        """Return the least-squares fit with the best factor on the positions of each of m joints.
 
-        A unit in `UNITS` is preferred if its cost is about equal. Other factors are rounded to three digits.
+        Units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
         """
-        scale, present = base.hypothesis.scale, abs(float(problem.unchanged.scale[0, joint]))
-        span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joint]))
+        scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
+        span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
 
-        def fitted(exponent: float, form: tuple[int, int, int], fault: PositionUnit = self) -> HypothesisFit:
+        def scaled(exponents: np.ndarray, form: Form, fault: PositionUnit = self) -> Hypothesis:
             factors, (sense, torque_sense, power) = np.ones_like(scale), form
-            factors[:, joint] = sense * np.exp(exponent), torque_sense * np.exp(-power * exponent)
-            return problem.fit(base.hypothesis.changed(fault, scale=scale * factors))
+            factors[:, joints] = sense * np.exp(exponents), torque_sense * np.exp(-power * exponents)
+            return base.hypothesis.changed(fault, scale=scale * factors)
 
-        # A form is (sense of the motion, sense of the torque, power of the factor by which the torque is divided).
-        # Power 0: the logged torque is the torque of the joint, of either sense if the motion is reversed. Power 1: it
-        # is the torque of the motor, which the gear multiplies.
-        forms = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
-        # the motion ranges over at least 0.05 rad or m, and at most two turns
-        exponents = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
-        costs = np.array([[fitted(x, form).cost for form in forms] for x in exponents])
-        row, column = np.unravel_index(costs.argmin(), costs.shape)
-        form, start = forms[column], float(exponents[row])
-        best = minimize_scalar(
-            lambda x: fitted(x, form).cost,
-            bounds=(start - 0.15, start + 0.15), method="bounded", options={"xatol": 0.002},
+        # Forms (senses of the motion, senses of the torque, power): the torque of the joint (power 0), of either sense
+        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        ones = np.ones(len(joints))
+        signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
+        # `_descended` reverses the senses of several joints.
+        forms: list[Form] = [
+            (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
+        ]
+        # the largest motion is at least 0.05 rad or m, and at most two turns
+        common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
+        costs = np.array([[problem.fit(scaled(x * ones, form)).cost for form in forms] for x in common])
+        lowest = costs.min(axis=0)
+        best, exponents, form = min(
+            (self._descended(problem, scaled, float(common[costs[:, k].argmin()]) * ones, forms[k])
+            for k in lowest.argsort()[: 1 if len(ones) == 1 else 2].tolist()),
+            key=lambda x: x[0].cost,
         )  # fmt: skip
-        # The log does not determine the factor if a factor that is 10 % larger or smaller, or another form, explains
-        # the log about equally well.
-        sides = [fitted(best.x + change, form).cost for change in (-0.1, 0.1)]
-        sides += np.delete(costs.min(axis=0) - GEOMETRY.ambiguous + GEOMETRY.right_angle, column).tolist()
-        fault = self if min(sides) > best.fun + GEOMETRY.right_angle else self._open_fault or self
-        exact = [np.log(SCALES.get(x, 1.0) / present) for x in UNITS[problem.arm.joint_types[joint]]]
-        unit = fitted(min(exact, key=lambda x: abs(x - best.x)), form, fault)
-        if unit.cost < best.fun + GEOMETRY.right_angle:
-            return unit
-        return fitted(-np.log(float(f"{np.exp(-best.x) / present:.3g}") * present), form, fault)
+        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well,
+        # or, for a single joint, if another form does.
+        steps = 0.1 * np.concatenate([np.eye(len(joints)), -np.eye(len(joints))])
+        sides = [problem.fit(scaled(exponents + x, form)).cost for x in steps]
+        if len(joints) == 1:
+            lowest[lowest.argmin()] = np.inf
+            sides.append(lowest.min() - GEOMETRY.ambiguous + GEOMETRY.right_angle)
+        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        is_sure = min(sides) > best.cost + GEOMETRY.right_angle and np.exp(-exponents).max() < LARGEST_GEAR
+        fault = self if is_sure else self._open_fault or self
+        scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
+        exact = np.log(np.array(scales)[:, None] / present)
+        nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
+        rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
+        unit = problem.fit(scaled(np.where(np.abs(nearest - exponents) < 0.1, nearest, rounded), form, fault))
+        return (
+            unit
+            if unit.cost < best.cost + GEOMETRY.right_angle
+            else problem.fit(scaled(rounded, form, fault))
+        )
+
+    def _descended(
+        self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
+    ) -> tuple[HypothesisFit, np.ndarray, Form]:
+        """Return the fit of lowest cost near initial exponents (m,) of the factors, its exponents, and its form.
+
+        The senses of several joints are reversed one by one while the torques are not explained and the cost falls.
+        """
+
+        def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
+            at = partial(scaled, form=form)
+            exponents = start
+            for _ in range(3):
+                # ratios from 1.5 to 1000, as of mm
+                exponents, fit = problem.descend(
+                    at, exponents, largest=0.5, smallest=0.002, allowed=lambda x: np.clip(x, -7.0, -0.4)
+                )
+            return fit, exponents, form
+
+        best = lowest(form)
+        while len(start) > 1 and best[0].errors.max() > GEOMETRY.explained:
+            _, _, (sense, torque_sense, power) = best
+            reversed_forms = [(x * sense, x**power * torque_sense, power) for x in 1 - 2 * np.eye(len(start))]
+            other = min(map(lowest, reversed_forms), key=lambda x: x[0].cost)
+            if other[0].cost > best[0].cost - GEOMETRY.ambiguous:
+                break
+            best = other
+        return best
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
@@ -467,11 +512,18 @@ class PositionUnit(WrongScale):
     def text(self, correction: Correction) -> str:
         """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
         motion, torque = correction.factors
-        texts = []
+        texts, ratios = [], dict[str, list[str]]()
         for k in np.flatnonzero(self.has(motion, torque)).tolist():
             unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
-            gear = f"about {abs(1 / motion[k]):.3g} times as large as the joint's{sense}, as at the motor of a gear"
-            texts.append(f"positions in {unit}{sense}" if unit else f"positions {gear}")
+            if unit:
+                texts.append(f"positions in {unit}{sense}")
+            else:
+                ratios.setdefault(sense, []).append(f"{abs(1 / motion[k]):.3g}")
+        for sense, gears in ratios.items():
+            times = ", ".join(dict.fromkeys(gears))
+            texts.append(
+                f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear"
+            )
         return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 

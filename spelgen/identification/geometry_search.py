@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.arm.arm import Chain
 from spelgen.identification.column_faults import JointSense, TorqueSense, WrongOrder
 from spelgen.identification.continuous_faults import Compensation, Gravity, ZeroOffset
-from spelgen.identification.hypotheses import Fault, HypothesisFit
+from spelgen.identification.hypotheses import Fault, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.time_faults import Delay, JointClock
 from spelgen.identification.tuning import GEOMETRY
@@ -197,7 +197,20 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 
     unchanged: fit of the unchanged log. fits: fits of hypotheses that correct faults of the log.
     """
-    best = min(fit.cost for fit in fits)
-    if best > unchanged.cost - GEOMETRY.needed:
+    best = min(fits, key=attrgetter("cost"))
+    if best.cost > unchanged.cost - GEOMETRY.needed:
         return ()
-    return tuple(sorted((fit for fit in fits if fit.cost < best + GEOMETRY.ambiguous), key=RANK))
+    likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=RANK)
+    # Exchanged columns may also explain errors of the friction model, by less than `needed`. The opposite sense of a
+    # single joint is then listed first, since it is more frequent than exchanged columns.
+    if isinstance(likely[0].hypothesis.faults[0], WrongOrder):
+        bound = min(likely[0].rank + GEOMETRY.needed, unchanged.cost - GEOMETRY.ambiguous)
+        senses = [fit for fit in fits if fit.rank < bound and _is_one_sense(fit.hypothesis)]
+        likely = [*sorted(senses, key=RANK)[:1], *(fit for fit in likely if fit not in senses)]
+    return tuple(likely)
+
+
+def _is_one_sense(hypothesis: Hypothesis) -> bool:
+    """Return True for a hypothesis that only corrects the opposite sense of one joint."""
+    is_sense = len(hypothesis.faults) == 1 and isinstance(hypothesis.faults[0], JointSense | TorqueSense)
+    return is_sense and int((hypothesis.scale < 0).any(axis=0).sum()) == 1

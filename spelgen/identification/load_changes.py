@@ -1,7 +1,11 @@
-"""Loads that differ between recordings: the model of one load is wrong for recordings with another one."""
+"""Changes between and within recordings: another load, and torques that have another scale or zero from a time on.
+
+One model of recordings with different loads, or of torques before and after a change, is wrong for all of them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +20,8 @@ SAMPLES = 1200
 """Largest number of samples of these recordings."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
+Candidate = tuple[float, int, float, int | None]
+"""Change of the cost, recording, time [s] and joint (None: all joints) of a possible change of the torques."""
 
 
 class LoadChange(NamedTuple):
@@ -65,7 +71,7 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     # The first effects of `FRICTION` are the armature, viscous and Coulomb friction.
     friction = rows[..., last + 10 + n : last + 10 + 3 * n]
     common, offset, other_friction, load = (
-        _refit(subset, fit, columns, recordings)
+        _refit(subset, fit, columns, [subset.samples.recording == x for x in recordings])
         for columns in (rows[..., :0], offsets, friction, rows[..., last : last + 4])
     )
     if load.misfit > min(offset.misfit, other_friction.misfit, common.misfit - GEOMETRY.needed):
@@ -89,36 +95,154 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     return changes
 
 
+class TorqueChange(NamedTuple):
+    """Change of the scale or zero of logged torques within a recording.
+
+    Attributes:
+        recording: index of the recording.
+        time: time of the change since the start of the recording [s].
+        joint: index of the joint, or None for a change of the torques of all joints.
+        factor: ratio of the torques after the change to the torques before it.
+        offset: torque that is added after the change [Nm, N]; 0 if the scale changes.
+    """
+
+    recording: int
+    time: float
+    joint: int | None
+    factor: float
+    offset: float
+
+
+def torque_change(problem: GeometryProblem) -> TorqueChange | None:
+    """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
+
+    The changes are: another factor on the torque of one joint or, in common, of all joints, and another offset of the
+    torque of one joint. A change must lower the negative log likelihood by `GEOMETRY.needed` more than another load,
+    and more than other friction of the joints together with offsets that drift: a load that the arm picks up, friction
+    that falls as the drives warm up, and drifting sensors are no changes of the torques' unit.
+    """
+    subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
+    fit = subset.fit(subset.unchanged)
+    residual = subset.residual(subset.unchanged, fit.parameters)
+    tau = subset.unchanged.signals(subset.samples).tau
+    single, common = list[Candidate](), list[Candidate]()
+    for recording in np.unique(subset.samples.recording).tolist():
+        rows = subset.samples.recording == recording
+        times = subset.samples.times[rows]
+        if len(times) < 4 * FEWEST or not times.any():
+            continue
+        # A time is tested after each twentieth of the samples.
+        splits = len(times) * np.arange(2, 19) // 20
+        falls = (
+            _falls((residual + tau)[rows], residual[rows], splits)
+            / np.maximum(tau.var(axis=0), 1e-30)
+            / len(tau)
+        )
+        errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
+        misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
+        split, joint = np.unravel_index(misfits.argmin(), misfits.shape)
+        single.append((float(misfits.min()), recording, float(times[splits[split]]), int(joint)))
+        total = misfits.sum(axis=1)
+        common.append((float(total.min()), recording, float(times[splits[total.argmin()]]), None))
+    changes = []
+    for candidates in filter(None, (single, common)):
+        misfit, recording, time, joint = min(candidates, key=itemgetter(0))
+        # The exact comparison takes time: it is omitted if the residual shows hardly any change.
+        if misfit < -GEOMETRY.needed:
+            changes.append(_change(subset, fit, residual + tau, recording, time, joint))
+    fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
+    return change if fall > GEOMETRY.needed else None
+
+
+def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
+    """Return decreases (C, n) of squared residuals by separate factors and offsets of torques before and after times.
+
+    torque, residual: torques of the model and their residuals, (S, n) [Nm, N]. splits: (C,) numbers of samples before
+    each time.
+    """
+    ones = np.ones_like(torque)
+    products = [torque * torque, torque, ones, torque * residual, residual]
+    before = np.cumsum(products, axis=1)[:, splits - 1]
+    total = np.sum(products, axis=1)[:, None]
+
+    def explained(sums: np.ndarray) -> np.ndarray:
+        """Return the squares that a factor and an offset explain, from sums of products (5, C, n)."""
+        squares, sum_, count, product, rest = sums
+        slope = product - sum_ * rest / count
+        return np.asarray(
+            rest**2 / count + slope**2 / np.maximum(squares - sum_**2 / count, 1e-9 * squares + 1e-30)
+        )
+
+    return np.asarray(explained(before) + explained(total - before) - explained(total))
+
+
+def _change(
+    problem: GeometryProblem,
+    fit: HypothesisFit,
+    torque: np.ndarray,
+    recording: int,
+    time: float,
+    joint: int | None,
+) -> tuple[float, TorqueChange]:
+    """Return the fall of the cost, compared with a load or other friction, by a change of torques, and this change.
+
+    torque: torques of the model of `fit`, (S, n) [Nm, N]. recording, time, joint: see `TorqueChange`.
+    """
+    rows, _ = problem.equations(problem.unchanged)
+    last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
+    chosen = np.arange(n) if joint is None else np.array([joint])
+    part = (problem.samples.recording == recording)[:, None, None]
+    late = part * (problem.samples.times[:, None, None] >= time)
+    offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
+    columns = [torque[..., None] * offsets.any(axis=2)[..., None] * late]
+    columns += [offsets * late] if joint is not None else []
+    whole = [np.ones(len(rows), bool)]
+    refits = [_refit(problem, fit, x, whole) for x in columns]
+    best = min(refits, key=lambda x: x.misfit)
+    quantity = float(best.quantities[0, 0])
+    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    change = TorqueChange(recording, time, joint, factor, offset)
+    # Other faults of the log cause a large residual.
+    if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
+        return 0.0, change
+    drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * part
+    viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
+    friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
+    others = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)
+    return min(_refit(problem, fit, x, whole).misfit for x in others) - best.misfit, change
+
+
 class _Refit(NamedTuple):
-    """Fit of torques with D additional quantities of each of R recordings.
+    """Fit of torques with D additional quantities of each of R parts of the samples, such as recordings.
 
     Attributes:
         misfit: negative log likelihood.
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
         residual: torques of the model minus the logged torques, (S, n) [Nm, N].
-        quantities: (R, D) quantities of the recordings.
+        quantities: (R, D) quantities of the parts.
         covariance: (R, D, R, D) covariance of the quantities.
     """
 
     misfit: float
+    errors: np.ndarray
     residual: np.ndarray
     quantities: np.ndarray
     covariance: np.ndarray
 
 
 def _refit(
-    problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, recordings: Sequence[int]
+    problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, parts: Sequence[np.ndarray]
 ) -> _Refit:
-    """Return the fit of the torques with additional quantities of each recording.
+    """Return the fit of the torques with additional quantities of each of R parts of the samples.
 
     Args:
-        problem: problem with the samples of the recordings.
+        problem: problem with the samples.
         fit: its fit without additional quantities.
-        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's recording.
-        recordings: indices of the R recordings.
+        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's part.
+        parts: masks (S,) of the samples of the parts.
     """
     count, size = len(fit.parameters), columns.shape[2]
-    number = problem.samples.recording[:, None, None]
-    joined = np.concatenate([columns * (number == recording) for recording in recordings], axis=2)
+    joined = np.concatenate([columns * part[:, None, None] for part in parts], axis=2)
     variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
     # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
     for _ in range(3):
@@ -127,6 +251,6 @@ def _refit(
         residual = problem.residual(problem.unchanged, parameters) + joined @ change[count:]
         errors = np.square(residual).mean(axis=0) / variance
         fit = replace(fit, errors=errors, parameters=parameters)
-    shape = len(recordings), size
+    shape = len(parts), size
     added = covariance[count:, count:].reshape(*shape, *shape)
-    return _Refit(problem.misfit(errors), residual, change[count:].reshape(shape), added)
+    return _Refit(problem.misfit(errors), errors, residual, change[count:].reshape(shape), added)

@@ -52,7 +52,7 @@ class GeometryProblem:
         # Number of independent errors per joint. Torque residuals of recorded arms are correlated for about 0.2 s,
         # so that each 0.2 s count as one error. The number is at most 150, since the errors of a rigid model are
         # systematic and do not average out in long logs.
-        self._count = float(np.clip(seconds / 0.2, 1.0, 150.0))
+        self.count = float(np.clip(seconds / 0.2, 1.0, 150.0))
         mean, precision = inertial_prior(arm)
         self._bodies = len(mean)
         # indices of the mass and moments of inertia of the bodies that carry no joint
@@ -211,7 +211,7 @@ class GeometryProblem:
                 load = np.maximum((normal @ x) @ x, 1e-9 * total)
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
-            weights = self._count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
+            weights = self.count / ((errors + GEOMETRY.error_floor) * variance * gains**2)
             matrix = (weights[None] @ normal.reshape(len(normal), -1)).reshape(precision.shape)
             matrix += scale * precision
             # a small ridge on the drive parameters, since the friction of a joint at rest is not identifiable; `drives`
@@ -238,7 +238,7 @@ class GeometryProblem:
 
     def misfit(self, errors: np.ndarray) -> float:
         """Return the negative log likelihood for relative squared residuals `errors` (n,) of the joints."""
-        return 0.5 * self._count * float(np.log(errors + GEOMETRY.error_floor).sum())
+        return 0.5 * self.count * float(np.log(errors + GEOMETRY.error_floor).sum())
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
         """Return the Gauss-Newton step (D,) of D quantities of a hypothesis, such as a delay.
@@ -260,7 +260,7 @@ class GeometryProblem:
         """
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
-        weights = self._count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
+        weights = self.count / (len(tau) * (fit.errors + GEOMETRY.error_floor) * _variance(tau))
         joined = np.concatenate([rows, columns], axis=2) * np.sqrt(weights)[:, None]
         flat = joined.reshape(-1, joined.shape[2])
         matrix = flat.T @ flat

@@ -64,8 +64,7 @@ def check_logs(
     # logs are read one trajectory at a time: an iterator of logs may be larger than memory
     for trajectory in logs:
         require_joints(trajectory, joints)
-        checked.add(trajectory)
-        log_checks.add(trajectory)
+        checked.add(log_checks.add(trajectory))
         measured.append(statistics(trajectory))
         if len(examples) < 2:  # only two are kept: the HTML report plots two trajectories
             examples.append(trajectory)

@@ -12,12 +12,12 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import UNITS, PositionUnit, TorqueUnit, position_factors
+from spelgen.identification.column_faults import GIVE_GEAR, UNITS, PositionUnit, TorqueUnit, position_factors
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
 from spelgen.identification.least_squares import varying
-from spelgen.identification.load_changes import LoadChange, load_changes
+from spelgen.identification.load_changes import LoadChange, load_changes, torque_change
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
@@ -51,10 +51,10 @@ if TYPE_CHECKING:
     from spelgen.arm.configured_arm import Arm
     from spelgen.settings.log_mapping import LogMapping
 
-COUPLED, WRONG_VELOCITY, WRONG_LINK = "coupled-motors", "velocity-is-no-derivative", "urdf-inertials"
+COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
-SMALL_MOTION, LOADS = "small-motion", "different-loads"
-# Codes of warnings that the torques are untested, or that the model does not explain them. Drives are then not tested.
+SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-changed"
+# Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -106,16 +106,15 @@ class TorqueLogs:
         motion = joined_samples([empty, *self._samples]).thinned(6000)
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
-        # The model is fitted only to logs without errors: wrong velocities, for example, result in wrong friction. The
-        # error about an unknown unit of positions is an exception, since the torques may show this unit; a finding that
-        # states the unit then replaces the error.
+        moving = self._moving.samples()
+        # The model is fitted only to logs without errors, since faults give wrong hints.
+        # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
         self._guessed = summary.guessed
-        is_sound = len(summary.errors) <= bool(self._guessed) and not any(
-            x.code == WRONG_VELOCITY for x in summary.notes
-        )
+        if summary.is_presumed and moving is not None:
+            summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]
+        is_sound = len(summary.errors) <= bool(self._guessed)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
-        moving = self._moving.samples()
         if moving is None:
             message = f"no samples for identify and for fits of torques: they need {NEEDED}"
             summary.notes.append(Diagnostic("warning", "no-accelerations", "logs", None, message))
@@ -312,6 +311,10 @@ class TorqueLogs:
         yield from (x for x in wrong if isinstance(x, LogError))
         if wrong:
             return
+        change = self._torque_change(problem) if CHANGED not in accepted else None
+        if change is not None:
+            yield change
+            return
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
@@ -331,6 +334,23 @@ class TorqueLogs:
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             yield from _link_notes(problem, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
+
+    def _torque_change(self, problem: GeometryProblem) -> LogError | None:
+        """Return an error if the scale or zero of torques changes within a recording, else None."""
+        change = None if self._guessed else torque_change(problem)
+        if change is None:
+            return None
+        name, file = self._sources[change.recording]
+        joints, torque = ", all joints", f"{change.factor:.2g} times those before it"
+        if change.joint is not None:
+            joints = f", joint {problem.arm.joint_names[change.joint]!r}"
+        if change.offset:
+            torque = f"another zero than before it, by {change.offset:.2g}"
+        return LogError(
+            f"torques that are, from about {change.time:.2g} s after the start on, {torque}", file=file,
+            element=f"trajectory {name}{joints}, tau", expected="one scale and zero of the torques in a recording",
+            do=f"use the part before or after it; --accept {CHANGED} if it is right",
+        )  # fmt: skip
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
@@ -362,9 +382,42 @@ class TorqueLogs:
             ]
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
-        wide = [k for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
         candidates = position_factors(problem.arm, problem.unchanged.scale[0])
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
+
+    def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
+        """Return an error; the error that most positions are in degrees is replaced if the torques contradict degrees.
+
+        The positions may be the positions of the motors, before gears. If gear ratios of the joints explain the
+        torques much better than degrees, they are advised. If neither explains the torques, no setting is advised.
+        """
+        problem = self._problem(samples)
+        if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
+            return error
+        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
+        coarse = problem.thinned(2 * GEOMETRY.coarse_samples).with_hysteresis()
+        factors = position_factors(problem.arm, problem.unchanged.scale[0])
+        unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
+        fault = PositionUnit([], [turning], PositionUnit([]))
+        best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
+        is_explained = (
+            unit.errors.max() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
+        )
+        if best.cost > unit.cost - GEOMETRY.needed or is_explained:
+            return error
+        if best.errors.max() <= GEOMETRY.explained:
+            found = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
+            return found if isinstance(found, LogError) else error
+        # the log may have another fault in addition to positions in degrees
+        converted = self._problem(unit.hypothesis.signals(problem.samples))
+        if converted is not None:
+            _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
+            if better and better[0].errors.mean() <= GEOMETRY.explained:
+                return error
+        message, _, unit_text = error.got.partition(": ")
+        do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
+        return replace(error, got=message, do=do)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

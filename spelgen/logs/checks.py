@@ -42,8 +42,8 @@ from spelgen.logs.unit_checks import (
 )
 from spelgen.settings.log_mapping import SCALES
 
-ELASTIC = "elastic-joint"
-# Advice for a fault that only some recordings have: settings apply to all recordings, so no setting is advised.
+ELASTIC, WRONG_VELOCITY = "elastic-joint", "velocity-is-no-derivative"
+# Advice for a fault of some recordings: settings that correct these recordings would be wrong for the others.
 OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
 
 Subject = TypeVar("Subject")
@@ -77,17 +77,18 @@ class Check(Generic[Subject]):
 AnyCheck = Check[Any]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions are in an unknown unit. If the log has torques, the checks of torques
-    determine this unit by a fit of the arm's model.
+    guessed: names of joints whose positions have an unknown unit, which the torques may show. is_presumed: True
+    if the unit of most positions is advised by their range only, so that the torques may contradict it.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
+    is_presumed: bool = False
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
@@ -246,7 +247,7 @@ CHECKS: list[Check[JointSignals]] = [
         do="check the logger, and the names of the columns under 'logs'",
     ),
     Check(
-        "velocity-is-no-derivative", "warning", find_wrong_velocity, expected="dq/dt",
+        WRONG_VELOCITY, "warning", find_wrong_velocity, expected="dq/dt",
         unless=("degrees", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign"),
     ),
     Check(ELASTIC, "warning", find_elastic, unless=("degrees", "time-unit", "frozen", "dropouts", "jumps")),
@@ -271,8 +272,12 @@ class LogChecks:
         self._count = 0
         self._fingerprints = Fingerprints()
 
-    def add(self, trajectory: Trajectory) -> None:
-        """Apply all checks that need no robot to a trajectory, and collect the findings."""
+    def add(self, trajectory: Trajectory) -> Trajectory:
+        """Apply all checks that need no robot to a trajectory, and collect the findings.
+
+        The result is the trajectory with dq/dt in place of velocities that are wrong for an unknown reason, for checks
+        with a model of the robot.
+        """
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
@@ -287,10 +292,14 @@ class LogChecks:
         products = velocity_products(trajectory)
         self.products += products
         factors, correlations = velocity_agreement(products)
+        wrong = []
         for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
             signals = JointSignals(trajectory, k, kind, self._joints, factors, correlations[:, k])
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
+                if check.code == WRONG_VELOCITY and not (advice.joint or advice.keys):
+                    wrong.append(k)
+        return trajectory.differentiated(wrong) if wrong else trajectory
 
     def _add(self, group: str, check: AnyCheck, advice: Advice, trajectory: Trajectory) -> None:
         occurrence = advice, f"trajectory {trajectory.name}", trajectory.file
@@ -315,11 +324,12 @@ class LogChecks:
             advice, where, file = occurrences[0]
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and not self._are_most(names):
+            if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
                 # The unit, after the colon of the message, is not certain.
                 message, _, _ = message.partition(": ")
                 summary.guessed.update(names)
                 entries = {}
+            summary.is_presumed |= advice.is_guess
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
             if names[0] in self._joints:
@@ -333,16 +343,15 @@ class LogChecks:
             summary.add(check, message, where, file, keys, is_partial)
         return summary
 
-    def _are_most(self, joints: Collection[str]) -> bool:
-        """Return True if the joints are most joints of their types: a range shows no unit of a joint without limits."""
-        kinds = dict(zip(self._joints, self._kinds, strict=True))
-        of_joints = {kinds[joint] for joint in joints}
-        return 2 * len(joints) > sum(kind in of_joints for kind in self._kinds)
-
     def _kin(self, joint: str) -> list[str]:
         """Return the names of all joints of the same type as `joint`: all prismatic joints, or all others."""
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
+
+    def _limited(self, joint: str) -> list[str]:
+        """Return the names of the joints in `_kin` with limited motion: positions beyond two turns show a unit."""
+        kinds = dict(zip(self._joints, self._kinds, strict=True))
+        return [x for x in self._kin(joint) if kinds[x] != "continuous"]
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return the settings for the group `logs` that correct one fault of several joints.
@@ -356,7 +365,7 @@ class LogChecks:
         units, kin = entries[first].get("units", {}), self._kin(first)
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
-        is_shared = "units" in entries[first] and self._are_most(entries)
+        is_shared = "units" in entries[first] and 2 * len(entries) > len(self._limited(first))
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})

@@ -97,6 +97,14 @@ class Trajectory:
         u = None if self.u is None else self.u[rows]
         return replace(self, t=self.t[rows], q=self.q[rows], qd=self.qd[rows], tau=self.tau[rows], u=u)
 
+    def differentiated(self, joints: Sequence[int]) -> Trajectory:
+        """Return a trajectory in which the velocities of some joints are derivatives of their positions."""
+        qd = self.qd.copy()
+        for start, end in pairwise(gap_ends(self.t)):
+            if end - start > 1:
+                qd[start:end, joints] = np.gradient(self.q[start:end][:, joints], self.t[start:end], axis=0)
+        return replace(self, qd=qd)
+
     def column(self, name: str) -> np.ndarray:
         """Return a signal by its name: t (T,), or q, qd, tau or u (T, n); an empty array if u was not logged."""
         values: np.ndarray | None = getattr(self, name)

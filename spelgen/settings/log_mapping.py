@@ -60,8 +60,8 @@ Accepted = Literal[
     "degrees", "frozen", "time-unit", "dropouts", "jumps", "held-samples", "velocity-without-sign", "no-torques",
     "velocity-is-no-derivative", "torque-sense", "torque-unit", "torque-beyond-drive", "torque-order", "motion-order",
     "joint-sense", "joint-order", "joint-unit", "joint-zero", "joint-delay", "joint-clock", "gravity",
-    "gravity-compensated", "torque-clipped", "torque-without-sign", "torque-copied", "torque-unexplained",
-    "normalised",
+    "gravity-compensated", "torque-changed", "torque-clipped", "torque-without-sign", "torque-copied",
+    "torque-unexplained", "normalised",
 ]  # fmt: skip
 """Codes of errors of `spelgen logs` that a user can accept."""
 
