@@ -37,12 +37,12 @@ from truth import Case, Truth, record_log, wrong_urdf
 
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.identification.column_faults import PositionUnit, position_factors
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_faults
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.identification.unit_faults import PositionUnit, position_factors
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 

@@ -162,18 +162,18 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
     """
     ones = np.ones_like(torque)
     products = [torque * torque, torque, ones, torque * residual, residual]
-    before = np.cumsum(products, axis=1)[:, splits - 1]
+    earlier = np.cumsum(products, axis=1)[:, splits - 1]
     total = np.sum(products, axis=1)[:, None]
 
     def explained(sums: np.ndarray) -> np.ndarray:
         """Return the squares that a factor and an offset explain, from sums of products (5, C, n)."""
-        squares, sum_, count, product, rest = sums
-        slope = product - sum_ * rest / count
+        squares, torques, count, products, residuals = sums
+        slope = products - torques * residuals / count
         return np.asarray(
-            rest**2 / count + slope**2 / np.maximum(squares - sum_**2 / count, 1e-9 * squares + 1e-30)
+            residuals**2 / count + slope**2 / np.maximum(squares - torques**2 / count, 1e-9 * squares + 1e-30)
         )
 
-    return np.asarray(explained(before) + explained(total - before) - explained(total))
+    return np.asarray(explained(earlier) + explained(total - earlier) - explained(total))
 
 
 def _change(
@@ -191,13 +191,13 @@ def _change(
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
     chosen = np.arange(n) if joint is None else np.array([joint])
-    part = (problem.samples.recording == recording)[:, None, None]
-    late = part * (problem.samples.times[:, None, None] >= time)
+    in_recording = (problem.samples.recording == recording)[:, None, None]
+    late = in_recording * (problem.samples.times[:, None, None] >= time)
     offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
-    columns = [torque[..., None] * offsets.any(axis=2)[..., None] * late]
+    columns = [torque[..., None] * np.any(offsets, axis=2, keepdims=True) * late]
     columns += [offsets * late] if joint is not None else []
-    whole = [np.ones(len(rows), bool)]
-    refits = [_refit(problem, fit, x, whole) for x in columns]
+    all_samples = [np.ones(len(rows), bool)]
+    refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
     quantity = float(best.quantities[0, 0])
     factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
@@ -205,11 +205,11 @@ def _change(
     # Other faults of the log cause a large residual.
     if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
         return 0.0, change
-    drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * part
+    drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
-    others = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)
-    return min(_refit(problem, fit, x, whole).misfit for x in others) - best.misfit, change
+    alternatives = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)
+    return min(_refit(problem, fit, x, all_samples).misfit for x in alternatives) - best.misfit, change
 
 
 class _Refit(NamedTuple):

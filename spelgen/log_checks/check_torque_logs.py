@@ -12,7 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import GIVE_GEAR, UNITS, PositionUnit, TorqueUnit, position_factors
+from spelgen.identification.column_faults import UNITS
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Fault, HypothesisFit
@@ -22,6 +22,7 @@ from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
+from spelgen.identification.unit_faults import GIVE_GEAR, PositionUnit, TorqueUnit, position_factors
 from spelgen.listing import Listing, number
 from spelgen.log_checks.geometry_finding import (
     UNEXPLAINED,
@@ -204,9 +205,10 @@ class TorqueLogs:
                 continue
             name, file = self._sources[numbers[0]]
             for error in results:
-                if isinstance(error, LogError):
+                if isinstance(error, LogError) and not str(error.element).startswith("trajectory"):
                     where = f"trajectory {name}, {error.element}"
-                    findings.append(replace(error, file=file, element=where, do=OF_ONE))
+                    error = replace(error, file=file, element=where, do=OF_ONE)
+                findings += [error] if isinstance(error, LogError) else []
         return findings
 
     def _load_changes(self, motion: MotionSamples, moving: MotionSamples | None) -> list[LoadChange]:
@@ -407,8 +409,8 @@ class TorqueLogs:
         if best.cost > unit.cost - GEOMETRY.needed or is_explained:
             return error
         if best.errors.max() <= GEOMETRY.explained:
-            found = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
-            return found if isinstance(found, LogError) else error
+            finding = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
+            return finding if isinstance(finding, LogError) else error
         # the log may have another fault in addition to positions in degrees
         converted = self._problem(unit.hypothesis.signals(problem.samples))
         if converted is not None:

@@ -11,8 +11,8 @@ from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
-from spelgen.identification.column_faults import is_other_unit, rounded_factor
 from spelgen.identification.motion_samples import MotionSamples
+from spelgen.identification.unit_faults import is_other_unit, rounded_factor
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
 from spelgen.log_checks.statistics import has_few_levels

@@ -185,11 +185,11 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         names, key = _group_at(group, location[:-1]).model_fields, str(location[-1])
         error = unknown_name(location, "key", key, names, document)
         # A key of another group is not misspelt. A key of a joint belongs to its settings or the logs, not to a fit.
-        place = _group_with(group, key)
-        if place is not None and (
-            len(location) == 1 or place.startswith(("logs", "columns", "joints")) or not place
+        owner = _group_with(group, key)
+        if owner is not None and (
+            len(location) == 1 or owner.startswith(("logs", "columns", "joints")) or not owner
         ):
-            error.do = f"write it under '{place}'" if place else "write it at the left margin"
+            error.do = f"write it under '{owner}'" if owner else "write it at the left margin"
         return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
@@ -249,16 +249,19 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
     return group
 
 
-def _group_with(group: type[BaseModel], key: str, place: str = "") -> str | None:
-    """Return the place of the first group of settings in `group` that has a key, such as "logs"; None without one."""
+def _group_with(group: type[BaseModel], key: str, path: str = "") -> str | None:
+    """Return the path to the first group of settings in `group` that has a key, such as "logs"; None without one.
+
+    path: path to `group` itself.
+    """
     if key in group.model_fields:
-        return place
+        return path
     for name, field in group.model_fields.items():
         inner = _first_group(field.annotation)
         of_joint = ": NAME" if str(field.annotation).startswith("dict") else ""
-        found = _group_with(inner, key, f"{place}: {name}{of_joint}".removeprefix(": ")) if inner else None
-        if found is not None:
-            return found
+        owner = _group_with(inner, key, f"{path}: {name}{of_joint}".removeprefix(": ")) if inner else None
+        if owner is not None:
+            return owner
     return None
 
 

@@ -1,0 +1,344 @@
+"""Kinds of faults of the columns of a log: another unit of the torques, or of the positions and velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from spelgen.arm.arm import Chain
+from spelgen.identification.column_faults import UNITS, JointSense, TorqueSense, WrongScale, position_unit
+from spelgen.identification.hypotheses import Correction, Hypothesis, HypothesisFit
+from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.tuning import GEOMETRY
+from spelgen.settings.log_mapping import SCALES
+
+Form = tuple[np.ndarray, np.ndarray, int]
+LARGEST_GEAR = 500.0  # [1]
+GIVE_GEAR = (
+    "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
+    "the gear ratio"
+)
+
+
+class TorqueUnit(WrongScale):
+    """Kind of fault of a log: torques in another unit, with a factor of at least 5.
+
+    The candidates for the factors are found by comparing the gravity in the torques to the URDF's (`torque_factors`).
+    Unlike other faults, another unit is accepted even if it hardly lowers the cost: without it, bodies that are too
+    light may explain torques that are too small.
+    """
+
+    code = "torque-unit"
+    rarity = 2
+    is_optimised = True
+    needed = 0.0
+    evidence = "by the URDF's gravity"
+
+    def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
+        """Define the candidates for corrections of the torques' unit.
+
+        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
+        may have another unit: the mapping states mNm or none. is_milli: (n,) True for torques declared in mNm.
+        """
+        super().__init__([])
+        self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
+
+        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints. The
+        other corrections in `base` remain.
+        """
+        is_open, is_found = self._is_open, self in base.hypothesis.faults
+        candidates = [] if is_found else [x.copy() for x in self._torque_factors]
+        if is_open.all():
+            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
+            # torque to the URDF's. The torque factor is therefore computed again from this ratio; this also corrects an
+            # earlier factor with a wrong sense.
+            fitted, of_urdf = problem.gravity_torques(base)
+            ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
+            if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
+                candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+        for factor in candidates:
+            # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
+            # is inexact because the masses of the URDF are.
+            is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
+            factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
+        fits = list(self._scaled_by(scales, problem, base))
+        yield from fits
+        if not is_found:
+            lowest = min((base, *fits), key=lambda fit: fit.cost)
+            yield from self._separate(problem, lowest, base, bool(candidates))
+
+    def _separate(
+        self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit, has_gravity: bool
+    ) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
+
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
+        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
+        joint is small.
+
+        lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
+        factors. has_gravity: True if gravity torques in the log gave a candidate.
+        """
+        present, scale = base.hypothesis, base.hypothesis.scale
+        tau = present.signals(problem.samples).tau
+        torque = problem.residual(present, problem.with_free_gains().fit(present).parameters) + tau
+        products = (torque * tau).sum(axis=0)
+        gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
+        common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
+        is_free = self._is_open & (gains > 0)
+        is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
+        if not (is_other.any() or has_gravity):
+            return
+        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
+
+        def fitted(factors: np.ndarray) -> HypothesisFit:
+            rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
+            return problem.fit(present.changed(self, scale=rounded))
+
+        for factors, changed in (
+            (single, is_other),
+            (gains, is_free & (is_other.any() | is_other_unit(common))),
+        ):
+            if not changed.any() or not (changed | (factors == 1)).all():
+                continue
+            fit = fitted(factors)
+            # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
+            # masses may change it by less than this factor.
+            steps = [
+                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
+            ]
+            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
+            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
+            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+                lowest = fit
+                yield fit
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
+
+        motion, torque: (n,) correction factors of the joints; only `torque` counts: it is neither 1 nor -1.
+        """
+        return np.asarray(np.abs(torque) != 1)
+
+    def text(self, correction: Correction) -> str:
+        """Return the text about torques in another unit, with the factor of the joint whose |log |factor|| is largest.
+
+        If this factor is negative, the text also states that the sense is opposite, unless the hypothesis contains
+        `JointSense` or `TorqueSense`, whose texts state it.
+        """
+        torque = correction.factors[1]
+        largest = torque[np.abs(np.log(np.abs(torque))).argmax()]
+        senses = (JointSense, TorqueSense)
+        is_reversed = largest < 0 and not any(isinstance(x, senses) for x in correction.hypothesis.faults)
+        sense = " and of the opposite sense" if is_reversed else ""
+        times = f"{abs(1 / largest):.3g} times as large"
+        if np.ptp(np.abs(torque[torque != 1])):
+            times = f"by another factor at each joint, up to {times}"
+        return f"torques of another unit{sense}, {times}"
+
+    def minor_code(self, correction: Correction) -> str:
+        """Return the code of a warning if all factors on the torques are between 0.1 and 10; else "", for an error.
+
+        Masses of a URDF may be wrong by such a factor, but never by a factor of ten.
+        """
+        torque = correction.factors[1]
+        return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
+
+
+def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
+    """Return True for ratios that are explained by another unit of torques, and not by wrong inertials of the URDF.
+
+    A ratio is the gravity torque in the log divided by the URDF's gravity torque. Its magnitude shows another unit if
+    it is at least `GEOMETRY.other_unit`, or at most the inverse. factor: a ratio, or an array of ratios; the result has
+    the same shape.
+    """
+    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
+
+
+def rounded_factor(factor: float) -> float:
+    """Return a factor on torques, rounded for a message; its sign remains.
+
+    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
+    changes it by less than 10 %, otherwise to two digits.
+    """
+    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
+        # The tolerance of 1.5 is wide, since the factor is only as exact as the masses of the URDF.
+        return float(np.copysign(1e-3, factor))
+    one = float(f"{factor:.1g}")
+    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
+
+
+class PositionUnit(WrongScale):
+    """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
+
+    The unit of all joints of a type is one of `UNITS`. The factors of groups of joints are optimised, since their
+    positions may be the positions of motors, before gears of any ratio.
+    """
+
+    code = "joint-unit"
+    rarity = 2
+    is_optimised = True
+
+    def __init__(
+        self,
+        factors: Sequence[np.ndarray],
+        groups: Sequence[list[int]] = (),
+        open_fault: PositionUnit | None = None,
+    ) -> None:
+        """Define the candidates for other units of the positions of n joints.
+
+        Args:
+            factors: candidates for the factors of all joints of a type, (2, n) each.
+            groups: indices of the joints of each group whose factors are also optimised.
+            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
+                a fault, and no setting is advised for it.
+        """
+        super().__init__(factors)
+        self._groups, self._open_fault = groups, open_fault
+        self.advice = "" if open_fault else GIVE_GEAR
+
+    def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
+        """Yield the least-squares fits with other units of all joints, and with the best factors of each group.
+
+        A single joint is omitted if the hypothesis of `base` already changes its unit.
+        """
+        yield from super().fits(problem, base)
+        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
+        if base.errors.max() <= GEOMETRY.explained:
+            return
+        is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
+        yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
+
+    def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
+        """Return the least-squares fit with the best factor on the positions of each of m joints.
+
+        Units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
+        """
+        scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
+        span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
+
+        def scaled(exponents: np.ndarray, form: Form, fault: PositionUnit = self) -> Hypothesis:
+            factors, (sense, torque_sense, power) = np.ones_like(scale), form
+            factors[:, joints] = sense * np.exp(exponents), torque_sense * np.exp(-power * exponents)
+            return base.hypothesis.changed(fault, scale=scale * factors)
+
+        # Forms (senses of the motion, senses of the torque, power): the torque of the joint (power 0), of either sense
+        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        ones = np.ones(len(joints))
+        signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
+        # `_descended` reverses the senses of several joints.
+        forms: list[Form] = [
+            (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
+        ]
+        # the largest motion is at least 0.05 rad or m, and at most two turns
+        common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
+        costs = np.array([[problem.fit(scaled(x * ones, form)).cost for form in forms] for x in common])
+        lowest = costs.min(axis=0)
+        best, exponents, form = min(
+            (self._descended(problem, scaled, float(common[costs[:, k].argmin()]) * ones, forms[k])
+            for k in lowest.argsort()[: 1 if len(ones) == 1 else 2].tolist()),
+            key=lambda x: x[0].cost,
+        )  # fmt: skip
+        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well,
+        # or, for a single joint, if another form does.
+        steps = 0.1 * np.concatenate([np.eye(len(joints)), -np.eye(len(joints))])
+        sides = [problem.fit(scaled(exponents + x, form)).cost for x in steps]
+        if len(joints) == 1:
+            lowest[lowest.argmin()] = np.inf
+            sides.append(lowest.min() - GEOMETRY.ambiguous + GEOMETRY.right_angle)
+        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        is_sure = min(sides) > best.cost + GEOMETRY.right_angle and np.exp(-exponents).max() < LARGEST_GEAR
+        fault = self if is_sure else self._open_fault or self
+        scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
+        exact = np.log(np.array(scales)[:, None] / present)
+        nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
+        rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
+        unit = problem.fit(scaled(np.where(np.abs(nearest - exponents) < 0.1, nearest, rounded), form, fault))
+        return (
+            unit
+            if unit.cost < best.cost + GEOMETRY.right_angle
+            else problem.fit(scaled(rounded, form, fault))
+        )
+
+    def _descended(
+        self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
+    ) -> tuple[HypothesisFit, np.ndarray, Form]:
+        """Return the fit of lowest cost near initial exponents (m,) of the factors, its exponents, and its form.
+
+        The senses of several joints are reversed one by one while the torques are not explained and the cost falls.
+        """
+
+        def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
+            hypothesis_of = partial(scaled, form=form)
+            exponents = start
+            for _ in range(3):
+                # ratios from 1.5 to 1000, as of mm
+                exponents, fit = problem.descend(
+                    hypothesis_of,
+                    exponents,
+                    largest=0.5,
+                    smallest=0.002,
+                    allowed=lambda x: np.clip(x, -7.0, -0.4),
+                )
+            return fit, exponents, form
+
+        best = lowest(form)
+        while len(start) > 1 and best[0].errors.max() > GEOMETRY.explained:
+            _, _, (sense, torque_sense, power) = best
+            reversed_forms = [(x * sense, x**power * torque_sense, power) for x in 1 - 2 * np.eye(len(start))]
+            other = min(map(lowest, reversed_forms), key=lambda x: x[0].cost)
+            if other[0].cost > best[0].cost - GEOMETRY.ambiguous:
+                break
+            best = other
+        return best
+
+    def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
+
+        motion, torque: (n,) correction factors of the joints; only `motion` counts: it is neither 1 nor -1.
+        """
+        return np.asarray(np.abs(motion) != 1)
+
+    def text(self, correction: Correction) -> str:
+        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        motion, torque = correction.factors
+        texts, ratios = [], dict[str, list[str]]()
+        for k in np.flatnonzero(self.has(motion, torque)).tolist():
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            if unit:
+                texts.append(f"positions in {unit}{sense}")
+            else:
+                ratios.setdefault(sense, []).append(f"{abs(1 / motion[k]):.3g}")
+        for sense, gears in ratios.items():
+            times = ", ".join(dict.fromkeys(gears))
+            texts.append(
+                f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear"
+            )
+        return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
+
+
+def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
+    """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
+
+    There is one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have
+    the factor 1.
+
+    scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
+    `sign: -1`.
+    """
+    types, candidates = np.array(arm.joint_types), []
+    for joint_type, units in UNITS.items():
+        for unit in units:
+            motion = np.where(types == joint_type, SCALES.get(unit, 1.0) / np.abs(scale), 1.0)
+            if (motion != 1).any():
+                candidates.append(np.stack([motion, np.ones_like(motion)]))
+    return candidates
