@@ -5,11 +5,11 @@ the base class of their groups of keys.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, get_args
+from typing import Annotated, Any, TypeAlias, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -30,6 +30,13 @@ EXPECTED = {
     "bool_parsing": "true or false", "bool_type": "true or false", "string_type": "a text, in quotes",
     "invalid_key": "a name as key; in braces, write numbers with a decimal point, 1.5",
 }  # fmt: skip
+
+# {part of a message about YAML: what to do}.
+REMEDIES = {
+    "\\t": "write spaces in place of tabs", "an alias": "write the values again", "a second time": "join both",
+    "another document": "remove the line ---",
+}  # fmt: skip
+SPACE = "write a space after the colon"
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _OCTAL = re.compile("[-+]?0[0-7]+")
@@ -146,7 +153,8 @@ def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem:
         # Some messages of PyYAML begin with "but", since they are the second half of a sentence. The word is removed.
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
-    return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None)
+    do = next((remedy for part, remedy in REMEDIES.items() if part in problem), None)
+    return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None, do=do)
 
 
 def validated(group: type[Checked], content: object, document: YamlDocument | None = None) -> Checked:
@@ -173,12 +181,22 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     line, which have no lines. group: class of the settings.
     """
     location, error_type = detail["loc"], detail["type"]
-    # An unknown key, the most frequent error, is mostly misspelt: the message names the most similar known key.
+    parent = _group_at(group, location[:-1]).model_fields
+    # An unknown key, the most frequent error, is in a wrong group, or misspelt: the message names the groups that have
+    # it, or the most similar known key.
     if error_type == "extra_forbidden":
-        names = _group_at(group, location[:-1]).model_fields
-        return unknown_name(location, "key", str(location[-1]), names, document)
+        error = unknown_name(location, "key", str(location[-1]), parent, document)
+        places = _places(group, location)
+        if places:
+            error.do = f"write it {' or '.join(places)}"
+        elif ":" in str(location[-1]):
+            error.do = SPACE
+        return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
+    items = get_args(parent[str(location[-1])].annotation) if location and str(location[-1]) in parent else ()
+    if error_type == "tuple_type" and items and ... not in items:
+        expected = f"a list of {len(items)} numbers"
     # Pydantic adds "[key]" to the location of an invalid key of a dict: it is removed.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
@@ -193,6 +211,9 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         got = got[:57] + "..."
     error = _error_at(location, document, got)
     error.expected = expected
+    error.do = (
+        SPACE if not location and ":" in str(detail["input"]) and isinstance(detail["input"], str) else None
+    )
     return error
 
 
@@ -228,6 +249,30 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
         if key in group.model_fields:
             group = _first_group(group.model_fields[key].annotation) or group
     return group
+
+
+def _places(group: type[BaseModel], location: Location) -> list[str]:
+    """Return where the last key of a location is known, as near as possible, such as "under 'logs'"; [] if nowhere.
+
+    group: class of the root of the document.
+    """
+    found: list[Location] = []
+    depth = len(location)
+    while depth and not found:
+        depth -= 1
+        groups = _groups(_group_at(group, location[:depth]), location[:depth])
+        found = [path for path, x in groups if location[-1] in x.model_fields]
+    least = min(map(len, found), default=0)
+    return [f"under {dotted(x)!r}" if x else "without indentation" for x in found if len(x) == least]
+
+
+def _groups(group: type[BaseModel], path: Location) -> Iterator[tuple[Location, type[BaseModel]]]:
+    """Yield (path, class) of a group of settings and of all groups inside it. path: location of the group."""
+    yield path, group
+    for name, field in group.model_fields.items():
+        inner = _first_group(field.annotation)
+        if inner:
+            yield from _groups(inner, (*path, name, *["NAME"] * (get_origin(field.annotation) is dict)))
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
