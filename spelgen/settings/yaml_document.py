@@ -252,7 +252,7 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _places(group: type[BaseModel], location: Location) -> list[str]:
-    """Return where the last key of a location is known, as near as possible, such as "under 'logs'"; [] if nowhere.
+    """Return the nearest groups that have the last key of a location, such as "under 'logs'"; [] if nowhere.
 
     group: class of the root of the document.
     """
