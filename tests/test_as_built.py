@@ -111,7 +111,9 @@ def test_an_arm_without_inertials_is_refused_by_its_joint(tmp_path, robots):
     path = tmp_path / "bare.urdf"
     text = (robots / "two_link.urdf").read_text(encoding="utf-8")
     path.write_text(re.sub(r"<inertial>.*?</inertial>", "", text, flags=re.DOTALL))
-    with pytest.raises(SpelgenErrors, match=r"joint 'joint1'.*without <inertial>"):
+    with pytest.raises(SpelgenErrors, match=r"bare\.urdf: joint 'joint1'.*without <inertial>"):
+        spelgen.simulate(spelgen.load_arm(path))
+    with pytest.raises(SpelgenErrors, match=r"bare\.urdf: joint 'joint1'.*without <inertial>"):
         spelgen.as_built(spelgen.load_arm(path), 0, tmp_path / "as_built.urdf")
     assert not (tmp_path / "as_built.urdf").exists()
 

@@ -187,9 +187,7 @@ def test_predictions_at_gaps_are_not_numbers():
 
 def test_representation_of_a_fit():
     found = spelgen.fit(Model(), motions(), MomentumFit(momentum_steps=20))
-    told = (
-        f"<Fit of 'Model' to momentum: finished after 0 epochs, validation loss {found.best_validation:.3g}>"
-    )
+    told = f"<Fit of 'Model' to momentum: finished, validation loss {found.best_validation:.3g}>"
     assert repr(found) == told
     assert "momentum steps" in found._repr_html_()
 

@@ -16,6 +16,7 @@ from spelgen.errors import LogError, SettingsError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import identify, least_squares
+from spelgen.identification.intervals import Interval
 from spelgen.identification.least_squares import correlation_time
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -335,3 +336,11 @@ def test_python_accepts_lists_and_a_single_trajectory(robots):
     np.testing.assert_array_equal(found.torque(*(x.tolist() for x in motion)), expected)
     single = trajectory(arm.chain, seconds=4.0)
     assert check_logs(single, arm).to_dict() == check_logs([single], arm).to_dict()
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [(-0.0004557, 0.15, "0 ± 0.29"), (1.23456, 0.03, "1.235 ± 0.059"), (1234.5, 70.0, "1230 ± 1.4e+02")],
+)
+def test_an_estimate_has_no_digits_below_its_interval(value, std, text):
+    assert Interval("offset", value, std).text == text

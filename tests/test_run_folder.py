@@ -171,6 +171,16 @@ def test_an_interruption_before_the_first_checkpoint_leaves_no_run(start, tmp_pa
     trained(start, tmp_path / "run")
 
 
+def test_an_interruption_before_the_record_leaves_no_files(start, tmp_path, monkeypatch):
+    """A run folder has all files of a run or none: weights without config.json would be no run."""
+    with monkeypatch.context() as patch:
+        patch.setattr("spelgen.fitting.fit.write_json", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            trained(start, tmp_path / "run")
+    assert not list((tmp_path / "run").glob("*.*"))
+    trained(start, tmp_path / "run")
+
+
 def test_a_full_disk_is_reported_with_the_file(start, tmp_path):
     """If the disk is full, the error names the file, and the run is unchanged.
 

@@ -81,6 +81,25 @@ def test_settings_do_not_change(urdf):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            "joints:\n\ta: {}",
+            "arm.yaml:2: not plain YAML: found character '\\t' that cannot start any token; "
+            "write spaces in place of tabs",
+        ),
+        (
+            "logs:\n  columns:\n    q: {joint}_q",
+            "arm.yaml:3: not plain YAML: expected <block end>, but found '<scalar>'; "
+            "write a text that begins with { or [ in quotes",
+        ),
+        (
+            "joints:\n  a: {rotor_inertia: 1 kg m2}",
+            "arm.yaml:2: joints.a.rotor_inertia: got '1 kg m2', expected a number; "
+            "write the number only, with a decimal point; docs/settings.md has its unit",
+        ),
+        (
+            "joints:\n  a:{gear: 1}",
+            "arm.yaml:2: joints.a:{gear: got '1}', expected keys with values; write a space after the colon",
+        ),
         ("gravty: [0, 0, 0]", "arm.yaml:1: unknown key 'gravty'; did you mean 'gravity'?"),
         (
             "joints:\n  a:\n    gear: 2\n    viscus: 1",

@@ -313,7 +313,7 @@ class LogChecks:
             advice, where, file = occurrences[0]
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and 2 * len(names) <= len(self._kin(names[0])):
+            if advice.is_guess and not self._are_most(names):
                 # The unit, after the colon of the message, is not certain.
                 message, _, _ = message.partition(": ")
                 summary.guessed.update(names)
@@ -330,6 +330,12 @@ class LogChecks:
             )
             summary.add(check, message, where, file, keys, is_partial)
         return summary
+
+    def _are_most(self, joints: Collection[str]) -> bool:
+        """Return True if these are most joints of their types: a range shows no unit of a joint without limits."""
+        kinds = dict(zip(self._joints, self._kinds, strict=True))
+        of_joints = {kinds[joint] for joint in joints}
+        return 2 * len(joints) > sum(kind in of_joints for kind in self._kinds)
 
     def _kin(self, joint: str) -> list[str]:
         """Return the names of all joints of the same type as a joint, revolute or prismatic."""
@@ -348,7 +354,7 @@ class LogChecks:
         units, kin = entries[first].get("units", {}), self._kin(first)
         ratio = SCALES.get(units.get("qd"), 1.0) / SCALES.get(units.get("q"), 1.0)
         factors, _ = velocity_agreement(self.products)
-        is_shared = "units" in entries[first] and 2 * len(entries) > len(kin)
+        is_shared = "units" in entries[first] and self._are_most(entries)
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
             if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})

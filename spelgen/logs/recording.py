@@ -262,10 +262,10 @@ def listed_times(t: np.ndarray) -> str:
 def _order_in_time(rows: Rows) -> None:
     """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
-    Rows are sorted by time, unless positions are then less smooth. Of several rows with equal times only the first is
-    kept. If many rows have the time of the row before but other values, the resolution of the clock is too low: all
-    rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that restarts, and for times
-    that cannot be reconstructed.
+    Rows are sorted by time, unless positions are then less smooth, or velocities opposite. Of several rows with equal
+    times only the first is kept. If many rows have the time of the row before but other values, the resolution of the
+    clock is too low: all rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that
+    restarts or falls, and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
@@ -278,7 +278,14 @@ def _order_in_time(rows: Rows) -> None:
         message = f"{counted(late, 'time')} before that of the row above: the rows were sorted"
         # If positions are rougher after sorting, the clock restarted in the file. If the motion continues, the clock
         # was set back, or its counter overflowed; else the file has several recordings, which sorting would interleave.
-        if _roughness(rows.positions[order]) > _roughness(rows.positions):
+        if 2 * late > len(rows.t):
+            # Rows in reverse order have the velocities of the sorted positions; a time that remains has the opposite.
+            joints, quantities = len(rows.layout.joints), rows.layout.mapping.quantities
+            velocities = rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros(1)
+            if np.nansum(np.diff(rows.positions[order], axis=0) * velocities[1:]) < 0:
+                raise _backward_times(rows)
+            rows.keep(order)
+        elif _roughness(rows.positions[order]) > _roughness(rows.positions):
             if not _continues(rows):
                 raise _backward_times(rows)
             steps = np.diff(rows.t)

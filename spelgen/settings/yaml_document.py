@@ -31,11 +31,15 @@ EXPECTED = {
     "invalid_key": "a name as key; in braces, write numbers with a decimal point, 1.5",
 }  # fmt: skip
 
-# {part of a message about YAML: what to do}.
-REMEDIES = {
-    "\\t": "write spaces in place of tabs", "an alias": "write the values again", "a second time": "join both",
+# {part of a message about YAML: advice about its most frequent cause}.
+YAML_ADVICE = {
+    r"'\t'": "write spaces in place of tabs",
+    "expected <block end>": "write a text that begins with { or [ in quotes",
+    "expected ',' or '}'": "write a text with braces in quotes",
+    "an alias": "write the values again",
+    "a second time": "join both",
     "another document": "remove the line ---",
-}  # fmt: skip
+}
 SPACE = "write a space after the colon"
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -153,7 +157,7 @@ def _yaml_error(error: yaml.YAMLError, path: Path) -> SettingsError:
     if isinstance(error, yaml.MarkedYAMLError) and error.problem:
         # Some messages of PyYAML begin with "but", since they are the second half of a sentence. The word is removed.
         problem, mark = error.problem.removeprefix("but "), error.problem_mark
-    do = next((remedy for part, remedy in REMEDIES.items() if part in problem), None)
+    do = next((advice for text, advice in YAML_ADVICE.items() if text in problem), None)
     return SettingsError(f"not plain YAML: {problem}", file=path, line=mark.line + 1 if mark else None, do=do)
 
 
@@ -211,9 +215,11 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         got = got[:57] + "..."
     error = _error_at(location, document, got)
     error.expected = expected
-    error.do = (
-        SPACE if not location and ":" in str(detail["input"]) and isinstance(detail["input"], str) else None
-    )
+    got_text = detail["input"] if isinstance(detail["input"], str) else ""
+    if ":" in (str(location[-1]) if location else got_text):
+        error.do = SPACE
+    elif re.match(r"[-+]?\.?\d", got_text):
+        error.do = "write the number only, with a decimal point; docs/settings.md has its unit"
     return error
 
 
