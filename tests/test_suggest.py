@@ -159,6 +159,10 @@ def test_times_that_fall_are_called_so(scara, tmp_path):
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
     with pytest.raises(LogError, match=r"got times that fall from .*write 'sample_rate: HZ'"):
         read_logs(path, scara)
+    # Rows in reverse order are sorted, also without velocities.
+    path = written(path, head, np.column_stack([T, Q, QD, TAU])[::-1])
+    for mapping in ({}, {"velocity": "differentiated"}):
+        np.testing.assert_array_equal(read_logs(path, scara, mapping)[0].q, Q)
 
 
 @pytest.mark.parametrize("file", ["struct.mat", "flat.mat", "dict.npy"])
@@ -171,7 +175,7 @@ def test_files_of_matlab_and_pickles_are_converted_by_the_printed_command(scara,
         scipy.io.savemat(tmp_path / file, {"log": arrays, "robot": "x"} if file == "struct.mat" else arrays)
     (error,) = log_files(tmp_path / file)[1]
     command, _, warning = str(error.do).removeprefix("convert it: ").partition('" (')
-    assert ("trust" in warning) == (file == "dict.npy")
+    assert ("pickles" in warning) == (file == "dict.npy")
     subprocess.run([sys.executable, "-c", command.split('"')[1]], check=True)
     suffix = ".npz" if file == "dict.npy" else ".json"
     require_same(suggested((tmp_path / file).with_suffix(suffix), scara)[0])

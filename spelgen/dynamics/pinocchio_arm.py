@@ -25,26 +25,11 @@ def arm_dynamics(
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
 
 
-def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
+def pinocchio_model(arm: Chain, settings: Settings, file: Path | None = None) -> pin.Model:
     """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
 
-    The armature is the rotor inertia on the joint side. Raises the errors of `require_inertials`.
-    """
-    require_inertials(arm)
-    model = kinematic_model(arm)
-    # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
-    for index, body in enumerate(arm.bodies, start=1):
-        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
-    # A mimic joint has no motor of its own, and therefore no armature.
-    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
-    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
-    return model
-
-
-def require_inertials(arm: Chain, file: Path | None = None) -> None:
-    """Raise ArmError if a body has no <inertial>, or negative mass, for which Pinocchio returns meaningless numbers.
-
-    file: path of the URDF, for the error.
+    The armature is the rotor inertia on the joint side. Raises ArmError, with the URDF `file`, if a body has no
+    <inertial>, or negative mass, for which Pinocchio returns meaningless numbers.
     """
     error = partial(
         ArmError,
@@ -53,11 +38,16 @@ def require_inertials(arm: Chain, file: Path | None = None) -> None:
         do="write estimates into the URDF; a model that is trained on logs needs none",
     )
     mass = {body.name: float(body.inertia[0]) if body.inertia else None for body in arm.bodies}
-    faults = {name: "a link without <inertial>" for name, value in mass.items() if value is None}
-    faults |= {
-        name: f"a body of {value:g} kg" for name, value in mass.items() if value is not None and value < 0
-    }
-    collect([error(got, element=f"joint {name!r}") for name, got in faults.items()])
+    faults = {x: "a link without <inertial>" if m is None else f"a body of {m:g} kg" for x, m in mass.items()}
+    collect([error(faults[x], element=f"joint {x!r}") for x, m in mass.items() if m is None or m < 0])
+    model = kinematic_model(arm)
+    # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
+    for index, body in enumerate(arm.bodies, start=1):
+        model.appendBodyToJoint(index, _inertia(np.array(body.inertia, dtype=float)), pin.SE3.Identity())
+    # A mimic joint has no motor of its own, and therefore no armature.
+    rotors = {name: settings.joint(name).armature for name in arm.joint_names}
+    model.armature = np.array([rotors.get(body.name, 0.0) for body in arm.bodies])
+    return model
 
 
 def kinematic_model(arm: Chain) -> pin.Model:

@@ -332,7 +332,7 @@ class LogChecks:
         return summary
 
     def _are_most(self, joints: Collection[str]) -> bool:
-        """Return True if these are most joints of their types: a range shows no unit of a joint without limits."""
+        """Return True if the joints are most joints of their types: a range shows no unit of a joint without limits."""
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         of_joints = {kinds[joint] for joint in joints}
         return 2 * len(joints) > sum(kind in of_joints for kind in self._kinds)

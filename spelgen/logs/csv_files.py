@@ -65,20 +65,17 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
     If the header is repeated between the rows, a new recording begins where the clock goes back.
     """
     content = _in_utf8(file.read_bytes())
-    # An appended file may begin with its byte order mark.
-    header = (
-        rb"(?:\A|(?<=[\r\n]))(?:\xef\xbb\xbf)?"
-        + re.escape(_beginning(content).header.encode())
-        + rb"(?=[\r\n])"
-    )
-    starts = [0, *[x.start() for x in re.finditer(header, content)][1:]]
+    # A line begins after the end of another one, or after the byte order mark of an appended file.
+    header = re.compile(re.escape(_beginning(content).header.encode()) + rb"(?=[\r\n])")
+    starts = [x.start() for x in header.finditer(content)]
+    starts = [0, *[x for x in starts if content[max(x - 1, 0) : x] in (b"", b"\n", b"\r", b"\xbf")][1:]]
     tables: list[tuple[pa.Table, int]] = []
     remarks: tuple[str, ...] = ()
-    last = None
+    last, above = None, 0
     for start, stop in pairwise([*starts, len(content)]):
         segment, lines, remarks = csv_table(file, content[start:stop] if len(starts) > 1 else content)
         if len(starts) > 1:
-            lines += len(content[:start].splitlines())
+            lines, above = lines + above, above + len(content[start:stop].splitlines())
             t = mapping.columns.t if mapping.columns.t in segment.column_names else segment.column_names[0]
             times = segment[t].drop_null().to_pylist()
             if not times:
@@ -267,4 +264,4 @@ def _in_utf8(content: bytes) -> bytes:
         heads = {x: content[:HEAD].decode(x, "ignore").lower() for x in CHARACTER_SETS}
         words = [x for x in KNOWN if not x.isascii()]
         encoding = max(heads, key=lambda x: sum(len(word) for word in words if word in heads[x]))
-    return content.decode(encoding).encode() if encoding else content
+    return content.decode(encoding, "replace").encode() if encoding else content

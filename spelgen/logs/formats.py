@@ -20,6 +20,10 @@ LogPaths = Path | str | Iterable[Path | str]
 """Paths of log files and of folders with logs, or their addresses (see `local`)."""
 
 _PYTHON = 'python -c "import {}"'
+_HDF5 = (
+    "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]}}) "
+    "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
+)
 # {suffix of a file that is no log: command that converts the file to a log}; in the command, {0} is the path of the
 # file, and {1} the path without the suffix.
 CONVERT = {
@@ -38,20 +42,18 @@ CONVERT = {
         "json.dumps(x) + chr(10) for x in yaml.load_all(open('{0}'), yaml.CSafeLoader) if x)"
     )),
     ".npy": _PYTHON.format("numpy; numpy.savetxt('{1}.csv', numpy.load('{0}'), delimiter=',', header='NAMES')"),
-    # A .npy file of a dict is a pickle, which is loaded only if the user trusts it.
+    # A .npy file of a dict is a pickle, which is loaded only with a warning.
     ".npy with a dict": _PYTHON.format(
         "numpy; numpy.savez('{1}.npz', **numpy.load('{0}', allow_pickle=True).item())"
-    ) + ' (only a file that you trust: pickles may contain code)',
+    ) + ' (only a file of a known source: pickles may contain code)',
     # JSON has the fields of structs, as x.q; NPZ would have them as Python objects.
     ".mat": _PYTHON.format(
         "json, scipy.io; json.dump(scipy.io.loadmat('{0}', simplify_cells=True), open('{1}.json', 'w'), "
         "default=lambda x: x.tolist() if hasattr(x, 'tolist') else str(x))"
     ),
     # MATLAB stores the columns of a matrix as rows of HDF5.
-    **dict(zip((".h5", ".hdf5", ".mat of version 7.3"), (_PYTHON.format(
-        "h5py, numpy; d = {{}}; h5py.File('{0}').visititems(lambda k, x: d.update({{k: x[()]" + end + "}}) "
-        "if isinstance(x, h5py.Dataset) else None); numpy.savez('{1}.npz', **d)"
-    ) for end in ("", "", ".T")), strict=True)),
+    ".mat of version 7.3": _PYTHON.format(_HDF5.replace("x[()]", "x[()].T")),
+    **dict.fromkeys((".h5", ".hdf5"), _PYTHON.format(_HDF5)),
 }  # fmt: skip
 
 

@@ -281,7 +281,9 @@ def _order_in_time(rows: Rows) -> None:
         if 2 * late > len(rows.t):
             # Rows in reverse order have the velocities of the sorted positions; a time that remains has the opposite.
             joints, quantities = len(rows.layout.joints), rows.layout.mapping.quantities
-            velocities = rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros(1)
+            velocities = (
+                rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros((2, 1))
+            )
             if np.nansum(np.diff(rows.positions[order], axis=0) * velocities[1:]) < 0:
                 raise _backward_times(rows)
             rows.keep(order)

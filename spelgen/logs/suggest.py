@@ -219,18 +219,30 @@ def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) ->
 
     The last half of the state's columns are the derivatives of the first half. joints: number of joints.
     """
-    result = list(columns)
     unstated = [x for x in columns if x.number >= 0 and not x.words & (COMMANDED | OTHERS)]
-    for state in _complete_signals([x for x in unstated if x.quantity in ("q", None)], 2 * joints).values():
+    unstated = [x for x in unstated if x.quantity in ("q", None)]
+    quantity = {}
+    for state in _complete_signals(unstated, 2 * joints).values():
         ordered = sorted(state, key=lambda x: x.number)
-        pairs = list(zip(ordered[:joints], ordered[joints:], strict=len(state) == 2 * joints))
-        values = [(_numbers(table, q.name), _numbers(table, qd.name)) for q, qd in pairs]
-        moving = [(q, qd) for q, qd in values if len(q) == len(qd) > 2 and np.ptp(q) * np.ptp(qd) > 0]
-        slopes = [np.corrcoef(np.gradient(q), qd)[0, 1] for q, qd in moving]
-        for q, qd in pairs if len(state) == 2 * joints and slopes and np.median(slopes) > 0.9 else ():
-            result[result.index(q)] = q._replace(quantity="q", words={"q"})
-            result[result.index(qd)] = qd._replace(quantity="qd", words={"qd"}, number=q.number)
-    return result
+        pairs = list(zip(ordered[:joints], ordered[joints:], strict=False))
+        if len(state) == 2 * joints and _similarity(pairs, table)[0] > 0.9:
+            for q, qd in pairs:
+                quantity[q.name] = q._replace(quantity="q", words={"q"})
+                quantity[qd.name] = qd._replace(quantity="qd", words={"qd"}, number=q.number)
+    return [quantity.get(x.name, x) for x in columns]
+
+
+def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table) -> tuple[float, float]:
+    """Return the correlation of columns x with the derivatives of columns q, and the relative distance of x and q.
+
+    Both are medians over the pairs (q, x) that move; NaN if none does.
+    """
+    values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
+    moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
+    slopes = [np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving] or [np.nan]
+    return float(np.median(slopes)), float(
+        np.median([np.std(x - q) / np.std(q) for q, x in moving] or [np.nan])
+    )
 
 
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
@@ -245,13 +257,9 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
     }
     for letter in "tvu":
         named = [k for k, x in enumerate(result) if x.words == {letter} and x.number in of_number]
-        pairs = [(of_number[result[k].number], result[k]) for k in named]
-        values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
-        moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
-        if not moving:
+        slope, distance = _similarity([(of_number[result[k].number], result[k]) for k in named], table)
+        if np.isnan(slope):
             continue
-        slope = np.median([np.corrcoef(np.gradient(q), x)[0, 1] for q, x in moving])
-        distance = np.median([np.std(x - q) / np.std(q) for q, x in moving])
         quantity = "tau" if letter == "t" or (letter == "u" and distance > 0.3) else None
         if letter != "t" and slope > 0.9:
             quantity = "qd"
