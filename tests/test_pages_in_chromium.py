@@ -76,6 +76,20 @@ def test_titles_and_numbers_of_tables_are_not_broken_on_a_phone(browser, pages):
     assert browser.run(f"Math.min(...{captions}.map(x => x.offsetWidth / x.parentNode.offsetWidth))") > 0.9
 
 
+def test_no_predictor_is_hidden_on_a_tablet(browser, pages):
+    """At 900 pixels, tables with a column per predictor have no column beyond the page, also with long names."""
+    browser.open(pages[0], width=900)
+    tables = "[...document.querySelectorAll('.tables .wide')]"
+    browser.run(
+        f"{tables}.forEach(x => x.querySelectorAll('tbody th').forEach(y => y.append('_of_the_arm [rad]')))"
+    )
+    browser.run(
+        "document.querySelectorAll('.tables td.n, .tables thead th.n').forEach("
+        "x => (x.textContent = x.matches('td') ? '2.32e-04' : 'least squares with memory'))"
+    )
+    assert browser.run(f"Math.max(...{tables}.map(x => x.scrollWidth - x.clientWidth))") == 0
+
+
 def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages):
     shown = (
         "['.without-script', 'canvas.arm', '.controls']"
