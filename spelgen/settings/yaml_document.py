@@ -33,13 +33,10 @@ EXPECTED = {
 
 # {part of a message about YAML: advice about its most frequent cause}.
 YAML_ADVICE = {
-    r"'\t'": "write spaces in place of tabs",
+    r"'\t'": "write spaces in place of tabs", "an alias": "write the values again", "a second time": "join both",
+    "another document": "remove the line ---", "expected ',' or '}'": "write a text with braces in quotes",
     "expected <block end>": "write a text that begins with { or [ in quotes",
-    "expected ',' or '}'": "write a text with braces in quotes",
-    "an alias": "write the values again",
-    "a second time": "join both",
-    "another document": "remove the line ---",
-}
+}  # fmt: skip
 SPACE = "write a space after the colon"
 
 Checked = TypeVar("Checked", bound=BaseModel)
@@ -190,11 +187,8 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     # it, or the most similar known key.
     if error_type == "extra_forbidden":
         error = unknown_name(location, "key", str(location[-1]), parent, document)
-        places = _places(group, location)
-        if places:
-            error.do = f"write it {' or '.join(places)}"
-        elif ":" in str(location[-1]):
-            error.do = SPACE
+        places = " or ".join(_places(group, location))
+        error.do = f"write it {places}" if places else SPACE if ":" in str(location[-1]) else error.do
         return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
