@@ -47,7 +47,7 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Con
             # Numbers without a star end with a blank, so that the digits of a column are aligned.
             cells.append(f"{number(row[name]) if name in row else ''} {star}")
         lines.append(cells)
-    # Columns without a star end with their digits, which leaves more room for the names of joints.
+    # Columns without a star end with their digits, so that names of joints have more room.
     padded = zip(["", *(f"{name}  " for name in columns)], *lines, strict=True)
     starred = [x if any(cell.endswith("*") for cell in x) else tuple(map(str.rstrip, x)) for x in padded]
     head, *body = zip(*starred, strict=True)
