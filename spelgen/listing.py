@@ -88,7 +88,10 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
     # Numbers cannot be wrapped. Names of rows are wrapped between words, or else within words, if the table is then
     # split into fewer parts.
     names = columns[0][1:]
-    forms = (names, *([word.rstrip() for x in names for word in at.split(x)] for at in (BLANK, SEPARATOR)))
+    forms = (
+        names,
+        *([word.rstrip() for x in names for word in separator.split(x)] for separator in (BLANK, SEPARATOR)),
+    )
     return min((_packed(columns, WIDTH - 2 - max(MIN_NAME, _width(words))) for words in forms), key=len)
 
 

@@ -256,14 +256,14 @@ def _places(group: type[BaseModel], location: Location) -> list[str]:
 
     group: class of the root of the document.
     """
-    found: list[Location] = []
-    depth = len(location)
-    while depth and not found:
-        depth -= 1
-        groups = _groups(_group_at(group, location[:depth]), location[:depth])
-        found = [path for path, x in groups if location[-1] in x.model_fields]
-    least = min(map(len, found), default=0)
-    return [f"under {dotted(x)!r}" if x else "without indentation" for x in found if len(x) == least]
+    paths: list[Location] = []
+    level = len(location)
+    while level and not paths:
+        level -= 1
+        groups = _groups(_group_at(group, location[:level]), location[:level])
+        paths = [path for path, x in groups if location[-1] in x.model_fields]
+    depth = min(map(len, paths), default=0)
+    return [f"under {dotted(x)!r}" if x else "without indentation" for x in paths if len(x) == depth]
 
 
 def _groups(group: type[BaseModel], path: Location) -> Iterator[tuple[Location, type[BaseModel]]]:
