@@ -12,6 +12,7 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
+BLANK = re.compile(r"(?<= )(?!s[)\]])")  # matches places between words, but not before the unit s
 SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # matches places at which names may be wrapped
 
 
@@ -59,7 +60,7 @@ class Listing:
         """Return the text of a table with the first column (names of rows) and the columns with indices `group`."""
         names, *chosen = _fitted([columns[column] for column in (0, *group)])
         room = WIDTH - 2 * (1 + len(group)) - sum(map(_width, chosen))
-        chosen.insert(0, [_folded(name, max(MIN_NAME, room)) for name in names])
+        chosen.insert(0, [re.sub(r" +$", "", _folded(x, max(MIN_NAME, room)), flags=re.M) for x in names])
         lines = []
         for row in zip(*chosen, strict=True):
             for cells in zip_longest(*(cell.split("\n") for cell in row), fillvalue=""):
@@ -84,9 +85,21 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
     columns: texts of each column; column 0 has the names of the rows and is in no group.
     """
-    # Names of rows are wrapped before the table is split; numbers cannot be wrapped.
-    words = [word for name in columns[0][1:] for word in SEPARATOR.split(name)]
-    room = WIDTH - 2 - max(MIN_NAME, _width(words))
+    # Numbers cannot be wrapped. Names of rows are wrapped between words, or else within words, if the table is then
+    # split into fewer parts.
+    names = columns[0][1:]
+    forms = (
+        names,
+        *([word.rstrip() for x in names for word in separator.split(x)] for separator in (BLANK, SEPARATOR)),
+    )
+    return min((_packed(columns, WIDTH - 2 - max(MIN_NAME, _width(words))) for words in forms), key=len)
+
+
+def _packed(columns: Sequence[Sequence[str]], room: int) -> list[list[int]]:
+    """Return groups of column indices, in their order, so that the columns of one group have at most the width `room`.
+
+    columns, result: see `_groups`.
+    """
     groups: list[list[int]] = [[]]
     used = 0
     # Columns are assigned greedily to tables: their order is preserved, and only the last table may be narrow.
@@ -111,7 +124,7 @@ def _folded(name: str, width: int) -> str:
     """Return a name with line breaks after separators if it is longer than `width` characters."""
     lines = [""]
     for word in SEPARATOR.split(name):
-        if lines[-1] and len(lines[-1]) + len(word) > width:
+        if lines[-1] and len(lines[-1]) + len(word.rstrip()) > width:
             lines.append("")
         lines[-1] += word
     return "\n".join(lines)

@@ -485,3 +485,9 @@ def test_logs_without_motion_are_refused(robots, samples):
 def test_a_diverged_predictor_keeps_its_column():
     text = table("Prediction loss", {"seed 0": {"phnode": None, "spel": 1.0}}).text()
     assert "phnode" in text and text.splitlines()[-1].split() == ["seed", "0", "-", "1", "*"]
+
+
+def test_a_column_without_a_star_ends_with_its_digits():
+    """Blanks that align the digits with starred numbers are only in columns with a star."""
+    shown = table("errors", {"a": {"model": 1.0, "URDF": 2.0}, "b": {"model": 3.0, "URDF": 4.0}})
+    assert shown.head == ("", "model  ", "URDF") and shown.rows == (("a", "1 *", "2"), ("b", "3 *", "4"))

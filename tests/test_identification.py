@@ -16,7 +16,7 @@ from spelgen.errors import LogError, SettingsError
 from spelgen.identification.base_parameters import base_parameters
 from spelgen.identification.identification import LeastSquares
 from spelgen.identification.identify import identify, least_squares
-from spelgen.identification.intervals import Interval
+from spelgen.identification.intervals import Interval, interval_listing
 from spelgen.identification.least_squares import correlation_time
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
@@ -347,3 +347,13 @@ def test_python_accepts_lists_and_a_single_trajectory(robots):
 )
 def test_an_estimate_has_no_digits_below_its_interval(value, std, text):
     assert Interval("offset", value, std).text == text
+
+
+def test_a_table_of_parameters_explains_r_and_has_the_digits_of_the_intervals():
+    """A value has the last digit of its interval, and the note states the meaning of R if a name ends with it."""
+    plain, combined = Interval("hx2", -0.232561, 0.019), Interval("m1R", 2.426412, 0.018)
+    assert interval_listing("", [plain], "note").rows == (("hx2", "-0.233", "0.037", "fair"),)
+    assert interval_listing("", [plain], "note").note == "note"
+    listing = interval_listing("", [plain, combined], "note")
+    assert listing.rows[1] == ("m1R", "2.426", "0.035", "firm")
+    assert listing.note == "R: includes parameters of other links that act only in this combination. note"

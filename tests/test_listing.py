@@ -93,3 +93,19 @@ def test_a_table_too_wide_for_the_words_of_its_names_is_cut_into_several():
     assert text.count("1.80e-05 *") == 6
     assert all(f"variant {k}" in text for k in range(6))
     assert text.splitlines()[-1] == "  A note."
+
+
+def test_a_name_is_broken_within_a_word_only_to_avoid_another_table():
+    """A table that is split anyway keeps the names of joints whole, if the number of its parts is the same."""
+    for cells in (["0.00131"] * 11, ["1.31e-04"] * 12):
+        rows = [(name, *cells) for name in ("1 (0.05 s)", "joint_wrist_yaw [rad]")]
+        tables = Listing("", ("", *"abcdefghijkl"[: len(cells)]), tuple(rows)).text().split("\n\n")
+        assert len(tables) == 2
+        assert all("joint_wrist_yaw" in x and all(len(line) <= 80 for line in x.splitlines()) for x in tables)
+
+
+def test_a_table_with_times_in_its_names_is_at_most_80_characters_wide():
+    """The room for names counts a number and its unit s as one word, as their wrapping does."""
+    for width in range(5, 20):
+        rows = tuple((name, *[width * "1"] * 9) for name in ("1 step (0.005 s)", "10 steps (0.05 s)"))
+        assert max(map(len, Listing("", ("", *"abcdefghi"), rows).text().splitlines())) <= 80

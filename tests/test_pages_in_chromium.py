@@ -64,6 +64,32 @@ def test_pages_have_no_console_messages_requests_or_overflow(browser, pages, wid
         assert [url for url in browser.requests if not url.startswith("data:")] == [path.as_uri()]
 
 
+def test_titles_and_numbers_of_tables_are_not_broken_on_a_phone(browser, pages):
+    """A title of a list is as wide as the list, and a number is on one line, whatever the length of its label."""
+    browser.open(pages[0], width=400)
+    cells = "[...document.querySelectorAll('td.n[data-head]')]"
+    browser.run(f"{cells}.forEach(x => (x.dataset.head = 'least squares with memory + observer'))")
+    browser.run(f"{cells}.forEach(x => (x.textContent = '2.32e-04'))")
+    rows = "(x => (range => (range.selectNodeContents(x), range.getClientRects().length))(document.createRange()))"
+    assert browser.run(f"Math.max(...{cells}.map({rows}))") == 1
+    captions = "[...document.querySelectorAll('table:has(td[data-head]) caption')]"
+    assert browser.run(f"Math.min(...{captions}.map(x => x.offsetWidth / x.parentNode.offsetWidth))") > 0.9
+
+
+def test_no_predictor_is_hidden_on_a_tablet(browser, pages):
+    """At 900 pixels, tables with a column per predictor have no column beyond the page, also with long names."""
+    browser.open(pages[0], width=900)
+    tables = "[...document.querySelectorAll('.tables .wide')]"
+    browser.run(
+        f"{tables}.forEach(x => x.querySelectorAll('tbody th').forEach(y => y.append('_of_the_arm [rad]')))"
+    )
+    browser.run(
+        "document.querySelectorAll('.tables td.n, .tables thead th.n').forEach("
+        "x => (x.textContent = x.matches('td') ? '2.32e-04' : 'least squares with memory'))"
+    )
+    assert browser.run(f"Math.max(...{tables}.map(x => x.scrollWidth - x.clientWidth))") == 0
+
+
 def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages):
     shown = (
         "['.without-script', 'canvas.arm', '.controls']"

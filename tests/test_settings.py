@@ -81,11 +81,10 @@ def test_settings_do_not_change(urdf):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("columns: {t: time}", "arm.yaml:1: unknown key 'columns'; write it under 'logs'"),
         (
             "joints:\n\ta: {}",
             "arm.yaml:2: not plain YAML: found character '\\t' that cannot start any token; "
-            "indent by blanks, not by tabs",
+            "write spaces in place of tabs",
         ),
         (
             "logs:\n  columns:\n    q: {joint}_q",
@@ -94,12 +93,12 @@ def test_settings_do_not_change(urdf):
         ),
         (
             "joints:\n  a: {rotor_inertia: 1 kg m2}",
-            "arm.yaml:2: joints.a.rotor_inertia: got '1 kg m2', expected a number; write the number only, with a "
-            "decimal point; docs/settings.md has its unit",
+            "arm.yaml:2: joints.a.rotor_inertia: got '1 kg m2', expected a number; "
+            "write the number only, with a decimal point; docs/settings.md has its unit",
         ),
         (
             "joints:\n  a:{gear: 1}",
-            "arm.yaml:2: joints.a:{gear: got '1}', expected keys with values; write a blank after the colon of a key",
+            "arm.yaml:2: joints.a:{gear: got '1}', expected keys with values; write a space after the colon",
         ),
         ("gravty: [0, 0, 0]", "arm.yaml:1: unknown key 'gravty'; did you mean 'gravity'?"),
         (
@@ -119,7 +118,29 @@ def test_settings_do_not_change(urdf):
             "gravity:\n  - 0\n  - 0\n  - up",
             "arm.yaml:4: gravity.2: got 'up', expected a number",
         ),
-        ("gravity: 9.81", "arm.yaml:1: gravity: got 9.81, expected a list"),
+        ("columns: {q: a}", "arm.yaml:1: unknown key 'columns'; write it under 'logs'"),
+        (
+            "logs: {columns: {joints: {}}}",
+            "arm.yaml:1: logs.columns: unknown key 'joints'; write it under 'logs'",
+        ),
+        (
+            "logs:\n  q: pos_{joint}",
+            "arm.yaml:2: logs: unknown key 'q'; write it under 'logs.columns' or under 'logs.units'",
+        ),
+        (
+            "training: {gravity: 9}",
+            "arm.yaml:1: training: unknown key 'gravity'; write it without indentation",
+        ),
+        (
+            "joints: {a: {gear:9}}",
+            "arm.yaml:1: joints.a: unknown key 'gear:9'; write a space after the colon",
+        ),
+        ("tip:a", "arm.yaml:1: got 'tip:a', expected keys with values; write a space after the colon"),
+        (
+            "joints: {a: {coulomb: 0.4}}",
+            "arm.yaml:1: joints.a.coulomb: got 0.4, expected a list of 2 numbers",
+        ),
+        ("gravity: 9.81", "arm.yaml:1: gravity: got 9.81, expected a list of 3 numbers"),
         ("moving_joints: []", "arm.yaml:1: moving_joints: got [], expected a longer list"),
         ("simulation: {sample_rate: yes}", "arm.yaml:1: simulation.sample_rate: got True, expected a number"),
         (
@@ -194,8 +215,13 @@ def test_a_wrong_value_is_reported_with_its_place(urdf, text, message):
     ("text", "message"),
     [
         ("a: [1", "arm.yaml:1: not plain YAML: expected ',' or ']', but got '<stream end>'"),
-        ("about: a\nabout: b", "arm.yaml:2: not plain YAML: the key 'about' a second time"),
-        ("about: &x a\ngravity: *x", "arm.yaml:2: not plain YAML: an alias"),
+        ("about: a\nabout: b", "arm.yaml:2: not plain YAML: the key 'about' a second time; join both"),
+        (
+            "gravity:\t[0, 0, 0]",
+            "arm.yaml:1: not plain YAML: found character '\\t' that cannot start any token; "
+            "write spaces in place of tabs",
+        ),
+        ("about: &x a\ngravity: *x", "arm.yaml:2: not plain YAML: an alias; write the values again"),
         ("? [a]\n: 1", "arm.yaml:1: not plain YAML: a key that is no plain word"),
         (
             "about: !!python/object/apply:os.system [ls]",
@@ -220,7 +246,10 @@ def test_a_wrong_value_is_reported_with_its_place(urdf, text, message):
         ("about: |\n" + 300_000 * " ", "arm.yaml: got a file of 300009 bytes, expected at most 262144"),
         (b"about: \xff", "arm.yaml: got bytes that are not UTF-8, expected YAML text"),
         (b"about: \x00", "arm.yaml: not plain YAML: characters that YAML does not allow"),
-        ("about: a\n---\nabout: b", "arm.yaml:2: not plain YAML: found another document"),
+        (
+            "about: a\n---\nabout: b",
+            "arm.yaml:2: not plain YAML: found another document; remove the line ---",
+        ),
     ],
 )
 def test_anything_but_plain_yaml_is_refused(urdf, text, message):
@@ -232,7 +261,7 @@ def test_all_errors_of_a_file_are_reported_at_once(urdf):
         load_settings(urdf("gear: 1\njoints:\n  a: {gear: 0}\n"))
     assert str(error.value).splitlines() == [
         "arm.yaml:3: joints.a.gear: got 0, expected greater than 0",
-        "arm.yaml:1: unknown key 'gear'; write it under 'joints: NAME'",
+        "arm.yaml:1: unknown key 'gear'; write it under 'joints.NAME'",
     ]
 
 
@@ -289,6 +318,14 @@ def test_a_mapping_may_have_a_file_of_its_own(tmp_path, monkeypatch):
     (tmp_path / "logger.yaml").write_text("units: {q: grad}\n")
     with pytest.raises(SettingsError, match=r"^logger\.yaml:1: units\.q: got 'grad', expected 'rad', 'deg'"):
         load_mapping("logger.yaml", ["a"])
+
+
+def test_units_in_settings_have_the_spellings_of_headers(urdf):
+    """A unit that a draft recognises in a header is also a unit of a setting, with the same meaning."""
+    units = "units: {t: seconds, q: Degrees, qd: 0.5 °/s, tau: N*m}"
+    logs = load_settings(urdf(f"logs:\n  {units}\n  joints: {{a: {{units: {{q: 2 cm, tau: kN}}}}}}\n")).logs
+    assert logs.units.model_dump(exclude_none=True) == {"t": "s", "q": "deg", "qd": "0.5 deg/s", "tau": "Nm"}
+    assert logs.joint("a").units.model_dump(exclude_none=True) == {"q": "20 mm", "tau": "1000 N"}
 
 
 def test_reading_settings_imports_nothing_heavy():

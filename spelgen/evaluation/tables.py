@@ -46,8 +46,12 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Con
             star = "*" if best is not None and row.get(name) == best else " "
             # Numbers without a star end with a blank, so that the digits of a column are aligned.
             cells.append(f"{number(row[name]) if name in row else ''} {star}")
-        lines.append(tuple(cells))
-    return Listing(title, ("", *(f"{name}  " for name in columns)), tuple(lines), note)
+        lines.append(cells)
+    # Columns without a star end with their digits, so that names of joints have more room.
+    padded = zip(["", *(f"{name}  " for name in columns)], *lines, strict=True)
+    starred = [x if any(cell.endswith("*") for cell in x) else tuple(map(str.rstrip, x)) for x in padded]
+    head, *body = zip(*starred, strict=True)
+    return Listing(title, head, tuple(body), note)
 
 
 def result_tables(results: Results) -> list[Listing]:

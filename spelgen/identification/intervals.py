@@ -63,12 +63,17 @@ class Interval:
         return DETERMINED[-1]
 
     @property
+    def rounded(self) -> float:
+        """The estimate, rounded to the second digit of half the width of its interval."""
+        if not 0 < self.half < math.inf:
+            return self.value
+        # Adding 0 turns -0 into 0.
+        return round(self.value, 1 - int(f"{self.half:.1e}"[-3:])) + 0.0
+
+    @property
     def text(self) -> str:
         """The estimate and half the width of its 95 % interval, as in ``1.234 ± 0.056``, with the same last digit."""
-        half = f"{self.half:.1e}"
-        # Adding 0 turns -0 into 0.
-        value = round(self.value, 1 - int(half[-3:])) + 0.0 if 0 < self.half < math.inf else self.value
-        return f"{value:.4g} ± {self.half:.2g}"
+        return f"{self.rounded:.4g} ± {self.half:.2g}"
 
     def to_dict(self) -> dict[str, object]:
         """Return the estimate and its interval in JSON form."""
@@ -89,7 +94,9 @@ def base_unit(name: str) -> str:
 
 def interval_listing(title: str, intervals: Sequence[Interval], note: str = "") -> Listing:
     """Return a table of estimates with half the widths of their 95 % intervals. note: text below the table."""
-    rows = [(x.name, f"{x.value:.5g}", f"{x.half:.2g}", x.determined) for x in intervals]
+    if any(x.name.endswith("R") for x in intervals):
+        note = f"R: includes parameters of other links that act only in this combination. {note}".strip()
+    rows = [(x.name, f"{x.rounded:.5g}", f"{x.half:.2g}", x.determined) for x in intervals]
     return Listing(title, ("parameter", "value", "+-", "determined"), tuple(rows), note, left=(0, 3))
 
 

@@ -13,7 +13,7 @@ from itertools import product
 from math import pi
 from typing import Annotated, Literal
 
-from pydantic import Field, PlainSerializer, WrapValidator, field_validator, model_validator
+from pydantic import Field, PlainSerializer, ValidationInfo, WrapValidator, field_validator, model_validator
 
 from spelgen.errors import SettingsError
 from spelgen.settings.yaml_document import Group, Number, Place, Positive
@@ -66,10 +66,19 @@ Accepted = Literal[
 """Codes of errors of `spelgen logs` that a user can accept."""
 
 
-def _scaled(value: object, validate: Callable[[object], str]) -> str:
-    """Return a unit that ``validate`` accepts, with its factor if it has one, such as "0.01 deg"."""
-    match = isinstance(value, str) and re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?) ?([^\d\s.].*)", value)
-    return f"{match[1]} {validate(match[2])}" if match and float(match[1]) else validate(value)
+def _scaled(value: object, validate: Callable[[object], str], info: ValidationInfo) -> str:
+    """Return a validated unit, which may have a factor, such as "0.01 deg", or another spelling, such as "degrees"."""
+    text = value if isinstance(value, str) else ""
+    match = re.fullmatch(r"((?:\d*\.?\d+(?:e[+-]?\d+)? ?)?)([^\d\s.].*)", text)
+    if not match or (match[1] and not float(match[1])):
+        return validate(value)
+    factor, name = match[1].strip(), match[2]
+    # "grad" is a degree in German, and 0.9 degrees in English: drafts are tested, but a mapping must be unambiguous.
+    plain = "" if name.lower().startswith("grad") else plain_unit(name)
+    multiple, _, unit = (mapped_unit(str(info.field_name), plain) or "").rpartition(" ")
+    if factor and multiple:
+        factor = f"{float(factor) * float(multiple):.9g}"
+    return f"{factor or multiple} {validate(unit or name)}".strip()
 
 
 # pydantic would warn if a field with a Literal type contained another value. A unit with a factor is such a value, so

@@ -5,11 +5,11 @@ the base class of their groups of keys.
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias, TypeVar, get_args
+from typing import Annotated, Any, TypeAlias, TypeVar, get_args, get_origin
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -31,12 +31,13 @@ EXPECTED = {
     "invalid_key": "a name as key; in braces, write numbers with a decimal point, 1.5",
 }  # fmt: skip
 
-# {part of a message of PyYAML: advice about its most frequent cause}.
+# {part of a message about YAML: advice about its most frequent cause}.
 YAML_ADVICE = {
-    r"'\t'": "indent by blanks, not by tabs",
+    r"'\t'": "write spaces in place of tabs", "an alias": "write the values again", "a second time": "join both",
+    "another document": "remove the line ---", "expected ',' or '}'": "write a text with braces in quotes",
     "expected <block end>": "write a text that begins with { or [ in quotes",
-    "expected ',' or '}'": "write a text with braces in quotes",
-}
+}  # fmt: skip
+SPACE = "write a space after the colon"
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _OCTAL = re.compile("[-+]?0[0-7]+")
@@ -180,19 +181,19 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     line, which have no lines. group: class of the settings.
     """
     location, error_type = detail["loc"], detail["type"]
-    # An unknown key, the most frequent error, is mostly misspelt: the message names the most similar known key.
+    parent = _group_at(group, location[:-1]).model_fields
+    # An unknown key, the most frequent error, is in a wrong group, or misspelt: the message names the groups that have
+    # it, or the most similar known key.
     if error_type == "extra_forbidden":
-        names, key = _group_at(group, location[:-1]).model_fields, str(location[-1])
-        error = unknown_name(location, "key", key, names, document)
-        # A key of another group is not misspelt. A key of a joint belongs to its settings or the logs, not to a fit.
-        owner = _group_with(group, key)
-        if owner is not None and (
-            len(location) == 1 or owner.startswith(("logs", "columns", "joints")) or not owner
-        ):
-            error.do = f"write it under '{owner}'" if owner else "write it at the left margin"
+        error = unknown_name(location, "key", str(location[-1]), parent, document)
+        places = " or ".join(_places(group, location))
+        error.do = f"write it {places}" if places else SPACE if ":" in str(location[-1]) else error.do
         return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
+    items = get_args(parent[str(location[-1])].annotation) if location and str(location[-1]) in parent else ()
+    if error_type == "tuple_type" and items and ... not in items:
+        expected = f"a list of {len(items)} numbers"
     # Pydantic adds "[key]" to the location of an invalid key of a dict: it is removed.
     if location[-1:] == ("[key]",):
         location, expected = location[:-1], "a name; write it in quotes"
@@ -207,9 +208,10 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
         got = got[:57] + "..."
     error = _error_at(location, document, got)
     error.expected = expected
-    if ":" in str(location[-1:]):
-        error.do = "write a blank after the colon of a key"
-    elif isinstance(detail["input"], str) and re.match(r"[-+]?\.?\d", detail["input"]):
+    got_text = detail["input"] if isinstance(detail["input"], str) else ""
+    if ":" in (str(location[-1]) if location else got_text):
+        error.do = SPACE
+    elif re.match(r"[-+]?\.?\d", got_text):
         error.do = "write the number only, with a decimal point; docs/settings.md has its unit"
     return error
 
@@ -249,20 +251,28 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
     return group
 
 
-def _group_with(group: type[BaseModel], key: str, path: str = "") -> str | None:
-    """Return the path to the first group of settings in `group` that has a key, such as "logs"; None without one.
+def _groups_with(group: type[BaseModel], location: Location) -> list[str]:
+    """Return the nearest groups that have the last key of a location, such as "under 'logs'"; [] if nowhere.
 
-    path: path to `group` itself.
+    group: class of the root of the document.
     """
-    if key in group.model_fields:
-        return path
+    paths: list[Location] = []
+    level = len(location)
+    while level and not paths:
+        level -= 1
+        groups = _groups(_group_at(group, location[:level]), location[:level])
+        paths = [path for path, x in groups if location[-1] in x.model_fields]
+    depth = min(map(len, paths), default=0)
+    return [f"under {dotted(x)!r}" if x else "without indentation" for x in paths if len(x) == depth]
+
+
+def _groups(group: type[BaseModel], path: Location) -> Iterator[tuple[Location, type[BaseModel]]]:
+    """Yield (path, class) of a group of settings and of all groups inside it. path: location of the group."""
+    yield path, group
     for name, field in group.model_fields.items():
         inner = _first_group(field.annotation)
-        of_joint = ": NAME" if str(field.annotation).startswith("dict") else ""
-        owner = _group_with(inner, key, f"{path}: {name}{of_joint}".removeprefix(": ")) if inner else None
-        if owner is not None:
-            return owner
-    return None
+        if inner:
+            yield from _groups(inner, (*path, name, *["NAME"] * (get_origin(field.annotation) is dict)))
 
 
 def _first_group(annotation: object) -> type[BaseModel] | None:
