@@ -186,8 +186,8 @@ def explain(detail: ErrorDetails, document: YamlDocument | None, group: type[Bas
     # it, or the most similar known key.
     if error_type == "extra_forbidden":
         error = unknown_name(location, "key", str(location[-1]), parent, document)
-        places = " or ".join(_places(group, location))
-        error.do = f"write it {places}" if places else SPACE if ":" in str(location[-1]) else error.do
+        groups = " or ".join(_groups_with(group, location))
+        error.do = f"write it {groups}" if groups else SPACE if ":" in str(location[-1]) else error.do
         return error
     message = detail["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     expected = EXPECTED.get(error_type, message)
