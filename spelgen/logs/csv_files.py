@@ -15,6 +15,7 @@ import pyarrow.csv
 
 from spelgen.errors import LogError
 from spelgen.logs.bags import FIELDS
+from spelgen.logs.column_names import KNOWN
 from spelgen.logs.tables import STATED_KEY, LogTable
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.values import is_number, stamps
@@ -259,8 +260,6 @@ def _in_utf8(content: bytes) -> bytes:
         # The head of the file may end in the middle of a UTF-8 character, which the incremental decoder omits.
         encoding or codecs.getincrementaldecoder("utf-8")().decode(content[:HEAD], final=len(content) < HEAD)
     except UnicodeDecodeError:
-        from spelgen.logs.suggest import KNOWN
-
         # Any text can be read as Latin-1: another character set is used if it gives more words of column names.
         heads = {x: content[:HEAD].decode(x, "ignore").lower() for x in CHARACTER_SETS}
         words = [x for x in KNOWN if not x.isascii()]

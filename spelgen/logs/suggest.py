@@ -6,10 +6,9 @@ SI units: the checks of logs then detect degrees, for example, and state the set
 
 import json
 import re
-import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, groupby, pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,63 +17,32 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.labels import listed
+from spelgen.logs.column_names import (
+    COMMANDED,
+    CURRENT,
+    OTHERS,
+    ColumnName,
+    parse_column_name,
+)
+from spelgen.logs.column_selection import (
+    abbreviated_names,
+    best_signal,
+    columns_by_joint,
+    columns_by_quantity,
+    complete_signals,
+    require_one_arm,
+)
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
 from spelgen.logs.values import logged_column
-from spelgen.settings.log_mapping import CURRENTS, UNIT_NAMES, LogMapping, is_unit, mapped_unit, plain_unit
+from spelgen.settings.log_mapping import CURRENTS, LogMapping, mapped_unit
 
-WORDS = {
-    quantity: frozenset(words.split())
-    for quantity, words in (
-        ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit zeitstempel uhrzeit "
-              "temps tiempo tempo tijd czas время 时间 時間 時刻 시간"),
-        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición posizione posição positie "
-              "hoek положение позиция угол 位置 角度 위치 각도"),
-        ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit geschw vitesse velocidad "
-               "velocidade velocità snelheid prędkość скорость spd 速度 속도"),
-        ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
-                "curr cur iq iqf drehmoment strom couple par coppia corrente corriente koppel момент ток 力矩 扭矩 "
-                "电流 トルク 電流 토크 전류"),
-    )
-}  # fmt: skip
-# Words in column names by which signals are classified: commanded values, measured values, other signals than the
-# needed joint signals, and values that a model computed (used only if the log has no measured values).
-COMMANDED, MEASURED, OTHERS, COMPUTED = (
-    frozenset(words.split())
-    for words in (
-        "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
-        "ipo set soll u leader consigne заданное заданный 目标 指令 设定 目標 목표",
-        "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
-        "현재 실제",
-        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance dist interact dd "
-        "ddot dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
-        "computed model predicted pred sim simulated g c f",
-    )
-)
-# {letter: quantity} for names such as `i_actual` (motor current) and `m_actual` (moment).
-LETTERS = {"i": "tau", "m": "tau"}
-# Letters that count as units only in brackets, as in `time (s)`: without brackets they may be part of a name.
-BARE = {"s", "n", "a", "m"}
-# Names of derivatives of positions, such as `d_theta` and `q_dot`.
-DERIVATIVE = r"(?<![^\W\d_])(?:d[ _]?(?:theta|pos|q)|(?:theta|pos|q)[ _]?dot)(?![^\W\d_])"
 JOINING = (
     "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
     "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
-)
-# All words that describe a signal. Any other word in a column name may be the name of an arm.
-KNOWN = COMMANDED.union(MEASURED, OTHERS, COMPUTED, *WORDS.values())
-FILTERED = {"filt", "filtered", "smooth", "smoothed"}
-CURRENT = {"current", "currents", "curr", "cur", "iq", "iqf", "strom", "corrente", "corriente", "ток", "i"}
-CURRENT |= {"电流", "電流", "전류"}
-# Words that are not separated from others by blanks: words of Chinese, Japanese and Korean anywhere, long words at the
-# end of a compound such as `Gelenkwinkel` or `motortorque`, and short words after the J of a joint, as in `JPOS1`.
-GLUED = re.compile(
-    "|".join(x for x in sorted(KNOWN.union(OTHERS), key=len, reverse=True) if x > "⺀")
-    + rf"|(?<=[^\W\d_])(?:{'|'.join(x for x in WORDS['q'].union(WORDS['qd'], WORDS['tau']) if len(x) > 4)})(?![^\W\d_])"
-    + r"|(?<=\bj)(?:pos|vel|trq|tau|cmd|cur)(?![^\W\d_])"
 )
 
 
@@ -83,26 +51,6 @@ class Suggestion(NamedTuple):
 
     text: str
     missing: tuple[str, ...]
-
-
-class ColumnName(NamedTuple):
-    """Name of a column, and its parts.
-
-    Attributes:
-        name: the name.
-        words: words of the name in lower case, without the words of the joint.
-        unit: unit in the name, or in a line of units below the header; "" if there is none.
-        joint: joint whose name the column's name contains; "" if there is none.
-        quantity: "t", "q", "qd" or "tau"; None if neither words nor unit state it.
-        number: last number in the name without its unit; -1 if there is none.
-    """
-
-    name: str
-    words: set[str]
-    unit: str = ""
-    joint: str = ""
-    quantity: str | None = None
-    number: int = -1
 
 
 ByJoint = Mapping[str, Mapping[str, ColumnName]]
@@ -143,22 +91,28 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
-    columns = [_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names]
+    columns = [
+        parse_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names
+    ]
     if not commands:
         columns = _with_letters(_with_states(columns, table, len(joints)), table)
-    columns_of = _by_quantity(columns, commands, len(joints))
+    columns_of = columns_by_quantity(columns, commands, len(joints))
     # A column named "load" does not count as torque here, since servos have a register with this name.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
-    if not commands and not torques and len(_by_quantity(columns, True, len(joints))["u"]) >= len(joints):
+    if (
+        not commands
+        and not torques
+        and len(columns_by_quantity(columns, True, len(joints))["u"]) >= len(joints)
+    ):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
     moving = [x for x in columns_of["q"] if len(set(_numbers(table, x.name).tolist())) > 1]
-    _require_one_arm(moving, len(joints), file)
+    require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
     # to a base or gripper at rest.
-    moved = {x.number for x in _of_one_signal(moving, len(joints))}
+    moved = {x.number for x in best_signal(moving, len(joints))}
     if len(moved) == len(joints):
         for quantity, named in columns_of.items():
             complete = [x for x in named if x.number in moved]
@@ -166,8 +120,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # The order of numbered columns may differ from the order of the arm's joints: ROS often sorts joints by name. If
     # cells of the log contain joint names, they state the order.
     order = _order_in_cells(table, joints)
-    signals = {x: _of_one_signal(named, len(joints)) for x, named in columns_of.items()}
-    by_joint = {x: _by_joint(named, joints, order) for x, named in signals.items()}
+    signals = {x: best_signal(named, len(joints)) for x, named in columns_of.items()}
+    by_joint = {x: columns_by_joint(named, joints, order) for x, named in signals.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
         _require_joints_in_columns(table, [x.name for x in columns if x.quantity is None], len(joints), file)
@@ -184,35 +138,52 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
         del by_joint["qd"]
-    units = _units(by_joint, joints)
-    common = _common(units)
-    common = {"t": mapped_unit("t", clock.unit) or _unit_of_times(clock.name, table) or "s"} | common
-    rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
-    lines = [
-        f"# Drafted from the column names of {json.dumps(file.name)}: check it, and the order of the joints.",
-        f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
-        f"units: {json.dumps(common)}",
-    ]
-    if not commands and "qd" not in by_joint:
-        lines.append("velocity: differentiated")
-    if any(x.words & COMMANDED for x in by_joint.get("tau", {}).values()):
-        lines.append("# tau: commanded torques, since no others were logged")
-    lines += ["joints:", *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints)]
+    unit_of_times = mapped_unit("t", clock.unit) or _unit_of_times(clock.name, table) or "s"
+    lines = _mapping_lines(file.name, joints, by_joint, clock, unit_of_times)
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
     columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
-    unused = {x: _ranges([y.name for y in named if y.name not in used]) for x, named in columns_of.items()}
-    lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
-    unknown = {
-        (quantity, column.unit)
-        for quantity, named in [*by_joint.items(), ("t", {"": clock})]
-        for column in named.values()
-        if column.unit and not mapped_unit(quantity, column.unit)
+    unused = {
+        x: abbreviated_names([y.name for y in named if y.name not in used]) for x, named in columns_of.items()
     }
-    lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in sorted(unknown)]
+    lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
+    unknown = _unknown_units({**by_joint, "t": {"": clock}})
+    lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in unknown]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     lines += [f"# no column was found for {name}" for name in missing]
     return Suggestion("\n".join([*lines, ""]), tuple(missing))
+
+
+def _mapping_lines(
+    file: str, joints: Sequence[str], by_joint: ByJoint, clock: ColumnName, unit_of_times: str
+) -> list[str]:
+    """Return the lines of a mapping for the log named `file`: its clock, its units, and the columns of each joint.
+
+    clock: column of the times, with the name "" if there is none. by_joint: {quantity: {joint: column}}.
+    """
+    units = _units(by_joint, joints)
+    common = {"t": unit_of_times} | _common(units)
+    rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
+    lines = [
+        f"# Drafted from the column names of {json.dumps(file)}: check it, and the order of the joints.",
+        f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
+        f"units: {json.dumps(common)}",
+    ]
+    if "tau" in by_joint and "qd" not in by_joint:
+        lines.append("velocity: differentiated")
+    if any(x.words & COMMANDED for x in by_joint.get("tau", {}).values()):
+        lines.append("# tau: commanded torques, since no others were logged")
+    return [
+        *lines,
+        "joints:",
+        *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints),
+    ]
+
+
+def _unknown_units(by_joint: ByJoint) -> list[tuple[str, str]]:
+    """Return the pairs (quantity, unit) of columns whose unit is not known, in ascending order."""
+    pairs = {(quantity, column.unit) for quantity, named in by_joint.items() for column in named.values()}
+    return sorted((quantity, unit) for quantity, unit in pairs if unit and not mapped_unit(quantity, unit))
 
 
 def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) -> list[ColumnName]:
@@ -223,7 +194,7 @@ def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) ->
     unstated = [x for x in columns if x.number >= 0 and not x.words & (COMMANDED | OTHERS)]
     unstated = [x for x in unstated if x.quantity in ("q", None)]
     quantity = {}
-    for state in _complete_signals(unstated, 2 * joints).values():
+    for state in complete_signals(unstated, 2 * joints).values():
         ordered = sorted(state, key=lambda x: x.number)
         pairs = list(zip(ordered[:joints], ordered[joints:], strict=False))
         if len(state) == 2 * joints and _similarity(pairs, table)[0] > 0.9:
@@ -359,12 +330,6 @@ def _joint_lines(
         yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
 
 
-def _ranges(names: Sequence[str]) -> list[str]:
-    """Return the names, with runs that differ only in a number, such as x1, x2, x3, abbreviated to `x1 ... x3`."""
-    groups = [list(group) for _, group in groupby(names, lambda name: re.sub(r"\d+(?=\D*$)", "", name))]
-    return [f"{x[0]} ... {x[-1]}" if len(x) > 2 else ", ".join(x) for x in groups]
-
-
 def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
     motors = dataset_motors(folder)
@@ -379,80 +344,6 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
     missing = [f"q of {joint}" for joint, name in motor_of.items() if not name]
     lines += [f"# no motor was found for {name}" for name in missing]
     return Suggestion("\n".join([*lines, ""]), tuple(missing))
-
-
-def _column_name(name: str, labels: Mapping[str, re.Pattern[str]], unit: str, words: set[str]) -> ColumnName:
-    """Return the parts of a column's name; the unit is in brackets, or the last word.
-
-    labels: {joint: pattern of its name}. unit: unit in a line of units below the header. words: additional words that
-    describe the column, such as "time" for a column of dates.
-    """
-    # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
-    # a number or a joint.
-    fraction = (
-        r"[\W_](\d*\.\d+ ?[^\W\d_]+|(?:\d*\.\d+ ?)?[%‰])(?![^\W_])"  # a unit such as 0.1%, at any place
-    )
-    for bracket in re.finditer(rf"\s*[\[(]([^\])]+)[\])]|{fraction}", name):
-        text = bracket[1] or bracket[2]
-        is_other = re.search(r"[\d',]", text) or text in labels
-        if is_unit(plain_unit(text)) or (bracket.end() == len(name) and not is_other):
-            unit, name_without = plain_unit(text), name.replace(bracket[0], "", 1)
-            return _column_name(name_without, labels, unit, words)._replace(name=name)
-    matches = {joint: match for joint, label in labels.items() if (match := label.search(name))}
-    joint = max(matches, key=lambda x: len(matches[x][0]), default="")
-    bare = labels[joint].sub(" ", name) if joint else name
-    numbers = re.findall(r"\d+", bare)
-    # A column named `t`, or with another word for time, contains times, even if a joint has the same name.
-    if joint and name.lower() in WORDS["t"]:
-        joint, bare = "", name
-    last = re.fullmatch(r"(.*?)[\s_.]*?((?:[^\W\d_]|°)+(?:/s|[\s_](?:per[\s_])?s)?)(?:(?!°)[\W\d_])*", bare)
-    is_bare = last and (last[2].lower() in BARE or last[2] == name[:1])
-    if not unit and last and not is_bare and is_unit(plain_unit(last[2])):
-        bare, unit = last[1], plain_unit(last[2])
-    separated = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", bare).lower()
-    separated = GLUED.sub(r" \g<0> ", unicodedata.normalize("NFKC", separated))
-    texts = re.findall(r"[^\W\d_]+", re.sub(DERIVATIVE, "qd", separated))
-    words = words | set(texts) | ({"theta"} if "theta" in separated else set())
-    quantity = "t" if words & WORDS["t"] else None
-    # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
-    for word in reversed(texts):
-        if quantity is None and (quantity := next((x for x, y in WORDS.items() if word in y), None)):
-            # Only a noun that is a current keeps the words for currents: `current_torque` and `current_as_torque` are
-            # torques.
-            words = words if word in CURRENT else words - CURRENT
-    quantity = quantity or next((x for x in UNIT_NAMES if mapped_unit(x, unit)), None)
-    if quantity is None and words & MEASURED:
-        quantity = next((LETTERS[x] for x in texts if x in LETTERS), None)
-    return ColumnName(name, words, unit, joint, quantity, int(numbers[-1]) if numbers else -1)
-
-
-def _by_quantity(columns: Sequence[ColumnName], commands: bool, joints: int) -> dict[str, list[ColumnName]]:
-    """Return {quantity: columns} for the quantities "t", "q", "qd", "tau" or "u".
-
-    commands: True for logs with commanded positions "u" instead of velocities and torques. joints: number of joints.
-    Columns with a word for commands, such as "d" or "target", are omitted from logs of torques. If no names state
-    positions, columns that only name a joint are positions.
-    """
-    by_quantity: dict[str, list[ColumnName]] = {x: [] for x in (("t", "q", "u") if commands else WORDS)}
-    unstated, commanded = [], []
-    for column in columns:
-        quantity = column.quantity
-        if commands and column.words & COMMANDED and quantity in ("q", None):
-            quantity = "u"
-        elif column.words & (COMMANDED | OTHERS):
-            if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
-                commanded.append(column)
-            continue
-        if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
-            unstated.append(column)
-        if quantity in by_quantity:
-            by_quantity[quantity].append(column)
-    if len(by_quantity["q"]) < joints:
-        by_quantity["q"] += unstated
-    # If no other torques were logged, the commanded torques are used.
-    if not commands and not by_quantity["tau"]:
-        by_quantity["tau"] = commanded
-    return by_quantity
 
 
 def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -523,84 +414,3 @@ def _first_list(column: pa.ChunkedArray) -> list[object]:
     if isinstance(first, str) and (match := re.fullmatch(r"[^\[({]*[\[({]+(.*?)[\])}]+", first.strip())):
         first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
     return first if isinstance(first, list) else []
-
-
-def _of_one_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[ColumnName]:
-    """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
-
-    A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. In this order, measurements are preferred to values that a model computed,
-    torques to currents, signals of joints to signals of motors, names with a word such as "actual" to other names,
-    unfiltered to filtered values, and names with few words to longer names. Example: `tau_J` is preferred to
-    `tau_hat_filtered`.
-
-    columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
-    """
-    complete = _complete_signals(columns, joints)
-    best = min(reversed(complete), key=_rank, default=frozenset[str]())
-    return complete.get(best, columns)
-
-
-def _complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozenset[str], list[ColumnName]]:
-    """Return {words of the names: columns} of the signals that have a column for each of the `joints`."""
-    signals: dict[frozenset[str], list[ColumnName]] = {}
-    for column in columns:
-        signals.setdefault(frozenset(column.words), []).append(column)
-    return {words: named for words, named in signals.items() if len(named) >= joints}
-
-
-def _require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> None:
-    """Raise LogError for positions of several arms, such as `left_q1` and `right_q1`, or q0 to q13 of 7 joints.
-
-    columns: columns of changing positions in the log `file`. joints: number of joints.
-    """
-    signals = _complete_signals(columns, joints)
-    best = min(signals, key=_rank, default=frozenset[str]())
-    # Column names of several arms differ only in words that do not describe a signal, such as "left", or in a number,
-    # which is not among the words.
-    arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
-    of_joint: dict[str, list[str]] = {}
-    for column in chain.from_iterable(signals[x] for x in arms):
-        label = column.joint or (str(column.number) if column.number >= 0 else column.name)
-        of_joint.setdefault(label, []).append(column.name)
-    rivals = max(of_joint.values(), key=len, default=[])
-    if len(rivals) > 1 and len(of_joint) >= joints:
-        raise LogError(
-            f"positions of {len(rivals)} arms: {shortened(rivals, TUNING.listed)} are of one joint", file=file,
-            expected="columns of one arm", do="remove the columns of the other arms, or write the mapping by hand",
-        )  # fmt: skip
-    unnamed = [x.name for x in signals.get(best, ()) if not x.joint]
-    if len(unnamed) >= 2 * joints:
-        got = f"{len(unnamed)} columns of positions that change: {shortened(_ranges(unnamed), TUNING.listed)}"
-        raise LogError(
-            got, file=file, expected=f"{joints}, one for each joint",
-            do="remove the columns of other joints, or write the mapping by hand",
-        )  # fmt: skip
-
-
-def _rank(words: frozenset[str]) -> list[int]:
-    """Return the order of preference of a signal with these words, the smallest first (see `_of_one_signal`)."""
-    ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
-    return [*ranks, words.isdisjoint(MEASURED), not words.isdisjoint(FILTERED), len(words)]
-
-
-def _by_joint(
-    columns: Sequence[ColumnName], joints: Sequence[str], order: Mapping[str, int]
-) -> dict[str, ColumnName]:
-    """Return {joint: column}: the column whose name contains the name of the joint.
-
-    If no column name contains a joint name, columns are assigned by the last number in their names: to the joint with
-    this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
-    number}, the result of `_order_in_cells`.
-    """
-    named = {column.joint: column for column in columns if column.joint}
-    numbered = {x.number: x for x in columns if x.number >= 0}
-    # If columns have the same name, pandas appends numbers except to the first: q, q.1, q.2. The first then has the
-    # number -1.
-    if len(numbered) == len(joints) - 1:
-        numbered = {x.number: x for x in columns}
-    if named or len(numbered) < len(joints):
-        return {joint: named[joint] for joint in joints if joint in named}
-    if set(order) == set(joints):
-        return {joint: numbered[order[joint]] for joint in joints if order[joint] in numbered}
-    return dict(zip(joints, map(numbered.__getitem__, sorted(numbered)), strict=False))
