@@ -96,6 +96,27 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
             assert errors([read], arm) == ""
 
 
+def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
+    """Positions in 0..360 degrees of joints with and without limits have one error, the unit, whose line mends the log."""
+    text = (robots / "six_dof.urdf").read_text()
+    joints = load_arm(robots / "six_dof.urdf").chain.joint_names
+    for joint in joints[::2]:
+        text = re.sub(rf'(<joint name="{joint}" type=)"revolute"', r'\1"continuous"', text)
+    (tmp_path / "arm.urdf").write_text(text)
+    arm = load_arm(tmp_path / "arm.urdf")
+    columns = motion(arm, 0)
+    for joint in joints:
+        columns[f"qd_{joint}"] = np.degrees(columns[f"qd_{joint}"])
+        columns[f"q_{joint}"] = np.degrees(columns[f"q_{joint}"])
+        if joint in joints[::2]:
+            columns[f"q_{joint}"] %= 360
+    file = written(columns, tmp_path / "log.csv")
+    (error,) = check_logs(read_logs([file], arm), arm).errors
+    assert "degrees" in str(error) and "check the encoder" not in str(error)
+    mapping = advised(str(error))
+    assert not errors(read_logs([file], arm, mapping=mapping), arm)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("form", ["sign bit", "overflow", "unsigned", "turn", "degrees"])
 def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, tmp_path, form, seed):
