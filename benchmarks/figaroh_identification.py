@@ -89,7 +89,9 @@ class FigarohDynamics:
 
     @property
     def inertial_parameters(self) -> np.ndarray:
-        """Return m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz per body in the joint frame, (n, 10); 0 if no base parameter."""
+        """Return m, m c, Ixx, Ixy, Ixz, Iyy, Iyz, Izz per body in the joint frame, (n, 10).
+
+        Entries that are no base parameters are 0."""
         return self.constants[: 10 * self.n].reshape(-1, 10)[:, OURS]
 
     @property

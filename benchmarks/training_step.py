@@ -83,7 +83,10 @@ def plain_mass(model: ArmModel) -> ArmModel | None:
 
 
 def training_step(model: ArmModel, data: Data) -> None:
-    """Compute the loss of windows and its gradient: geodesic position and velocity errors, PHNODE paper, eq. 8."""
+    """Compute the loss of windows of a trajectory, and its gradient with respect to the model's parameters.
+
+    The loss is the sum of geodesic position errors and of velocity errors (Duong et al., IEEE T-RO 2024, eq. 8).
+    """
     model.zero_grad()
     prepared = model.prepare()
     q, p = data.q[:, 0], model.momentum(model.at(data.q[:, 0], prepared=prepared), data.qd[:, 0])

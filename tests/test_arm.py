@@ -427,7 +427,7 @@ class TestLumping:
 
 
 class TestAgainstPinocchio:
-    """Poses, M and V of an arm equal Pinocchio's own reading of the URDF at random configurations."""
+    """At random configurations, poses, M and the potential energy are equal to Pinocchio's, which reads the URDF itself."""
 
     def test_all_reference_arms_move_and_weigh_the_same(self, shared):
         rng = np.random.default_rng(0)

@@ -536,7 +536,8 @@ def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
 def test_seconds_of_recorded_logs_show_a_coupling(shared):
     """The coupling of the TX40's wrist is found in the first 5.4 s of its log.
 
-    The coupling lowers the residual by a factor of a thousand in one of ten blocks, by three in the other blocks.
+    The coupling lowers the squared torque residual in each of ten blocks of the log: a thousand times in one, three
+    times in the others.
     """
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)

@@ -67,7 +67,11 @@ def moved(model, seconds, seed=0):
 
 
 def on_motors(q, qd, qdd, arm, strength, armature):
-    """Return the joint torques (T, 6) of friction and rotors that act at the speeds of the motors."""
+    """Return joint torques and motor torques, (T, 6) [Nm] each, of a motion of an arm with coupled motors.
+
+    Friction and rotor inertia act at the motors. strength: Coulomb friction of each motor [Nm]. armature: inertia of
+    each rotor [kg m^2].
+    """
     speeds = np.eye(6)
     speeds[4:, 4:] = SPEEDS
     at_motors = strength * np.tanh(qd @ speeds.T / 0.01) + 0.3 * strength * (qd @ speeds.T)

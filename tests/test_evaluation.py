@@ -333,7 +333,7 @@ def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):
 def test_mimic_joints_have_baselines_tips_and_predictions(cart):
     """An arm with a mimic joint has baselines, tip errors and predictions, also in single precision.
 
-    Its URDF's dynamics made the logs: the pendulum mimics the slider.
+    The logs are simulated from its URDF, in which the joint of the pendulum mimics the slider.
     """
     mimic = '<axis xyz="0 -1 0"/><mimic joint="slide" multiplier="2" offset="0.1"/>'
     cart.write_text(CART.replace('<axis xyz="0 -1 0"/>', mimic))

@@ -100,9 +100,9 @@ def test_base_parameters_make_the_torque(robots, robot):
 
 
 def excited(arm, seconds=20.0, seed=0, noise=0.0, friction=None):
-    """Return samples of a smooth random motion, and the parameters that give their torques.
+    """Return samples of a smooth random motion with the torques of an arm, and the parameters of this arm.
 
-    Parameters: the URDF's bodies, friction and rotors.
+    Its bodies are the URDF's; friction and rotor inertias are added. noise: standard deviation of the torques [Nm, N].
     """
     friction = friction or FrictionModel()
     n = len(arm.coordinates)

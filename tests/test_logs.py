@@ -272,7 +272,7 @@ DEGREES = {
 
 @pytest.mark.parametrize("case", DEGREES)
 def test_degrees_are_refused(case):
-    """Positions in degrees are one error about all joints, with one line that corrects all joints."""
+    """Positions in degrees are one error about all joints, and one line of settings corrects all of them."""
     trajectory, message, units = DEGREES[case]
     with pytest.raises(LogError) as caught:
         check([trajectory], JOINTS, ("revolute", "revolute"))

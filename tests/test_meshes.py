@@ -154,9 +154,8 @@ def gltf_of_triangles_without_corners(folder: Path) -> str:
     content = json.loads(gltf(INLINE))
     content["meshes"][0]["primitives"][0]["indices"] = 1
     content["accessors"].append({"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"})
-    content["bufferViews"].append(
-        {"buffer": 0, "byteOffset": 12, "byteLength": 6}
-    )  # the indices of the second vertex are 0, 16256, 0
+    # The floats of the second vertex, read as indices of a triangle, are 0, 16256 and 0: there is no vertex 16256.
+    content["bufferViews"].append({"buffer": 0, "byteOffset": 12, "byteLength": 6})
     (folder / "m.gltf").write_text(json.dumps(content))
     return "m.gltf"
 

@@ -1,4 +1,7 @@
-"""Intervals of the posterior of torque fits, compared with known arms, sampled parameters and exact combinations."""
+"""Intervals of the posterior of torque fits agree with simulated arms, sampled parameters and exact combinations.
+
+The exact combinations are linear combinations of the parameters, whose variances are known.
+"""
 
 import json
 import pickle

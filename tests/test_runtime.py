@@ -29,7 +29,8 @@ from spelgen.runtime.residual_terms import HARMONICS, SPLINES, ResidualTerms
 from spelgen.runtime.rows import Constant, Joint, Link, vector
 
 NUMBERS = Path(__file__).parent / "golden" / "numbers.json"
-# replacements that restore the first release's formulas of friction: |gravity torque|, tanh and exp
+# Replacements in the source that restore three formulas of friction of the first release: the load was |gravity
+# torque|, the smooth sign was tanh, and the Stribeck curve was exp.
 FIRST_STAGE = (
     ("load = 0.01 * torch.where", "load = 0.0 * torch.where"),
     ("torch.rsqrt(velocity * velocity + width**2)", "(velocity / width).tanh() / velocity"),
@@ -298,9 +299,10 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Return parameters that give the bodies which the first release had after 0.01 was added to all its parameters.
+    """Return the parameters of the bodies of the first release, for 0.01 added to each of its parameters.
 
-    Its Cholesky factors were lower triangular; relative to nominal, their entries were then exp(0.01) and 0.01.
+    The first release had lower triangular Cholesky factors of the pseudo-inertia, relative to the nominal ones. With
+    0.01 added, their diagonal entries are exp(0.01), and their other entries 0.01. bodies: a `BodyChain`.
     """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)

@@ -755,7 +755,7 @@ def test_a_subset_of_many_samples_is_fitted_first(emitted, monkeypatch):
     monkeypatch.setattr(torque_fit, "TUNING", TorqueTuning(initial_samples=200))
     found = fit_torque(quick, samples)
     assert found.steps != expected.steps
-    # costs differ by the estimated noise and correlation time
+    # the costs differ because noise and correlation time are estimated separately in both fits
     np.testing.assert_allclose(found.correlation_time, expected.correlation_time, rtol=0.1)
     assert found.cost == pytest.approx(expected.cost, rel=0.03)
     np.testing.assert_allclose(found.rms_residual, expected.rms_residual, rtol=1e-3)

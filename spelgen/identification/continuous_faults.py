@@ -73,7 +73,7 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets, with the largest one; the text of `JointSense` covers reversed joints."""
+        """Return the text about zero offsets, with the largest offset. Reversed joints have a text of their own."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())

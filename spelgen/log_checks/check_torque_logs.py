@@ -108,8 +108,8 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints.
-        # The torques may show a unit of positions that is otherwise unknown, and its error is then replaced.
+        # The model is fitted only to logs without errors, since faults give wrong hints. An error about an unknown unit
+        # of positions is an exception: the torques may show the unit, and an error that states it then replaces it.
         self._guessed = summary.guessed
         if summary.is_presumed and moving is not None:
             summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]

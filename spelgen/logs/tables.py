@@ -200,7 +200,7 @@ def missing_columns(
 ) -> LogError:
     """Return the error about missing columns of a log, with advice for the most likely cause.
 
-    missing: names in the mapping of the columns that are missing. columns: names of all columns of the file.
+    missing: missing columns, by the names that the mapping states. columns: names of all columns of the file.
     """
     of_quantity = {x: [mapping.column(x, joint) for joint in joints] for x in mapping.quantities}
     patterns = [mapping.pattern(x).replace("{joint}", "<joint>") for x in of_quantity]

@@ -177,8 +177,8 @@ class Spans:
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
         """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
 
-        Each joint has 2 S rows, in increasing order of the joints. A row is M in the block of ``floats`` in which only
-        this joint has moved, minus M in block 0.
+        With S samples per block (see the module), each joint has 2 S rows, in increasing order of the joints. A row is
+        M in the block of ``floats`` in which only this joint has moved, minus M in block 0.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])

@@ -221,7 +221,7 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
     """
     rigid = estimate.problem.jacobian.rigid
     (name,) = rigid.names("fractions")
-    # fractions: (n, elements), indices in x
+    # fractions: (n, K), indices in x of the K bristle fractions of each joint
     fractions = rigid.unflatten(torch.arange(len(estimate.state.x)))[name]
     block = fractions.unsqueeze(-1), fractions.unsqueeze(-2)
     prior: torch.Tensor = torch.linalg.inv(estimate.problem.prior.precision)[block]
