@@ -427,7 +427,7 @@ class TestLumping:
 
 
 class TestAgainstPinocchio:
-    """At random configurations, poses, M and the potential energy are equal to Pinocchio's, which reads the URDF itself."""
+    """At random configurations, poses, M and potential energy are equal to Pinocchio's, which reads the URDF itself."""
 
     def test_all_reference_arms_move_and_weigh_the_same(self, shared):
         rng = np.random.default_rng(0)

@@ -97,7 +97,7 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 
 
 def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
-    """Positions in 0..360 degrees, of joints with and without limits, have one error: the unit. Its line mends the log."""
+    """Positions in 0..360 degrees, of joints with and without limits, have one error, whose line mends the log."""
     text = (robots / "six_dof.urdf").read_text()
     joints = load_arm(robots / "six_dof.urdf").chain.joint_names
     for joint in joints[::2]:

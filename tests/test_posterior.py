@@ -1,7 +1,4 @@
-"""Intervals of the posterior of torque fits agree with simulated arms, sampled parameters and exact combinations.
-
-The exact combinations are linear combinations of the parameters, whose variances are known.
-"""
+"""Intervals of the posterior of torque fits agree with simulated arms, and with sampled parameters."""
 
 import json
 import pickle
