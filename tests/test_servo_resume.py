@@ -85,8 +85,8 @@ def test_only_the_same_logs_and_model_are_resumed(start, whole, tmp_path):
     others = [replace(log, u=log.u + 0.01) for log in servo_logs(2, 1.0)]
     assert digest(others) != digest(servo_logs(2, 1.0))
     checkpoint, run = RunFolder(whole).load_checkpoint(), RunFolder(tmp_path / "run")
-    run.start(RunFolder(whole).read_spec(), start / "servo_arm.urdf", force=False)
-    run.config.write_bytes((whole / "config.json").read_bytes())
+    with run.started(RunFolder(whole).read_spec(), start / "servo_arm.urdf", force=False):
+        run.config.write_bytes((whole / "config.json").read_bytes())
     torch.save(checkpoint.content | {"servo": {}}, run.checkpoint)
     with pytest.raises(RunError, match="a checkpoint of another model"):
         trained(start, run.path, options=RunOptions(resume=True))

@@ -255,14 +255,16 @@ class PositionUnit(WrongScale):
         if len(joints) == 1:
             lowest[lowest.argmin()] = np.inf
             sides.append(lowest.min() - GEOMETRY.ambiguous + GEOMETRY.right_angle)
-        # no joint has a gear of a larger ratio than LARGEST_GEAR
-        is_sure = min(sides) > best.cost + GEOMETRY.right_angle and np.exp(-exponents).max() < LARGEST_GEAR
-        fault = self if is_sure else self._open_fault or self
         scales = [SCALES.get(x, 1.0) for x in UNITS[problem.arm.joint_types[joints[0]]]]
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
+        is_unit = np.abs(nearest - exponents) < 0.1
+        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        largest_gear = np.where(is_unit, 0.0, np.exp(-exponents)).max()
+        is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
+        fault = self if is_sure else self._open_fault or self
         rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
-        unit = problem.fit(scaled(np.where(np.abs(nearest - exponents) < 0.1, nearest, rounded), form, fault))
+        unit = problem.fit(scaled(np.where(is_unit, nearest, rounded), form, fault))
         return (
             unit
             if unit.cost < best.cost + GEOMETRY.right_angle

@@ -81,12 +81,15 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # first is used, since its units are most frequent.
     readings = _unit_readings(signals, is_far)
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
-    # Any other common multiple of all joints is of the times: 0.1 of 0.1 us in us is no rpm, which is 0.105.
-    if keys and not is_far and distance > 0.03 + 0.02 * len(keys["units"]) and _rate_by_velocities(signals):
+    registers = signals.qd / mapping.scale("qd", joint)
+    is_register = bool((registers == registers.round()).all())
+    # Any other common multiple of all joints is of the times, unless the velocities are values of registers: 0.1 of
+    # 0.1 us in us is no rpm, which is 0.105.
+    is_other = bool(keys) and not is_far and distance > 0.03 + 0.02 * len(keys["units"])
+    if is_other and not is_register and _rate_by_velocities(signals):
         return None
     if distance > log(1.25):
-        registers = signals.qd / mapping.scale("qd", joint)
-        if is_far or not (registers == registers.round()).all():
+        if is_far or not is_register:
             return message if is_far else None
         message += ", whole numbers of an unknown unit, such as register values"
         return Advice(message, keys={"velocity": "differentiated"})
