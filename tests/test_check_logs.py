@@ -545,6 +545,16 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
     assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]
 
 
+@pytest.mark.parametrize("name", ["ga_N12T25", "ga_N12T25_again", "opt"])
+def test_degrees_of_a_recorded_arm_with_coarse_encoders_are_one_error(shared, name):
+    """In degrees, the steps of coarse encoders exceed thresholds in rad, and yet no signal is reported as frozen."""
+    folder = shared / "logs" / "airbot"
+    airbot = load_arm(folder / "airbot.urdf")
+    (log,) = read_logs([folder / f"{name}.parquet"], airbot)
+    (error,) = check_logs([replace(log, q=np.degrees(log.q), qd=np.degrees(log.qd))], airbot).errors
+    assert "write 'units: {q: deg, qd: deg/s}' under 'logs'" in str(error)
+
+
 def test_notes_of_several_joints_with_one_text_are_one_note(loaded, log):
     # with constant torques no fault of the geometry is searched, which would take five seconds
     speed = np.abs(log.qd)

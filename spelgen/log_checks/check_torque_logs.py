@@ -404,7 +404,7 @@ class TorqueLogs:
         fault = PositionUnit([], [turning], PositionUnit([]))
         best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
         is_explained = (
-            unit.errors.max() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
+            unit.errors.mean() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
         )
         if best.cost > unit.cost - GEOMETRY.needed or is_explained:
             return error

@@ -319,9 +319,14 @@ class LogChecks:
                 advice, _, _ = occurrences[0]
                 is_error = check.severity == "error" or advice.joint or advice.keys
                 groups.setdefault((check, "" if is_error else group), []).append(group)
+        codes = {check.code for check, _ in groups}
         for (check, _), names in groups.items():
             occurrences = self._results[names[0], check]
             advice, where, file = occurrences[0]
+            # Samples that stay equal are searched with thresholds in rad and m. If a unit is wrong, they are reported
+            # only after the user has corrected the unit.
+            if check.code == "frozen" and advice.keys and "degrees" in codes:
+                continue
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
             if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
