@@ -25,11 +25,10 @@ def arm_dynamics(
     return PinocchioDynamics(pinocchio_model(arm, settings), body_constraint(arm), friction)
 
 
-def pinocchio_model(arm: Chain, settings: Settings, file: Path | None = None) -> pin.Model:
-    """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
+def require_inertials(arm: Chain, file: Path | None = None) -> None:
+    """Raise ArmError if a body has no <inertial>, or negative mass, for which Pinocchio returns meaningless numbers.
 
-    The armature is the rotor inertia on the joint side. Raises ArmError, with the URDF `file`, if a body has no
-    <inertial>, or negative mass, for which Pinocchio returns meaningless numbers.
+    file: the URDF, for the error.
     """
     error = partial(
         ArmError,
@@ -40,6 +39,14 @@ def pinocchio_model(arm: Chain, settings: Settings, file: Path | None = None) ->
     mass = {body.name: float(body.inertia[0]) if body.inertia else None for body in arm.bodies}
     faults = {x: "a link without <inertial>" if m is None else f"a body of {m:g} kg" for x, m in mass.items()}
     collect([error(faults[x], element=f"joint {x!r}") for x, m in mass.items() if m is None or m < 0])
+
+
+def pinocchio_model(arm: Chain, settings: Settings) -> pin.Model:
+    """Return a Pinocchio model of the arm's bodies, with one joint per body, inertia and armature.
+
+    The armature is the rotor inertia on the joint side. Raises ArmError, see `require_inertials`.
+    """
+    require_inertials(arm)
     model = kinematic_model(arm)
     # The joint with index 0 is the universe (the fixed world) in Pinocchio, so bodies are counted from 1.
     for index, body in enumerate(arm.bodies, start=1):

@@ -11,7 +11,7 @@ import yaml
 from lxml import etree
 
 from spelgen.arm.configured_arm import Arm, load_arm
-from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
+from spelgen.dynamics.pinocchio_arm import arm_dynamics, require_inertials
 from spelgen.errors import SpelgenError
 from spelgen.excitation.bounds import SPEEDS, motion_bounds
 from spelgen.files import write_bytes, write_text
@@ -39,7 +39,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
     # At this point, the error names the user's URDF, and no file has been written.
-    pinocchio_model(arm.chain, arm.settings, arm.robot.path)
+    require_inertials(arm.chain, arm.robot.path)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))
     # The scales of friction and armature are computed from the torques and M of the perturbed bodies. Therefore the arm

@@ -8,7 +8,7 @@ import numpy as np
 from spelgen.arm.actuation import Drives
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
-from spelgen.dynamics.pinocchio_arm import arm_dynamics, pinocchio_model
+from spelgen.dynamics.pinocchio_arm import arm_dynamics, require_inertials
 from spelgen.errors import SettingsError
 from spelgen.excitation.trajectory import Motion
 from spelgen.logs.trajectory import Trajectory, set_aside
@@ -113,7 +113,7 @@ def simulate(
     changed = validated(SimulationSettings, values, YamlDocument(Path("simulate"), None))
     settings = _controlled(arm.settings.model_copy(update={"simulation": changed}))
     progress = progress or silent
-    pinocchio_model(arm.chain, arm.settings, arm.robot.path)
+    require_inertials(arm.chain, arm.robot.path)
     if settings.input == "position":
         if motions:
             raise SettingsError(
