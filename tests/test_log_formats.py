@@ -684,17 +684,28 @@ def test_the_cut_last_line_of_a_csv_is_left_out(tmp_path):
     (tmp_path / "x.csv").write_text("\n".join([*lines, lines[-1][:9]]))
     (found,) = read_logs(tmp_path / "x.csv", JOINTS)
     check(found, "x")
-    assert found.remarks == (f"the last line is cut off and was left out: {lines[-1][:9]}",)
+    assert found.remarks == (f"the last line is no complete row and was left out: {lines[-1][:9]}",)
     (tmp_path / "x.csv").write_text("\n".join([*lines[:3], lines[3][:9], *lines[4:]]))
     with pytest.raises(LogError, match=r"x\.csv:4: got \d values \(.*\), expected 7, as in the header"):
         read_logs(tmp_path / "x.csv", JOINTS)
 
 
-def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path):
-    (tmp_path / "x.csv").write_text(f"{text_log()}\nSamples: 4\nDuration: 3 s\n")
+@pytest.mark.parametrize(
+    "footer",
+    [
+        "\nSamples: 4\nDuration: 3 s\n",
+        "\nMin,-1,-2,-3,-4,-5,-6\n\nMean,0.1,0.2,0.3,0.4,0.5,0.6\n",
+        '\n"Mittel","1","2","3","4","5","6"\r\n"Größe",1,2,3,4,5,6\r\n\r\n',
+    ],
+)
+def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path, footer):
+    """Texts and statistics of the columns at the end of a CSV file are no samples."""
+    (tmp_path / "x.csv").write_text(text_log().rstrip("\n") + footer, encoding="utf-8")
     (found,) = read_logs(tmp_path / "x.csv", JOINTS)
     check(found, "x")
-    assert found.remarks == ("the last 2 lines are no rows and were left out: Samples: 4",)
+    assert found.remarks == (
+        f"the last 2 lines are no rows and were left out: {footer.split(chr(10))[1].rstrip()[:30]}",
+    )
 
 
 @pytest.mark.parametrize("place", ["above", "below", "comment"])

@@ -103,6 +103,7 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     """
     content = content or _in_utf8(file.read_bytes())
     text = _beginning(content)
+    content, footer = _without_footer(content, text)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
@@ -141,10 +142,35 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     if text.units:
         units = dict(zip(text.names, text.units, strict=False))
         table = table.replace_schema_metadata({STATED_KEY: json.dumps(units)})
-    if not wrong:
+    omitted = [*(row.text for row in wrong), *footer]
+    if not omitted:
         return table, text.lines, ()
-    ending = "line is cut off and was" if len(wrong) == 1 else f"{len(wrong)} lines are no rows and were"
-    return table, text.lines, (f"the last {ending} left out: {wrong[0].text:.30}",)
+    ending = (
+        "line is no complete row and was"
+        if len(omitted) == 1
+        else f"{len(omitted)} lines are no rows and were"
+    )
+    return table, text.lines, (f"the last {ending} left out: {omitted[0]:.30}",)
+
+
+def _without_footer(content: bytes, text: Beginning) -> tuple[bytes, list[str]]:
+    """Return the content of a CSV file without the lines at its end that begin with a word, and these lines.
+
+    They are statistics of the columns (`Mean,0.1,...`) or an end mark, unless the rows begin with a word, too.
+    """
+
+    def begins_with_word(line: str) -> bool:
+        cell = _cells(line, text.delimiter)[0]
+        return cell[:1].isalpha() and not is_number(cell) and cell not in NO_VALUE
+
+    # Arrow would read the first column as text if one of its cells is a word.
+    lines = content[-HEAD:].decode(errors="replace").splitlines(keepends=True)
+    end = list(takewhile(lambda line: not line.strip() or begins_with_word(line), reversed(lines)))
+    words = [line.strip() for line in reversed(end) if line.strip()]
+    first = text.rows.split("\n", 1)[0]
+    if not first or begins_with_word(first) or len(words) > TUNING.ending:
+        return content, []
+    return content[: len(content) - len("".join(end).encode())], words
 
 
 def _beginning(content: bytes) -> Beginning:
