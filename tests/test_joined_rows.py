@@ -131,7 +131,7 @@ def test_topics_in_rows_of_one_file_are_joined(joints, form, tmp_path):
     (log,) = read_logs(path, joints)
     np.testing.assert_allclose(log.q, signals(times[0][kept])[0], rtol=1e-9)
     assert log.repairs == (
-        f"{np.sum(~kept)} rows without all signals left out: signals have different rates",
+        f"{np.sum(~kept)} rows without all signals left out: of other joints, or signals have different rates",
     )
 
 

@@ -813,6 +813,64 @@ def test_places_of_lists_are_columns(tmp_path, form):
         read_logs(tmp_path / "x.csv", JOINTS, mapping)
 
 
+OF_ROW = {
+    "another arm at the same times": lambda k: [JOINTS, ("left_shoulder", "left_elbow")],
+    "another arm in the first row": lambda k: [("left_shoulder", "left_elbow"), JOINTS],
+    "a hand in some rows": lambda k: [JOINTS, ("thumb", "index", "ring")][: 1 + (k % 3 == 1)],
+    "a gripper in some rows": lambda k: [JOINTS + ("gripper",) * (k % 2)],
+    "another order in some rows": lambda k: [JOINTS[:: 1 - 2 * (k % 3 == 1)]],
+}
+"""Lists of joint names of the rows at the time step k."""
+
+
+@pytest.mark.parametrize("rows", OF_ROW)
+@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet"])
+def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, suffix):
+    """Rows with other joint names, or in another order, never change the values of the arm's joints."""
+    t = 0.01 * np.arange(40)
+    q = np.stack([np.sin(5 * t), 2 + np.cos(7 * t)], axis=1)
+    log = []
+    for k, now in enumerate(t):
+        for names in OF_ROW[rows](k):
+            values = np.array([q[k, JOINTS.index(x)] if x in JOINTS else 9.0 - 0.01 * k for x in names])
+            lists = {"position": values, "velocity": values + 1, "effort": values + 2}
+            log.append({"time": now, "name": list(names)} | {x: y.tolist() for x, y in lists.items()})
+    path = tmp_path / f"x.{suffix}"
+    if suffix == "jsonl":
+        path.write_text("\n".join(map(json.dumps, log)))
+    elif suffix == "parquet":
+        pa.parquet.write_table(pa.Table.from_pylist(log), path)
+    else:
+        pa.csv.write_csv(pa.Table.from_pylist([{x: str(y) for x, y in row.items()} for row in log]), path)
+    (found,) = read_logs(path, JOINTS, yaml.safe_load(suggest_mapping(path, JOINTS).text))
+    np.testing.assert_allclose(found.t, t, atol=1e-9)
+    for values, expected in ((found.q, q), (found.qd, q + 1), (found.tau, q + 2)):
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_rows_of_two_arms_with_unknown_names_are_an_error(tmp_path):
+    """If rows are of two arms and no joint name identifies one of them, the names in the log are asked for."""
+    state = {"position": [0.1, 0.2], "velocity": [0.3, 0.4], "effort": [0.5, 0.6]}
+    log = [{"time": 0.01 * k, "name": [f"{'lr'[k % 2]}_{x}" for x in "ab"]} | state for k in range(40)]
+    path = tmp_path / "x.jsonl"
+    path.write_text("\n".join(map(json.dumps, log)))
+    mapping = {
+        "columns": {"t": "time"},
+        "joints": {
+            x: {"columns": {"q": f"position[{k}]", "qd": f"velocity[{k}]", "tau": f"effort[{k}]"}}
+            for k, x in enumerate(JOINTS)
+        },
+    }
+    with pytest.raises(
+        LogError, match="got joint states of l_a, l_b and of r_a, r_b, expected shoulder, elbow"
+    ):
+        read_logs(path, JOINTS, mapping)
+    for joint, name in zip(JOINTS, ("r_a", "r_b"), strict=True):
+        mapping["joints"][joint]["name"] = name
+    (found,) = read_logs(path, JOINTS, mapping)
+    np.testing.assert_allclose(found.t, 0.01 + 0.02 * np.arange(20), atol=1e-9)
+
+
 def test_no_column_of_another_joint_is_offered(tmp_path):
     joints = tuple(str(k) for k in range(6))
     names = {"q": "position_{joint}", "qd": "velocity_{joint}", "tau": "effort_{joint}"}

@@ -28,6 +28,8 @@ STAMP = ("sec", "nanosec", "frame_id")
 COMMENT = re.compile(r"^(#|% )\s*")
 
 
+# First cell of a line with statistics of the columns, or of an end mark: a word, or a quantile such as "25%".
+STATISTIC = re.compile(r"[^\W\d]\D*|\d+ ?%")
 # Texts that are no value, in addition to the texts that Arrow recognises.
 NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#INF", "-1.#INF"]
 NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
@@ -161,7 +163,7 @@ def _without_footer(content: bytes, text: Beginning) -> tuple[bytes, list[str]]:
 
     def begins_with_word(line: str) -> bool:
         cell = _cells(line, text.delimiter)[0]
-        return cell[:1].isalpha() and not is_number(cell) and cell not in NO_VALUE
+        return bool(STATISTIC.fullmatch(cell)) and not is_number(cell) and cell not in NO_VALUE
 
     # Arrow would read the first column as text if one of its cells is a word.
     lines = content[-HEAD:].decode(errors="replace").splitlines(keepends=True)

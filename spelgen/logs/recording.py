@@ -330,7 +330,9 @@ def _join_signals(rows: Rows) -> None:
     base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
     complete = finite.all(axis=1)
     if complete.sum() > 0.9 * base.sum():
-        rows.leave_out(~complete, "without all signals left out: signals have different rates")
+        rows.leave_out(
+            ~complete, "without all signals left out: of other joints, or signals have different rates"
+        )
         return
     order = np.argsort(data[:, 0], kind="stable")
     data, finite, base = data[order], finite[order], base[order]

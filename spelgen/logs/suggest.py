@@ -34,6 +34,7 @@ from spelgen.logs.column_selection import (
 )
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
+from spelgen.logs.row_names import first_list, rows_by_names
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
@@ -88,6 +89,9 @@ def _names_signals(values: Sequence[object], joints: int) -> bool:
 
 def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
     """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
+    # Of rows with different lists of joint names, such as rows of two arms, only rows with the arm's list are used.
+    for rows in list(rows_by_names(table, dict(zip(joints, joints, strict=True)), file).values())[:1]:
+        table = table.filter(rows)
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
@@ -388,7 +392,7 @@ def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
     order = {name: position for position, name in enumerate(listed_names) if name in joints}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
-        for position, text in enumerate(_first_list(column)):
+        for position, text in enumerate(first_list(column)):
             if text in joints:
                 order[str(text)] = position
         if numbers and first in joints:
@@ -404,13 +408,5 @@ def _names(table: pa.Table) -> list[str]:
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
         if table.column_names.count(name) == 1 and column.null_count < len(column):
-            names += [f"{name}[{index}]" for index in range(len(_first_list(column)))] or [name]
+            names += [f"{name}[{index}]" for index in range(len(first_list(column)))] or [name]
     return names
-
-
-def _first_list(column: pa.ChunkedArray) -> list[object]:
-    """Return the first list of a column of lists, which may be texts such as "[0.1, 0.2]"; [] for other columns."""
-    first = next(iter(column.drop_null().slice(0, 1).to_pylist()), None)
-    if isinstance(first, str) and (match := re.fullmatch(r"[^\[({]*[\[({]+(.*?)[\])}]+", first.strip())):
-        first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
-    return first if isinstance(first, list) else []
