@@ -125,7 +125,7 @@ class ParameterMap:
     def precision(self, x: ServoParameters) -> Tensor:
         """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior.
 
-        They depend on ``x.active``: a parameter that is not fitted has a variance of practically zero.
+        A parameter that is not fitted according to ``x.active`` has a variance of practically zero.
         """
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
@@ -151,8 +151,8 @@ class ParameterMap:
 
         Let A (M n, 10 B) be the derivative of the gravity torques at M positions with respect to the log-Cholesky
         parameters. A direction is a right singular vector of A, multiplied by the prior standard deviation
-        `ServoTuning.bodies`. The vectors of the largest singular values are used: at most
-        `ServoTuning.body_directions`, without those of negligible effect. q: (M, n), the positions [rad, m].
+        `ServoTuning.bodies`. The vectors of the largest singular values are used, at most
+        `ServoTuning.body_directions`; vectors of negligible effect are omitted. q: (M, n), the positions [rad, m].
         """
         zero = torch.zeros_like(q)
         # torch.func is not used, since its Jacobians import torch's compiler, which takes more than a second.

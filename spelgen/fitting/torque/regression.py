@@ -40,9 +40,9 @@ class Regression(NamedTuple):
 
 
 def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray) -> Regression:
-    """Return the one of two ridge regressions that has the smaller held-out error.
+    """Return the ridge regression with the smaller held-out error of two.
 
-    In one regression, Coulomb friction depends on the velocity, in the other one on the friction state z.
+    In one regression, Coulomb friction depends on the velocity; in the other, on the friction state z.
 
     Args:
         model: model whose arm, drives and gains are used.
