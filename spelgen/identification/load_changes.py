@@ -1,6 +1,7 @@
 """Changes between and within recordings: another load, and torques that have another scale or zero from a time on.
 
-One model of recordings with different loads, or of torques before and after a change, is wrong for all of them.
+A single model that is fitted to recordings with different loads, or to torques before and after a change, is wrong for
+all of them.
 """
 
 from collections.abc import Sequence
@@ -250,8 +251,8 @@ def _refit(
     Args:
         problem: problem with the S samples.
         fit: fit of `problem` without additional quantities.
-        columns: (S, n, D) derivatives of the torques with respect to the quantities of the sample's part. For a load,
-            these are regressor columns of the last body; for torque offsets, identity matrices.
+        columns: (S, n, D) derivatives of the torques with respect to the quantities of the sample's part. Examples:
+            regressor columns of the last body for a load, identity matrices for torque offsets.
         parts: mask (S,) of each part.
     """
     count, size = len(fit.parameters), columns.shape[2]

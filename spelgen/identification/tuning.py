@@ -84,9 +84,10 @@ class LogGeometryTuning:
     # [1] A recording has a fault of its own if its squared torque residual is larger than this multiple of the squared
     # residual of the other recordings, to which the model is fitted.
     deviation: float = 5.0
-    # [1] A hypothesis does not explain the torques if the relative residual variance is above this value at one of the
-    # joints that it affects, and also in the mean of these joints. With the right correction, logs of recorded arms
-    # have at most 0.07 in the mean of all joints, although up to 0.27 at a joint whose torque is mostly friction.
+    # [1] A hypothesis does not explain the torques if the relative residual variance is above this value at a joint,
+    # and also in the mean of the joints, weighted by the changes of their residual variance under the hypothesis. With
+    # the right correction, logs of recorded arms have at most 0.07 in the mean of all joints, although up to 0.27 at a
+    # joint whose torque is mostly friction.
     no_advice: float = 0.2
     # [1] If the relative residual variance of the unchanged log is above this value, its torques are probably no joint
     # torques.
