@@ -179,8 +179,8 @@ def _weighed(
     Args:
         problem: problem without hysteresis.
         stateful: the same problem with hysteresis.
-        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
-            with hysteresis.
+        fits: fits of `problem`. Only the best `GEOMETRY.weighed` of them are compared with hysteresis, if a exceeds
+            `GEOMETRY.slight`; the other fits have the decrease a.
         base: fit of `problem` with which the costs are compared.
     """
     best = sorted(fits, key=RANK)
