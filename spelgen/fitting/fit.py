@@ -267,8 +267,9 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        # The parameters of rigid bodies start at the values of the URDF and need no regularizer towards the URDF, so
-        # the default of its weight is zero. An objective that the user chose has its own default.
+        # If the user chose no objective, the default weight of the regularizer towards the URDF is zero: parameters of
+        # rigid bodies start at the values of the URDF and need no regularizer. If the user chose the objective rollout,
+        # the default of `Rollout` applies.
         if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)

@@ -52,8 +52,8 @@ class Objective(ABC):
 
         Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
         """
-        # If a class does not override this function, its `begin` runs the whole fit: the checkpoint is from a finished
-        # fit.
+        # An objective that does not override `resume` runs the whole fit in `begin`. Its only checkpoint is written
+        # after the fit, so nothing remains to be fitted after the best weights are loaded.
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 

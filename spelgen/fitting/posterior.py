@@ -270,9 +270,10 @@ class Posterior:
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the constants of the drives that have intervals, and the function that returns their values.
+        """Return the constants of drives that have 95 % intervals, and the function that computes their values.
 
-        The function returns one row per constant for a model, (constants, n).
+        The constants are armature, friction, torque offset and motor gain (see `torque_drive_quantities`). The function
+        returns their values for a model, one row of n joints per constant, (constants, n).
         """
         return torque_drive_quantities(self.model)
 

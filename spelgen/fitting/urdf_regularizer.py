@@ -1,6 +1,7 @@
 """Regularizer towards the mass matrix and gravity torque of a URDF, for parameters that the logs do not determine.
 
-The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants to M.
+The variation of M with q is compared, not its mean: URDFs do not specify the inertias of rotors, which add constants to
+M.
 """
 
 from __future__ import annotations

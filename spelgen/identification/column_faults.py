@@ -126,10 +126,11 @@ class WrongScale(Fault):
     def _scaled_by(
         self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
     ) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques with scaled signals, one or two fits per array of `factors`.
+        """Yield least-squares fits of the log's torques with signals that are scaled by each array of `factors`.
 
-        An array (2, n) has the factors on the motion, then the factors on the torques. They multiply the scales that
-        the hypothesis of the fit `base` has.
+        An array (2, n) has the factors on the motion, then the factors on the torques of n joints. They multiply the
+        scales in the hypothesis of the fit `base`. If an array reverses a joint that has a zero offset, two fits are
+        yielded, with either sign of this offset.
         """
         reading = base.hypothesis
         for factor in factors:

@@ -1,6 +1,6 @@
-"""Kinds of faults of a log that real numbers describe: zero offsets, and the vector of gravity.
+"""Kinds of faults of a log that have continuous parameters: a zero offset of positions, and the vector of gravity.
 
-The values of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
+The parameters of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # The descent ends at a step below `smallest`. If it starts at the unchanged zero, `smallest` is `min_offset`: a
-        # smaller offset is only a calibration error. If it starts at a multiple of 90 degrees, `smallest` is less, so
-        # that the offset is accurate.
+        # The descent ends at a step below `smallest`. If it starts at the current zero, `smallest` is `min_offset`
+        # (0.09 rad or 0.01 m): a smaller offset is only a calibration error. If it starts at a multiple of 90 degrees,
+        # the offset is certainly large and should be accurate, so `smallest` is 0.01 rad.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -85,8 +85,8 @@ class ZeroOffset(Fault):
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
         """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
 
-        {} is also returned for a joint whose sense `correction` reverses: the method of `JointSense` returns both its
-        sign and its offset, since another sign may need another offset.
+        {} is also returned if `correction` reverses the sense of the joint: `JointSense.joint_keys` then returns the
+        offset together with the sign, since the offset may depend on the sign.
         """
         offset = correction.hypothesis.offset[joint]
         if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
@@ -157,14 +157,14 @@ class Gravity(Compensation):
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
-        standard = size or 9.81  # [m/s^2] magnitude of gravity in `base`
+        standard = size or 9.81  # [m/s^2] magnitude of gravity in `base`; 9.81 if it is zero
 
         def turned(gravity: np.ndarray) -> Hypothesis:
             """Return the hypothesis that gravity is this vector, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
-            """Return the vector (3,) in the direction of `gravity` with the magnitude `standard` [m/s^2]."""
+            """Return the vector (3,) [m/s^2] in the direction of `gravity`, scaled to the magnitude `standard`."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
         # Gravity along -z is the first start, so it is preferred if the log does not determine the sign of gravity.
@@ -182,9 +182,10 @@ class Gravity(Compensation):
                 )
             )
         new, best = min(descents, key=lambda x: x[1].cost)
-        # Torques without gravity are also explained by gravity parallel to the axes of all joints. A direction found
-        # from the start -z is accepted. Any other direction must have a lower cost than zero gravity; otherwise a
-        # gravity compensation is more likely.
+        # Gravity parallel to the axes of all joints causes no torque. If the torques contain no gravity, such a
+        # direction therefore explains them as well as zero gravity does, and a gravity compensation is more likely. A
+        # direction must thus have a lower cost than zero gravity. The exception is a direction found from the start -z,
+        # the gravity of an upright arm, which is the most frequent mounting.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
         if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())

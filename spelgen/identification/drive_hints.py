@@ -35,8 +35,8 @@ FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 class Coupling:
     """Coupling of two joints: the motor of `joint` also rotates when the joint `moved_by` moves.
 
-    The speed of the motor, in units of the joint's speed, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
-    the logged torques are joint torques, "motors" if they are motor torques in the units of the joints.
+    The speed of the motor, on the output side of its gear, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
+    the logged torques are joint torques; "motors" if they are motor torques on the output side of the gears [Nm, N].
     """
 
     joint: int

@@ -76,9 +76,10 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, stateful, _corrected(coarse, stateful, faults, start), start)
         better = min(tried, key=RANK)
-        # Permutations of all joints and long drifts of delays take time. They are searched only if no single correction
-        # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
-        # wrong signals.
+        # `thorough_fits` search permutations of all joints, and delays that change by tenths of a second during a
+        # recording (drifts). They take time, and are made only if no single correction explains the torques, or if the
+        # best one is a drift. The search for this drift started from zero delay: if the true drift is large, the best
+        # drift from this start may be of the wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -162,21 +163,24 @@ def _weighed(
 ) -> list[HypothesisFit]:
     """Return the fits with costs that take a friction model with hysteresis into account.
 
-    The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
-    under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
-
     Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
-    and b the decrease in fits with hysteresis. For a right hypothesis, b is the whole decrease. For a wrong hypothesis,
-    b may also be larger than a: on recorded arms, b is up to 32 and a up to 17. A wrong hypothesis may also have a
-    large a and a small b, since it explains the friction that the model without hysteresis lacks. The decrease is
-    therefore a, limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a,
-    b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
+    and b the decrease in fits with hysteresis. The result has the decrease min(b, max(a, b / 2)).
+
+    - a can be too small: the friction model of `problem` lacks presliding hysteresis. The residual of a few per cent of
+      the torque hides a part of the decrease by the right hypothesis, for which b is the whole decrease.
+    - a can be too large: a wrong hypothesis may explain friction that this model lacks. b is then small and is the
+      bound.
+    - b can be too large for a wrong hypothesis: on recorded arms, b is up to 32 and a up to 17. Only b / 2 is therefore
+      counted if a is smaller.
+
+    For a hypothesis with another delay than `base`, the decrease is min(a, b): hysteresis resembles a delay, so such a
+    hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.
         stateful: the same problem with hysteresis.
-        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
-            with hysteresis.
+        fits: fits of `problem`. Only the best `GEOMETRY.weighed` of them are compared with hysteresis, if a exceeds
+            `GEOMETRY.slight`; the other fits have the decrease a.
         base: fit of `problem` with which the costs are compared.
     """
     best = sorted(fits, key=RANK)
@@ -201,8 +205,9 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
     if best.cost > unchanged.cost - GEOMETRY.needed:
         return ()
     likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=RANK)
-    # Exchanged columns may also explain errors of the friction model, by less than `needed`. The opposite sense of a
-    # single joint is then listed first, since it is more frequent than exchanged columns.
+    # Errors of the friction model may be explained by exchanged columns, which then have a lower cost than the opposite
+    # sense of a single joint, by less than `needed`. The opposite sense is listed first in this case, since it is the
+    # more frequent fault.
     if isinstance(likely[0].hypothesis.faults[0], WrongOrder):
         bound = min(likely[0].rank + GEOMETRY.needed, unchanged.cost - GEOMETRY.ambiguous)
         senses = [fit for fit in fits if fit.rank < bound and _is_one_sense(fit.hypothesis)]

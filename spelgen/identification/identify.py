@@ -178,8 +178,8 @@ class _Equations:
         products = self._products(method.friction, len(base.parameters))
         torques = np.concatenate([block.tau for block in self._blocks])
         deviation = torques.std(axis=0)
-        # The range of a torque is bounded from below, since a joint with a constant torque would have an infinite
-        # weight.
+        # The standard deviation of a torque, by which it is weighted, has a lower bound: a joint with a constant torque
+        # would have an infinite weight otherwise.
         torque_range = np.maximum(deviation, 1e-3 * deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
         # with the weights "noise", each iteration weights the joints by their residuals in the previous fit

@@ -139,8 +139,8 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     """
     # the matrix `lower_bound` is scaled to a unit diagonal, since parameters have different units
     scale = lower_bound.diagonal().sqrt()
-    # The eigenvalues of the scaled `lower_bound` are clamped, since it is inverted: for samples without noise it is
-    # singular except for rounding errors.
+    # The inverse of `lower_bound`, a covariance, is needed. Without noise in the samples, `lower_bound` is singular
+    # except for rounding errors. The eigenvalues of the scaled matrix are therefore clamped.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

@@ -1,6 +1,7 @@
 """Changes between and within recordings: another load, and torques that have another scale or zero from a time on.
 
-One model of recordings with different loads, or of torques before and after a change, is wrong for all of them.
+A single model that is fitted to recordings with different loads, or to torques before and after a change, is wrong for
+all of them.
 """
 
 from collections.abc import Sequence
@@ -56,7 +57,8 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
         for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
-            # The first recording is part of every group of recordings; of its several changes, the first is returned.
+            # Each group of at most `TOGETHER` recordings is compared together with the recording known[0]. This
+            # recording may have a change in several groups; the change of the first group is kept.
             changes.setdefault(change.recording, change)
     return list(changes.values())
 
@@ -102,7 +104,7 @@ class TorqueChange(NamedTuple):
         recording: index of the recording.
         time: time of the change since the start of the recording [s].
         joint: index of the joint, or None for a change of the torques of all joints.
-        factor: ratio of the torques after the change to the torques before it.
+        factor: ratio of the torques after the change to the torques before it; 1 if the zero changes.
         offset: torque that is added after the change [Nm, N]; 0 if the scale changes.
     """
 
@@ -116,10 +118,11 @@ class TorqueChange(NamedTuple):
 def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
 
-    The changes are: another factor on the torque of one joint or, in common, of all joints, and another offset of the
-    torque of one joint. A change must lower the negative log likelihood by `GEOMETRY.needed` more than another load,
-    and more than other friction of the joints together with offsets that drift: a load that the arm picks up, friction
-    that falls as the drives warm up, and drifting sensors are no changes of the torques' unit.
+    A change is another factor on the torque of one joint, a common factor on the torques of all joints, or another
+    offset of the torque of one joint, from a time on. Two other hypotheses are fitted: another load from this time on
+    (the arm picks it up), and other friction from this time on together with offsets that drift (warm drives, drifting
+    sensors). A change is returned only if its negative log likelihood is lower by `GEOMETRY.needed` than without a
+    change and than under both other hypotheses.
     """
     subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
     fit = subset.fit(subset.unchanged)
@@ -131,7 +134,8 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
         times = subset.samples.times[rows]
         if len(times) < 4 * FEWEST or not times.any():
             continue
-        # A time is tested after each twentieth of the samples.
+        # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
+        # enough samples before and after each time.
         splits = len(times) * np.arange(2, 19) // 20
         falls = (
             _falls((residual + tau)[rows], residual[rows], splits)
@@ -155,10 +159,12 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
 
 
 def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
-    """Return decreases (C, n) of squared residuals by separate factors and offsets of torques before and after times.
+    """Return the decrease of the squared residual if torques may change their factor and offset at a time, (C, n).
 
-    torque, residual: torques of the model and their residuals, (S, n) [Nm, N]. splits: (C,) numbers of samples before
-    each time.
+    Each joint's residual is regressed on the model's torque and on 1 (factor and offset), once on all samples, and once
+    separately on the samples before and after each of C times. The result is the difference of both squared residuals
+    [Nm^2, N^2]. torque, residual: torques of the model and their residuals, (S, n) [Nm, N]. splits: (C,) numbers of
+    samples before each time.
     """
     ones = np.ones_like(torque)
     products = [torque * torque, torque, ones, torque * residual, residual]
@@ -166,7 +172,10 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
     total = np.sum(products, axis=1)[:, None]
 
     def explained(sums: np.ndarray) -> np.ndarray:
-        """Return the squares that a factor and an offset explain, from sums of products (5, C, n)."""
+        """Return the part of the sum of squared residuals that a regression on torque and 1 explains, (C, n).
+
+        sums: (5, C, n), sums over the samples of a part of torque^2, torque, 1, torque * residual and residual.
+        """
         squares, torques, count, products, residuals = sums
         slope = products - torques * residuals / count
         return np.asarray(
@@ -184,8 +193,10 @@ def _change(
     time: float,
     joint: int | None,
 ) -> tuple[float, TorqueChange]:
-    """Return the fall of the cost, compared with a load or other friction, by a change of torques, and this change.
+    """Return a change of the torques from `time` on, and its evidence compared with another load or other friction.
 
+    The evidence is returned first. It is the negative log likelihood of the better of the two other hypotheses (see
+    `torque_change`) minus the negative log likelihood of the change; 0 if the change does not explain the torques.
     torque: torques of the model of `fit`, (S, n) [Nm, N]. recording, time, joint: see `TorqueChange`.
     """
     rows, _ = problem.equations(problem.unchanged)
@@ -202,7 +213,7 @@ def _change(
     quantity = float(best.quantities[0, 0])
     factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
     change = TorqueChange(recording, time, joint, factor, offset)
-    # Other faults of the log cause a large residual.
+    # A large residual after the change shows that the log has another fault, so the change is not reported.
     if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
         return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
@@ -213,7 +224,9 @@ def _change(
 
 
 class _Refit(NamedTuple):
-    """Fit of torques with D additional quantities of each of R parts of the samples, such as recordings.
+    """Fit of torques with D additional quantities per part of the samples, for example one load per recording.
+
+    There are R parts. Examples of quantities are the mass and the first moment of a load, or a torque offset.
 
     Attributes:
         misfit: negative log likelihood.
@@ -233,18 +246,20 @@ class _Refit(NamedTuple):
 def _refit(
     problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, parts: Sequence[np.ndarray]
 ) -> _Refit:
-    """Return the fit of the torques with additional quantities of each of R parts of the samples.
+    """Return the fit of the torques with D additional quantities per part of the samples (see `_Refit`).
 
     Args:
-        problem: problem with the samples.
-        fit: its fit without additional quantities.
-        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's part.
-        parts: masks (S,) of the samples of the parts.
+        problem: problem with the S samples.
+        fit: fit of `problem` without additional quantities.
+        columns: (S, n, D) derivatives of the torques with respect to the quantities of the sample's part. Examples:
+            regressor columns of the last body for a load, identity matrices for torque offsets.
+        parts: mask (S,) of each part.
     """
     count, size = len(fit.parameters), columns.shape[2]
     joined = np.concatenate([columns * part[:, None, None] for part in parts], axis=2)
     variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
-    # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
+    # The weight of a joint depends on its residual, which becomes smaller with the additional quantities. The fit is
+    # therefore repeated with the new weights.
     for _ in range(3):
         change, covariance = problem.estimate(fit, joined)
         parameters = fit.parameters + change[:count]

@@ -206,8 +206,9 @@ class GeometryProblem:
         # is used.
         for iteration in range(14 if self._has_free_gains else 6):
             if self._has_free_gains and iteration < 6:
-                # Gain of a joint: coefficient of a regression of the model's torque on the logged torque. It is kept
-                # positive, even if both torques are not correlated.
+                # The gain of a joint multiplies its logged torque. It is the inverse of the coefficient in a regression
+                # of the logged torque on the model's torque. The correlation is bounded from below, so that the gain is
+                # positive and finite even if both torques are not correlated.
                 load = np.maximum((normal @ x) @ x, 1e-9 * total)
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
@@ -369,21 +370,24 @@ def _joint_step(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters (K,) and gains (n,) after a Gauss-Newton step of both.
 
-    The torque residual of joint k is tau_k - h_k Y_k x, with the logged torque tau_k and the inverse gain h_k. Its
-    derivatives with respect to x and to h_k are -h_k Y_k and -Y_k x.
+    The cost is the sum over joints of s_k |tau_k - h_k Y_k x|^2 / 2, plus the prior of x, with the logged torque tau_k,
+    the regressor Y_k, the weight s_k of the squared residual, and h_k = 1 / gain. The derivatives of the residual with
+    respect to x and to h_k are -h_k Y_k and -Y_k x. The step changes log h_k by at least -0.7 and at most 1.
 
     Args:
         matrix: (K, K) Hessian of the cost with respect to x.
         vector: (K,) right-hand side of the normal equations for x.
-        weights: (n,) weights of the squared residuals, divided by the gains.
-        gains: (n,) current gains.
+        weights: (n,) s_k h_k.
+        gains: (n,) current gains 1 / h_k.
         products: (n, K) Y_k^T Y_k x.
         agreement: (n,) tau_k^T Y_k x.
         x: (K,) current parameters.
     """
     count, coupling = len(x), weights[:, None] * products
     scale = weights * gains
-    # The factor 1 + 1e-6 is a ridge: it keeps the gain of a joint without load, which is confounded with friction.
+    # Without a gravity or inertial load, a joint's gain is confounded with its friction: only friction / gain is
+    # determined. The factor 1 + 1e-6 is a ridge on the change of h_k, with which such a gain remains at its current
+    # value.
     power = scale * (products @ x) * (1 + 1e-6) + 1e-30
     whole = np.block([[matrix, coupling.T], [coupling, np.diag(power)]])
     step = solution(whole, np.append(vector, scale * agreement))
@@ -442,8 +446,9 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # The standard deviations of the prior are half of these values: of the mass, of the body's extent (for the centre
-    # of mass), and of mass times squared radius of gyration (for the inertia tensor).
+    # The factor 0.5 converts the columns to standard deviations: half of the mass (column 0), half of `extent` for each
+    # coordinate of the centre of mass (columns 1 to 3), and half of mass * radius^2 for each entry of the inertia
+    # tensor (columns 4 to 9).
     return 0.5 * root
 
 

@@ -57,9 +57,10 @@ class MotionSamples(NamedTuple):
     def of(
         cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
     ) -> MotionSamples:
-        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples.
+        """Return samples without signals before and after each sample (E = 1, see the class), for tests without delays.
 
-        recording: index of the recording that contains the samples.
+        q, qd, qdd, tau: signals at the samples, (S, n) [rad, m], per s, per s^2, and [Nm, N]. recording: index of the
+        recording that contains the samples.
         """
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         numbers = np.full(len(q), recording)
@@ -83,9 +84,10 @@ class MotionSamples(NamedTuple):
     def at(self, delays: np.ndarray) -> np.ndarray:
         """Return q, qd, qdd and tau (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        `delays` of shape (n, 4) are the same for all samples, up to `longest_delay` in magnitude: signals are
-        interpolated from the values of the same sample. `delays` of shape (S, n, 4) may be of any magnitude: signals
-        are interpolated from the values of the sample nearest to the delayed time.
+        A sample has the signals at E times around it (`values`), up to `longest_delay` before and after it. `delays` of
+        shape (n, 4) are common to all samples and at most `longest_delay` in magnitude: a signal is interpolated
+        between the E values of its sample. `delays` of shape (S, n, 4) may be of any magnitude: a signal is
+        interpolated between the E values of the sample nearest to the delayed time.
         """
         if not delays.any():
             return self.central
@@ -103,7 +105,7 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest delay [s], earlier or later, for which `values` of a sample contain the signals; 0 for E = 1."""
+        """Largest time [s] before or after a sample at which `values` has its signals; 0 if it has none (E = 1)."""
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def part(self, rows: slice | np.ndarray) -> MotionSamples:

@@ -100,11 +100,11 @@ class JointClock(Fault):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
         """Return the least-squares fit of the torques with a delay that changes linearly with time.
 
-        If the hypothesis of `base` has a delay, the search starts from this delay, without a change. Otherwise each set
-        of `_delayed_signals` gives an initial guess: the delays at the start and at the end of a recording after one
-        Gauss-Newton step from zero. The derivatives of the residual with respect to these two delays are (1 - t) d and
-        t d, with the relative time t from 0 to 1 and the derivative d with respect to a constant delay. [] is returned
-        if the delay of `base` already changes.
+        If the hypothesis of `base` has a delay, the search starts from this delay at both the start and the end of a
+        recording. Otherwise each set of `_delayed_signals` gives an initial guess: the delays at the start and at the
+        end of a recording after one Gauss-Newton step from zero. The derivatives of the residual with respect to these
+        two delays are (1 - t) d and t d, with the relative time t from 0 to 1 and the derivative d with respect to a
+        constant delay. [] is returned if the delay of `base` already changes.
         """
         reading = base.hypothesis
         if reading.drift.any() or not problem.samples.longest_delay:
@@ -146,7 +146,7 @@ class JointClock(Fault):
         limit: float,
         count: int = 1,
     ) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits in which some signals have the best delays at the start and end of a recording.
+        """Yield least-squares fits in which a set of signals has the best delays at the start and end of a recording.
 
         Between start and end the delay changes linearly. A fit is omitted if both delays are about equal, or if the
         torque residual hardly falls.
@@ -154,8 +154,10 @@ class JointClock(Fault):
         Args:
             problem: least-squares problem of the log.
             reading: hypothesis without these delays.
-            starts: initial delays (2,) [s] at the start and the end, and masks (2, n) of the delayed motions and
-                torques. Only the `count` starts of lowest cost, below `limit`, are refined.
+            starts: initial guesses: delays (2,) [s] at the start and at the end, and a mask (2, n) of the signals that
+                are delayed (see `_delayed_signals`).
+            limit: only initial guesses with a cost below this limit are refined.
+            count: only this number of initial guesses, with the lowest costs, are refined.
         """
 
         def drifting(delays: np.ndarray, signals: np.ndarray) -> Hypothesis:
@@ -187,7 +189,7 @@ class JointClock(Fault):
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints with signals whose times, by `correction`, are from a clock of their own."""
+        """Return the names of the joints that have a signal with another clock according to `correction`."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 

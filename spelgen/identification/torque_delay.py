@@ -93,8 +93,8 @@ def find_torque_delay(
 def delay_of(problem: DriveProblem) -> TorqueDelay:
     """Return the delay of the torques in a `DriveProblem`; if motors are coupled, only `coupling` of the result is set.
 
-    Both are detected by the decrease of the least-squares torque residual. A coupling is searched after the torques
-    are shifted by the delay.
+    A delay and a coupling are both detected by a decrease of the least-squares torque residual. The delay is estimated
+    first. Then the torques are shifted by the delay, and a coupling is searched.
     """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
@@ -122,12 +122,13 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The delay must be significant without a friction state: errors of this model do not lag behind the motion, and do
-    # not resemble a delay. A friction state depends on past motion: its errors lag behind the motion, and do resemble a
-    # delay.
+    # The delay must be significant for the model without a friction state: its friction depends only on the current
+    # motion, so its errors do not lag behind the motion, and do not resemble a delay. In the model with a friction
+    # state, friction depends on past motion: errors of this model lag behind the motion, and resemble a delay.
     memory, direct = estimates
     likely = [direct]
-    # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
+    # On recorded arms, the squared residual with a friction state is 0.3 to 0.8 times the squared residual without. A
+    # factor above 2 shows that the state does not describe the friction, and the model with the state is ignored.
     if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)

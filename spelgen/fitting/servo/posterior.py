@@ -48,7 +48,10 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters or, if no kp is known, of their ratios to kp of `scale_joint`."""
+        """95 % intervals of the base parameters; if no kp is known, of their ratios to the kp of one joint.
+
+        This joint is `scale_joint`.
+        """
         if self._scale_index is None:
             return super().base_parameters
         values, roots = self._ratios(self._scale_index)

@@ -38,10 +38,11 @@ class Likelihood:
 
     @classmethod
     def of(cls, errors: Tensor, noise: Tensor, max_samples: int) -> Likelihood:
-        """Return the likelihood whose ``scale`` and ``samples_per_error`` are estimated from errors.
+        """Return the likelihood with ``scale`` and ``samples_per_error`` estimated from position errors.
 
         Args:
-            errors: (W, K', n), position errors [rad, m].
+            errors: (W, K', n), position errors [rad, m] of n joints at the K' samples of each of W windows after the
+                burn-in.
             noise: (n,), lower bound of the scale [rad, m].
             max_samples: upper bound of ``samples_per_error``, the number of samples per independent error.
         """
@@ -172,8 +173,8 @@ class ServoProblem:
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
             # The errors of a joint depend only on p parameters of the joint and on r parameters that all joints share:
-            # body parameters and delay. `jacobian`, (W, p + r, K'), has the derivatives of the joint's K' errors in
-            # each window with respect to these p + r parameters.
+            # here r includes the coordinates of the bodies and the delay. `jacobian`, (W, p + r, K'), has the
+            # derivatives of the joint's K' errors in each window with respect to these p + r parameters.
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]

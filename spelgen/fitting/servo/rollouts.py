@@ -48,7 +48,10 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts from the measured states of `windows`; x0 of the class are the model's parameters."""
+        """Return the rollouts from the measured states of `windows`.
+
+        The parameters x0, for which the load is computed (see the class), are the current parameters of the model.
+        """
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -56,9 +59,10 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Write x to the model; return the rollouts with the load recomputed for x along the fixed motion ``motion``.
+        """Write x to the model; return the rollouts with x as the new x0 and ``motion`` as the new fixed motion.
 
-        The load is the torque of the bodies: gravity, inertia, Coriolis forces. x replaces x0 of the class.
+        The load of the bodies along the fixed motion (gravity, inertia, Coriolis forces) is recomputed for x. For other
+        parameters, this load is corrected by the term Y (phi - phi(x0)), see the class.
         """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
@@ -69,11 +73,12 @@ class ServoRollouts:
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions with velocities and accelerations from rollouts at x, at midpoints between samples.
+        """Return the motion of the windows for `linearized`, at midpoints between samples, from rollouts at x.
 
-        The velocities are derivatives of the predicted positions, plus smoothed derivatives of the difference (measured
-        minus predicted position). The accelerations are computed in the same way. Smoothed derivatives of the measured
-        positions would attenuate fast motion (see `ServoWindows.motion`).
+        The positions are measured. The velocities are derivatives of the predicted positions, plus smoothed derivatives
+        of the difference (measured minus predicted position); the accelerations are computed in the same way. Smoothed
+        derivatives of the measured positions, without a prediction, would attenuate fast motion (see
+        `ServoWindows.motion`).
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])

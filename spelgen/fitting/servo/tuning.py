@@ -31,7 +31,8 @@ class ServoTuning:
     # [1] Prior standard deviation of the logarithm of the Stribeck velocity. With a wider prior, friction could
     # decrease over the whole range of speeds and would then absorb offsets.
     stribeck_velocity: float = 1.0
-    # [rad, m] Prior standard deviation of half a dead zone: dead zones of the gears of hobby servos are a few mrad.
+    # [rad, m] Prior standard deviation of half the width of a dead zone. It is several times the dead zones of the
+    # gears of hobby servos, a few mrad, so that the prior is weak.
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
@@ -86,7 +87,9 @@ class ServoTuning:
 
     # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
-    # [1] Half the width w of the initial dead zone, as a fraction of the static error, dry friction / kp + w / 2.
+    # [1] Initial half width of a dead zone, as a fraction of dry friction / kp, the static position error of the fit
+    # without a dead zone. Coulomb friction is reduced by the same fraction, so that the static error remains about the
+    # same.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
     # with a dead zone and the fit without.
@@ -122,9 +125,9 @@ class ServoTuning:
     # [1] The initial kp is computed from the coefficient of gravity only if it differs from the nominal kp by less than
     # this factor; otherwise kp / nominal kp is the median of the other joints.
     kp_range: float = 20.0
-    # [1] Lower bound m of three initial values: dry friction is at least m times nominal friction, kd/kp at least m^2 =
-    # 0.0025 s, and armature/kp at least m^3 = 0.000125 s^2. The last two are 5 % of 0.05 s (`ModelTuning.servo_lag`)
-    # and of 1 / (20 rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
+    # [1] Number m = 0.05 that defines lower bounds of three initial values, which are positive since their logarithms
+    # are fitted. Dry friction: m times nominal friction. kd/kp: m^2 s = 0.0025 s, 5 % of 0.05 s
+    # (`ModelTuning.servo_lag`). armature/kp: m^3 s^2 = 0.000125 s^2, 5 % of 1 / (20 rad/s)^2 (`frequency`).
     min_friction: float = 0.05
     # [s] Largest delay of linear servos.
     max_delay: float = 0.4

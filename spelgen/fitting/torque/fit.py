@@ -48,15 +48,16 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 class FitComparison(NamedTuple):
     """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
+    An error is the mean squared error of held-out blocks divided by the variance of the torque, averaged over joints.
+
     Attributes:
-        fit: error of the returned model: mean squared error of held-out blocks divided by the variance of the torque,
-            averaged over joints.
-        regression: the same error of the ridge regression.
-        behind: True if the regression is significantly better than the fit.
-        replaced: error of a fit from the URDF that was replaced by a better fit from the result of the regression; None
-            if the returned fit started at the URDF.
-        discarded: error of a fit that was discarded, since the model before the fit has no larger error; this model is
-            then returned. None if a fit is returned.
+        fit: error of the returned model.
+        regression: error of the ridge regression.
+        behind: True if the regression is significantly better than the returned model.
+        replaced: error of the fit from the URDF, if a fit from the result of the regression has a smaller error and
+            replaced it; otherwise None.
+        discarded: error of the fit, if the model before the fit has no larger error and is returned instead of the fit;
+            otherwise None.
     """
 
     fit: float
@@ -233,8 +234,8 @@ def _compared_fit(
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < best.held_out.sum():
             best, replaced = restarted, nmse(best.held_out)
-    # A fit whose nMSE is below the threshold is kept even if the model before the fit (URDF) is exact and predicts
-    # better: the intervals of the fit are smaller.
+    # Below the threshold, the fit is kept without a comparison with the model before the fit. An exact URDF may predict
+    # better, but the model before the fit has only the wide intervals of the prior; the fit has narrower intervals.
     if nmse(best.held_out) > TUNING.unsupported:
         model.load_state_dict(initial)
         unfitted = _unfitted(model, samples, prior, blocks)

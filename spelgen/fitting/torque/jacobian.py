@@ -228,9 +228,9 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # The projection is computed with respect to theta, which contains inertial parameters where x contains
-        # log-Cholesky parameters. The torque is linear in inertial parameters, so the projection is also valid for
-        # large torques.
+        # The projection describes how the model would absorb an added joint torque of any magnitude. It is computed
+        # with respect to theta, because the torque is linear in inertial parameters. With respect to x, which contains
+        # log-Cholesky parameters instead, the projection would be valid only for small added torques.
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -248,8 +248,8 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # A step s > 0 of log c becomes log(c (1 + s)) - log c = log1p(s), which equals s to first order; s < 0 is
-            # unchanged, since 1 + s could be negative.
+            # For s > 0, c becomes c (1 + s): log c changes by log1p(s). With a change by s, c would grow exponentially
+            # with s. For s < 0, log c changes by s, since 1 + s could be negative.
             parameters[name] = (
                 parameters[name]
                 - change[name]

@@ -38,11 +38,11 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries, for example the spline coefficients of the joint. The first L weights are amplitudes of
-    trends, which change all entries together, for example mean and slope of the spline coefficients. The other W
-    weights change one entry each: for the weights w (P,), the entries are trends @ w[:L] + w[L:].
+    The term has W entries e (W,), for example the spline coefficients of the joint. The weights w (P,) are L amplitudes
+    of trends, which change all entries together (for example mean and slope of the spline coefficients), and W changes
+    of single entries: e = trends @ w[:L] + w[L:].
 
-    scale: the parameter of the model is entries / scale.
+    scale: unit of the entries [Nm, N], or 1 for a friction factor; the parameter of the model is e / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization, without the part of the columns that rigid bodies and friction
@@ -70,9 +70,9 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return the P = L + W weights (P,) that represent the current values of this term's W entries in `terms`.
+        """Return weights w (P,) of this term that give its current W entries in `terms`: L zeros, then the entries.
 
-        The weights of the L trends are zero: the W weights of single entries suffice (see the class).
+        The entries are trends @ w[:L] + w[L:] (see the class), so the weights of the L trends can be zero.
         """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
@@ -83,8 +83,8 @@ class JointFunction:
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
         """Set the term's parameter in `terms` to the values that weights (P,) of the `JointFunction` represent."""
         count = self.trends.shape[1]
-        # Trends (see the class) have a separate prior in the fit but no parameter in the model, so their part is added
-        # to the entries of the term.
+        # The model stores only the W entries of the term. The trends have weights of their own only in the fit, for
+        # which they have a separate prior: here they are converted to entries.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
             # The model bounds the logarithm of a friction factor by a tanh, which is inverted here.
@@ -114,8 +114,8 @@ class JointFunction:
         term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque
         noise [Nm, N].
         """
-        # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on
-        # several joints.
+        # The friction of a coupled drive acts on several joints, each with its own residual and noise. The returned
+        # value is the weighted least-squares solution over these joints.
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 

@@ -105,8 +105,9 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # If a segment determines many parameters, eigenvalues of 1 - H are near zero, and (1 - H)^(-1/2) would be
-            # too large: the eigenvalues have the lower bound 1 / size.
+            # H is near 1 in some directions if a segment of `size` samples determines many parameters. These
+            # eigenvalues of 1 - H are near zero, and (1 - H)^(-1/2) would be too large, so the eigenvalues have the
+            # lower bound 1 / size.
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors

@@ -130,7 +130,8 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
             coefficient's logarithm exceeds three of these standard deviations.
 
     Returns:
-        `deviation` if no gain was changed, otherwise the upper bound of prior standard deviations.
+        Prior standard deviation of the logarithm of a gain: `deviation` if no gain was changed, otherwise the larger
+            `TorqueTuning.max_width`.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
@@ -363,7 +364,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |d|^2 of each body
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |x - prior mean|^2 of each body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}

@@ -86,10 +86,10 @@ class NoiseEstimator:
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for a squared residual.
+        """Return the noise (n,) [Nm, N], s = RMS residual times sqrt(correlation length), for a squared residual.
 
-        The root mean square residual is at most `max_error`, and at least a fraction of `torque_std`, also if that
-        fraction exceeds `max_error`.
+        The root mean square (RMS) residual is corrected for the number of parameters, and limited: to at most
+        `max_error`, then to at least a fraction of `torque_std`, also if that fraction exceeds `max_error`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
@@ -166,7 +166,7 @@ class TorqueProblem:
 
     @cached_property
     def noise_estimator(self) -> NoiseEstimator:
-        """Estimator of the torque noise from the residual on all samples of ``jacobian``."""
+        """Estimator of the torque noise; its samples are the samples for which ``jacobian`` was computed."""
         return NoiseEstimator.of(self.jacobian, self.correlation_time, self.max_error)
 
     @property
@@ -288,8 +288,8 @@ class TorqueEstimate:
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
         """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
 
-        The squared residual is recomputed with the current friction model of each joint, with or without bristles
-        (`FrictionLaws.memoryless`).
+        The squared residual is recomputed with the new Jacobian. It also depends on the friction model of each joint,
+        which may have changed: bristles, or rate-only friction (`FrictionLaws.memoryless`).
         """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
@@ -355,7 +355,8 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate for other samples, or with residual terms, refitted with ``estimate`` as the warm start.
 
-    terms: {joint: residual terms whose weights are linear and are eliminated from the fit}.
+    terms: {joint: residual terms}. Their torque is linear in their weights, which are eliminated by variable
+    projection.
     """
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     # The noise of ``estimate`` is not used, since it was estimated from other samples or with other linear terms.
