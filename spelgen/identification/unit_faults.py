@@ -329,7 +329,7 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        """Return the text that the positions have another unit, with its name or the gear ratio, if it is known."""
         motion, torque = correction.factors
         texts, ratios = [], dict[str, list[str]]()
         for k in np.flatnonzero(self.has(motion, torque)).tolist():

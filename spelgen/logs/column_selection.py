@@ -120,9 +120,9 @@ def columns_by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names: to the joint with
-    this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
-    number}, the result of `_order_in_cells`.
+    If no column name contains a joint name, columns are assigned by the last number in their names. If `order` contains
+    all joints, a column belongs to the joint with its number in `order`. Otherwise the columns, sorted by their
+    numbers, belong to the `joints` in the given order. order: {joint: number}, the result of `_order_in_cells`.
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}

@@ -396,7 +396,7 @@ def _roughness(positions: np.ndarray) -> float:
 
 
 def _continues(rows: Rows) -> bool:
-    """Return True if the clock was set back during a continuous motion, at each row at which the time steps back.
+    """Return True if the motion is continuous at each row at which the time steps back, so that the clock was set back.
 
     The motion is continuous at such a row if a joint moves in the rows around it, and if no position changes by more
     than twice its largest change in the rows around it. If the time steps forward by a gap and then back, a single time

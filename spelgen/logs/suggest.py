@@ -61,8 +61,8 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError for a file that cannot be
     read, is a ROS bag, has joint names in a column, has positions of several arms, or has no positions but only torques
-    or only commands. If `commands` is False, it also raises LogError for a file with positions that has no torques:
-    either commanded positions in their place, or no further columns at all.
+    or only commands. If `commands` is False, LogError is also raised for a file without torques that has commanded
+    positions, or only times, positions and velocities.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:

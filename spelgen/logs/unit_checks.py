@@ -84,7 +84,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     registers = signals.qd / mapping.scale("qd", joint)
     is_register = bool((registers == registers.round()).all())
     # If dq/dt is the same multiple of qd at all joints, and no combination of units explains this multiple within a few
-    # per cent, the times are wrong, and the units are not: `find_time_unit` reports it. Example: times in units of
+    # per cent, the times are wrong and not the units: `find_time_unit` reports this fault. Example: times in units of
     # 0.1 us that are read as us give the multiple 0.1, which differs from the 0.105 of velocities in rpm. An exception
     # are velocities that are whole numbers: they may be values of registers, in any unit.
     is_other = bool(keys) and not is_far and distance > 0.03 + 0.02 * len(keys["units"])
