@@ -15,7 +15,9 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.settings.log_mapping import SCALES
 
 Form = tuple[np.ndarray, np.ndarray, int]
-LARGEST_GEAR = 500.0  # [1]
+# [1] Largest plausible gear ratio: gears of robot arms have smaller ratios. A larger fitted ratio is not advised as a
+# setting.
+LARGEST_GEAR = 500.0
 GIVE_GEAR = (
     "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
     "the gear ratio"
@@ -40,7 +42,8 @@ class TorqueUnit(WrongScale):
         """Define the candidates for corrections of the torques' unit.
 
         factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
-        may have another unit: the mapping states mNm or none. is_milli: (n,) True for torques declared in mNm.
+        may have another unit, since the column mapping states mNm or no unit of it. is_milli: (n,) True for joints
+        whose torque has the unit mNm in the mapping.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
@@ -48,8 +51,8 @@ class TorqueUnit(WrongScale):
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
         """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
 
-        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints. The
-        other corrections in `base` remain.
+        If the hypothesis of `base` does not correct the unit of torques yet, also yield fits with separate factors on
+        the torques of some joints, and of all joints. The other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
@@ -62,8 +65,9 @@ class TorqueUnit(WrongScale):
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
         for factor in candidates:
-            # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
-            # is inexact because the masses of the URDF are.
+            # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
+            # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from
+            # 200 to 5000 are replaced by 1000.
             is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
@@ -78,14 +82,14 @@ class TorqueUnit(WrongScale):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
-        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
-        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
-        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
-        joint is small.
+        The factors are the gains of a fit in which the torque of each joint has an unknown gain. The dynamic coupling
+        of the joints determines the ratios of the gains, and the masses of the URDF their common factor. Gains also
+        compensate errors of the masses, which lowers the cost a little. Separate factors are therefore yielded only if
+        (1) the cost with them, plus a penalty for each factor, is significantly below the cost of `lowest`, (2) each
+        factor is determined, and (3) the relative residual of each joint is small.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
-        factors. has_gravity: True if gravity torques in the log gave a candidate.
+        factors. has_gravity: True if the gravity in the logged torques gave at least one candidate.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau
@@ -95,7 +99,8 @@ class TorqueUnit(WrongScale):
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
         is_free = self._is_open & (gains > 0)
         is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
-        # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
+        # If no gain differs much from the median gain, only one common factor on all torques can be wrong. It is known
+        # only if the torques contain gravity, which is compared to the URDF's gravity torques.
         if not (is_other.any() or has_gravity):
             return
         single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
@@ -123,9 +128,10 @@ class TorqueUnit(WrongScale):
                 yield fit
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
+        """Return the mask (n,) of the joints whose torque has another unit than stated: |`torque`| is not 1.
 
-        motion, torque: (n,) correction factors of the joints; only `torque` counts: it is neither 1 nor -1.
+        motion, torque: (n,) factors that correct motion and torque of the joints. `motion` is not used here, but by
+        other kinds of faults.
         """
         return np.asarray(np.abs(torque) != 1)
 
@@ -171,7 +177,8 @@ def rounded_factor(factor: float) -> float:
     changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # The tolerance of 1.5 is wide, since the factor is only as exact as the masses of the URDF.
+        # Magnitudes from 0.00067 to 0.0015 become 0.001. The range is wide, since the factor is only as exact as the
+        # masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
@@ -180,8 +187,9 @@ def rounded_factor(factor: float) -> float:
 class PositionUnit(WrongScale):
     """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
 
-    The unit of all joints of a type is one of `UNITS`. The factors of groups of joints are optimised, since their
-    positions may be the positions of motors, before gears of any ratio.
+    The unit of all joints of a type is one of `UNITS`. Positions may also have been measured at the motors, before
+    gears of any ratio. For given groups of joints (a single joint, or all revolute joints), the factors on the
+    positions are therefore optimised.
     """
 
     code = "joint-unit"
@@ -197,31 +205,35 @@ class PositionUnit(WrongScale):
         """Define the candidates for other units of the positions of n joints.
 
         Args:
-            factors: candidates for the factors of all joints of a type, (2, n) each.
-            groups: indices of the joints of each group whose factors are also optimised.
-            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
-                a fault, and no setting is advised for it.
+            factors: candidates, (2, n) each: factors on the motion (first row) and on the torques (second row).
+            groups: lists of joint indices. The factors on the positions of the joints in a list are optimised together.
+            open_fault: kind of fault that replaces this object in hypotheses whose optimised factors are uncertain. It
+                is reported as an unknown unit, without a value to write. None: this object is such a kind of fault.
         """
         super().__init__(factors)
         self._groups, self._open_fault = groups, open_fault
         self.advice = "" if open_fault else GIVE_GEAR
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with other units of all joints, and with the best factors of each group.
+        """Yield the least-squares fits with each of the candidates, and with the best factors of each group of joints.
 
-        A single joint is omitted if the hypothesis of `base` already changes its unit.
+        A group is omitted if the hypothesis of `base` already changes the unit of one of its joints. All groups are
+        omitted if `base` explains the torques.
         """
         yield from super().fits(problem, base)
-        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
+        # An optimised factor also compensates small errors of the model: it is tried only if `base` does not explain
+        # the torques.
         if base.errors.max() <= GEOMETRY.explained:
             return
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
         yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
 
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
-        """Return the least-squares fit with the best factor on the positions of each of m joints.
+        """Return the least-squares fit with the best factors on the positions of a group of m joints.
 
-        Units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
+        Factors of units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
+
+        joints: indices of the joints of the group.
         """
         scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
         span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
@@ -231,15 +243,18 @@ class PositionUnit(WrongScale):
             factors[:, joints] = sense * np.exp(exponents), torque_sense * np.exp(-power * exponents)
             return base.hypothesis.changed(fault, scale=scale * factors)
 
-        # Forms (senses of the motion, senses of the torque, power): the torque of the joint (power 0), of either sense
-        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        # A form is (sign of the positions, sign of the torques, power). If the positions get the factor x, the torques
+        # get the factor x^-power. Power 0: the torques are the joint's; if the positions are reversed, the torques may
+        # be reversed or not. Power 1: the torques are the motor's, which the gear ratio 1 / x multiplies; they always
+        # have the sign of the positions.
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
-        # `_descended` reverses the senses of several joints.
+        # For several joints, only the two forms without reversal are tried here; `_descended` then reverses joints.
         forms: list[Form] = [
             (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
         ]
-        # the largest motion is at least 0.05 rad or m, and at most two turns
+        # `common`: logarithms of the tried factors. The factor makes the largest motion at least 0.05 rad or m and at
+        # most two turns, and is at most exp(-0.6) = 0.55: a factor near 1 is neither a unit nor a gear.
         common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
         costs = np.array([[problem.fit(scaled(x * ones, form)).cost for form in forms] for x in common])
         lowest = costs.min(axis=0)
@@ -259,7 +274,7 @@ class PositionUnit(WrongScale):
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
         is_unit = np.abs(nearest - exponents) < 0.1
-        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        # The largest fitted gear ratio, of the factors that are no units, must be below LARGEST_GEAR.
         largest_gear = np.where(is_unit, 0.0, np.exp(-exponents)).max()
         is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
         fault = self if is_sure else self._open_fault or self
@@ -274,16 +289,19 @@ class PositionUnit(WrongScale):
     def _descended(
         self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
     ) -> tuple[HypothesisFit, np.ndarray, Form]:
-        """Return the fit of lowest cost near initial exponents (m,) of the factors, its exponents, and its form.
+        """Return the fit of lowest cost near initial factors on the positions of m joints, its exponents, and its form.
 
-        The senses of several joints are reversed one by one while the torques are not explained and the cost falls.
+        Exponents (m,) are the logarithms of the factors, and `start` has their initial values. A form has the signs of
+        positions and torques (see `_free`); scaled(exponents, form) returns the hypothesis. As long as the torques of
+        several joints are not explained, one joint more is reversed if this lowers the cost enough.
         """
 
         def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
             hypothesis_of = partial(scaled, form=form)
             exponents = start
             for _ in range(3):
-                # ratios from 1.5 to 1000, as of mm
+                # The bounds permit logged positions that are 1.5 to 1100 times the joint's. Values in mm, for example,
+                # are 1000 times the values in m.
                 exponents, fit = problem.descend(
                     hypothesis_of,
                     exponents,
@@ -304,14 +322,14 @@ class PositionUnit(WrongScale):
         return best
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
+        """Return the mask (n,) of the joints whose positions have another unit than stated: |`motion`| is not 1.
 
-        motion, torque: (n,) correction factors of the joints; only `motion` counts: it is neither 1 nor -1.
+        motion, torque: (n,) factors that correct motion and torque of the joints. `torque` is not used here.
         """
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        """Return the text that the positions have another unit, with its name or the gear ratio, if it is known."""
         motion, torque = correction.factors
         texts, ratios = [], dict[str, list[str]]()
         for k in np.flatnonzero(self.has(motion, torque)).tolist():

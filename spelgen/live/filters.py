@@ -49,7 +49,11 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return the means over this block and the next block, `later`, as one block of both durations."""
+        """Return this block and the next block, `later`, as one block.
+
+        Its duration is the sum of the durations, and its terms are means weighted by the durations. A joint counts as
+        moving only if it moved in both blocks.
+        """
         duration = self.duration + later.duration
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration

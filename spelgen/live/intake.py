@@ -67,7 +67,7 @@ class Intake:
         self._begin()
 
     def _begin(self) -> None:
-        """Reset the bounds of the friction state and the delay line: the past motion is unknown."""
+        """Start with an unknown past motion: the initial bounds of the deflections, and an empty delay line."""
         self.bounds = np.stack([-self.limit, self.limit])
         self.line = DelayLine(abs(self.levels.delay))
 
@@ -117,8 +117,9 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # `furthest` is the largest plausible motion since the last sample. Time stamps may be delayed, so it includes a
-        # motion of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
+        # `furthest` is the largest plausible motion since the last sample: the time step times `speed`, which is
+        # `TUNING.jump` times the largest speed v of the training logs, plus one encoder step. Time stamps may be
+        # delayed, so a motion of `TUNING.block` seconds at the speed v = speed / TUNING.jump is added.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"

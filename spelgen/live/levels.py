@@ -153,8 +153,9 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
-    # them. A torque limit in the URDF is replaced if logged torques exceed it. Without a limit in the URDF, `limit` is
-    # a guess: torques above it (for example under a payload) do not count as saturated up to `TUNING.jump` times it.
+    # them. `limit` is the torque limit in the URDF, but at least 1.2 times the largest logged torque. Without a limit
+    # in the URDF it is a guess, 2.5 times the largest logged torque, which a payload may exceed. A torque then counts
+    # as saturated only from `TUNING.jump` times the guess on.
     limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
@@ -178,12 +179,14 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
 
     The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
-    factor is found by trials: each trial estimates the payload from several consecutive blocks. The logs are without
-    payload, so the estimate x is an error, with the normalised square s = x^T P^-1 x / k; x is the mass (k = 1), or
-    mass and first moments (k = 4). The mean of s is computed for each k and each number of blocks per trial, because
-    errors are correlated over time. As a prior, each mean includes `prior_trials` imaginary trials with s =
-    `prior_variance`. The factor is the largest mean; its degrees of freedom are the number of trials in this mean,
-    including the imaginary trials.
+    factor is found by trials on logs without payload:
+
+    1. A trial estimates the payload from several consecutive blocks. The true payload is zero, so the estimate x is an
+       error. Its normalised square is s = x^T P^-1 x / k, for the mass (k = 1) and for mass and first moments (k = 4).
+    2. The mean of s over all trials is computed for each k, and for trials of each of the lengths `trial_blocks`: since
+       errors are correlated over time, the mean depends on the length. As a prior, `prior_trials` trials with
+       s = `prior_variance` are added to the trials of each mean.
+    3. The factor is the largest mean. Its degrees of freedom are the number of trials in this mean, prior included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -306,12 +309,17 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
     """Return the distribution of the largest peaks: `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. An
-    exponential distribution is fitted to the largest peaks and gives the contact thresholds. Peaks differ between logs,
-    so thresholds from some logs cause too many alarms on others. All peaks, and thereby the thresholds, are therefore
-    multiplied by a factor. Cross-validation determines the factor: for each log, thresholds are computed from all other
-    logs. With these thresholds times the factor, all held-out logs together have at most the number of alarms that the
-    default rate of false alarms allows. The factor is the same for all joints, because the joint that needs the largest
-    factor differs between logs.
+    exponential distribution fitted to the largest peaks gives the contact thresholds. Thresholds from some logs cause
+    too many alarms on other logs, since peaks differ between logs. All peaks, and thereby the thresholds, are therefore
+    multiplied by a factor, which is found by cross-validation:
+
+    1. For each log, thresholds are computed from the peaks of all other logs. A time window of the log has an alarm if
+       the peak of a joint exceeds its threshold times the factor.
+    2. The factor is the smallest one with which the windows of all logs have no more alarms than the default rate of
+       false alarms allows, and at least `TUNING.other_days`.
+
+    All joints have the same factor. Factors of single joints would be too small for new logs, since the joint with the
+    largest ratio of peak to threshold differs from log to log.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].
@@ -338,10 +346,11 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the
-    # errors, the scales are shrunk towards their mean (James and Stein, 1961). The weight of the mean is the error
-    # variance divided by the variance over the joints. It is at most 1 - 1 / n, so that `peak_count` is at most n
-    # `count`, the number of peaks of all n joints.
+    # `scale` (n,) is the mean excess over `start` of the `count` largest peaks of each joint. The scales of the joints
+    # are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the errors, the scales are
+    # shrunk towards their mean (James and Stein, 1961). The weight w of the mean is the error variance divided by the
+    # variance of the scales over the joints. A shrunk scale is as exact as one from `peak_count` = count / (1 - w)
+    # peaks. All n joints together have only n count peaks, so w is at most 1 - 1 / n.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)

@@ -32,7 +32,9 @@ Vector = Annotated[
 
 
 class BlockNoise(BaseModel):
-    """Noise of the torque residual of the momentum balance, averaged over blocks of samples of one length.
+    """Noise of the means of the torque residual of the momentum balance over blocks of samples.
+
+    The noise depends on the duration of the blocks: `NoiseLevels` has one `BlockNoise` for each of two durations.
 
     Attributes:
         white: standard deviations of white noise, (n,) [Nm, N].
@@ -140,10 +142,11 @@ class NoiseLevels(BaseModel):
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
-        Peaks (see the class) above `peak_start` have an exponential distribution. Its scale is uncertain, because it is
-        estimated from m = `peak_count` peaks. With the prior density 1 / scale, the probability that a peak above
-        `peak_start` also exceeds `peak_start` + x is p(x) = (1 + x / (m `peak_scale`))^-m. There are `tail_peaks` such
-        peaks per minute. The threshold is `peak_start` + x, at least 1, where x solves
+        A peak is the largest external torque of a joint in a time window, divided by its standard deviation. Without
+        contacts, all joints together have `tail_peaks` peaks per minute above `peak_start`; these peaks have an
+        exponential distribution. Its scale is uncertain, because it is estimated from only m = `peak_count` peaks. With
+        the prior density 1 / scale, a peak above `peak_start` also exceeds `peak_start` + x with the probability
+        p(x) = (1 + x / (m `peak_scale`))^-m. The threshold is `peak_start` + x, at least 1, where x is the solution of
         `tail_peaks` p(x) = `alarms_per_minute`.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].

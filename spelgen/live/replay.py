@@ -192,8 +192,9 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     """Return the indices of the samples at which the load changes.
 
-    All samples with `load_changed` are returned, with one exception: if no payload was reported before a change, and
-    the status after it is "no payload", the two loads differ by less than the errors of the model.
+    Samples with `load_changed` are returned, except for changes without a payload on either side: no payload was
+    reported before the change, and the status after it is "no payload". Such a change is within the errors of the
+    model, and is omitted.
 
     states: estimates after each sample of a log.
     """

@@ -56,7 +56,7 @@ class LiveTuning:
     # not averaged out by more motion. The variance of the torque of the estimated payload has a lower bound: this
     # fraction times the variance of torque errors. Without the bound, the normalised squared error of a payload that is
     # estimated for an arm without payload increases with time, to 20 after ten minutes of repeated logs of a UR10e.
-    # With 0.03, 20 minutes of repeated logs of other arms give payloads of 6 to 60 g.
+    # The fraction 0.03 is too small: after 20 minutes of repeated logs, it gives payloads of 6 to 60 g for other arms.
     recurring: float = 0.1
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).

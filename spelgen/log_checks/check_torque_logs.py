@@ -55,7 +55,8 @@ if TYPE_CHECKING:
 COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-changed"
-# Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
+# Codes of warnings after which couplings of motors and delays of torques are not tested: the motion is too small, the
+# logged columns may not be the torques of the joints, or scale, zeros or gravity probably differ from the URDF.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -178,7 +179,8 @@ class TorqueLogs:
         recording.
 
         Args:
-            samples: unfiltered samples, then filtered ones, which are used unless they are too few.
+            samples: two sets of samples, first unfiltered, then low-pass filtered. The filtered samples are used; if
+                there are too few of them, for example at low sample rates, the unfiltered samples are used.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
             loads: changes of the load between recordings.
@@ -212,10 +214,10 @@ class TorqueLogs:
         return findings
 
     def _load_changes(self, motion: MotionSamples, moving: MotionSamples | None) -> list[LoadChange]:
-        """Return the changes of the load between recordings.
+        """Return the changes of the load (the arm's payload) between recordings; [] for a single recording.
 
-        motion: unfiltered samples of all recordings. moving: filtered samples, which are used if they are of all
-        recordings: they show smaller changes.
+        motion: unfiltered samples of all recordings. moving: low-pass filtered samples; None if there are none. The
+        filtered samples are used if they are from all recordings, since smaller changes are detectable in them.
         """
         problem = self._problem(motion)
         if problem is None or len(self._sources) == 1:
@@ -226,7 +228,7 @@ class TorqueLogs:
         return load_changes(problem)
 
     def _load_notes(self, loads: Sequence[LoadChange]) -> Iterator[Diagnostic]:
-        """Yield a warning if there are changes of the load between recordings."""
+        """Yield a warning that names the recordings with another load, with its mass; none if `loads` is empty."""
         masses = []
         for change in loads:
             width = 2 * change.deviation
@@ -330,8 +332,9 @@ class TorqueLogs:
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
-        # If a hypothesis changes the unit of only one joint's torque, the evidence is the magnitude of gravity in this
-        # torque. A wrong link of the URDF changes it as well, so warnings about links are added.
+        # If the best hypothesis changes the unit of only one joint's torque, its evidence is that the gravity in this
+        # torque is much larger or smaller than the URDF's. A wrong mass of a link in the URDF is another explanation of
+        # this difference, so warnings about links are added.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             yield from _link_notes(problem, unchanged)
@@ -389,10 +392,13 @@ class TorqueLogs:
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
 
     def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
-        """Return an error; the error that most positions are in degrees is replaced if the torques contradict degrees.
+        """Return `error`, or its replacement if it states positions in degrees, and the torques contradict degrees.
 
-        The positions may be the positions of the motors, before gears. If gear ratios of the joints explain the
-        torques much better than degrees, they are advised. If neither explains the torques, no setting is advised.
+        The positions may have been measured at the motors, before gears. If gear ratios explain the torques much better
+        than degrees, the replacement advises them. If neither explains the torques, it states that degrees do not
+        explain them, and advises to write the units.
+
+        samples: filtered samples of all recordings. error: any error of the earlier checks.
         """
         problem = self._problem(samples)
         if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
@@ -411,7 +417,8 @@ class TorqueLogs:
         if best.errors.max() <= GEOMETRY.explained:
             finding = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
             return finding if isinstance(finding, LogError) else error
-        # the log may have another fault in addition to positions in degrees
+        # Positions in degrees may explain the torques together with another fault of the log, such as a wrong sense.
+        # The error about degrees is then right.
         converted = self._problem(unit.hypothesis.signals(problem.samples))
         if converted is not None:
             _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
@@ -446,9 +453,9 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     problem = problem.thinned(GEOMETRY.confirming_samples)
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
-        # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
-        # At other joints, the cost without gravity must be lower by at least the penalty of a rare fault, `rarity`: a
-        # wrong centre of mass of the last link has a similar effect.
+        # A joint is reported without a comparison of costs if the model with gravity does not fit its torque: the
+        # residual is above 10 % of the torque's variance. At other joints, the cost without gravity must be lower by
+        # at least the penalty of a rare fault, `rarity`: a wrong centre of mass of the last link has a similar effect.
         without = problem.without_gravity(k).fit(problem.unchanged).cost
         if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
             message = (
@@ -487,7 +494,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             ratio = float(axis @ found)
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis))
             # The ratio must be above 2.5 or below 1/2.5: masses of CAD models are wrong by less. It must also differ
-            # from 1 by more than four standard deviations: at one of many bodies, it differs by two by chance.
+            # from 1 by more than four of its standard deviations: among many bodies, the ratio of one may by chance
+            # differ from 1 by two standard deviations.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

@@ -88,8 +88,9 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     if not suspects.any():
         return []
     fits = []
-    # Two guesses of the signs are refined: the signs of the URDF's torques and, for joints with little load, the signs
-    # of the velocity (friction).
+    # The signs of the suspected torques are unknown at each sample. Two initial guesses are refined: the signs of the
+    # torques predicted with the URDF's parameters, and the signs of the velocities. The second guess is good for joints
+    # with little load, whose torque is mostly friction.
     for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
@@ -160,9 +161,10 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - certain * deviation)[rows, k])
-            # Contact with a stop requires a large difference, since a controller that pushes against a stop needs a
-            # large torque. Smaller differences also occur in pauses of a joint that moves one way only: its friction is
-            # not determined.
+            # `difference` is between logged torque and torque of the model, while the position is at an extreme. A
+            # joint counts as pushed against a stop only if the difference is large. Smaller differences also occur in
+            # pauses of a joint that moves only in one direction: such motion does not determine the friction, so that
+            # the torque of the model is wrong by about the friction when the joint is at rest.
             sure = max(certain * noise[k], 0.5 * samples.tau[:, k].std())
             if difference > sure + 2 * abs(friction[k]):
                 message = (

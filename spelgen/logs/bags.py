@@ -142,8 +142,11 @@ def _joint_states(
 def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    names: {joint: its name in the mapping}. logged: names in the log. The advice contains the settings that map the
-    names if exactly one logged name contains each name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
+    Each name is searched in the logged names, in full or without the words that all names share: "fer_j1" is found by
+    "j1" in "panda_j1" (see `joint_patterns`). If each name is found in exactly one logged name, the advice contains the
+    settings that map the names; otherwise it shows the form of the settings for one joint.
+
+    names: {joint: its name in the mapping}. logged: names in the log.
     """
     patterns = joint_patterns(list(names.values()), logged)
     matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}

@@ -73,7 +73,8 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# A check of a trajectory or of a joint; `LogChecks` collects the findings of both in one dict.
+# Type of a check of any subject. A check is of a trajectory or of the signals of a joint; one dict of `LogChecks`
+# contains the findings of both kinds.
 AnyCheck = Check[Any]
 
 
@@ -81,8 +82,9 @@ AnyCheck = Check[Any]
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions have an unknown unit, which the torques may show. is_presumed: True
-    if the unit of most positions is advised by their range only, so that the torques may contradict it.
+    guessed: names of joints whose positions have an unknown unit; later checks may find the unit from the torques.
+    is_presumed: True if a finding about the unit of positions is based only on the range of the positions; later checks
+    test whether the torques contradict it.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
@@ -330,7 +332,8 @@ class LogChecks:
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
             if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
-                # The unit, after the colon of the message, is not certain.
+                # At most half of the joints have this fault, so their unit is uncertain: it is removed from the message
+                # (the text after the colon), and no setting is advised. The check of the torques gets their names.
                 message, _, _ = message.partition(": ")
                 summary.guessed.update(names)
                 entries = {}
@@ -354,7 +357,10 @@ class LogChecks:
         return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
 
     def _limited(self, joint: str) -> list[str]:
-        """Return the names of the joints in `_kin` with limited motion: positions beyond two turns show a unit."""
+        """Return the names of the joints of the same type as `joint`, without continuous joints.
+
+        Only at joints with position limits do positions beyond two turns show a wrong unit.
+        """
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         return [x for x in self._kin(joint) if kinds[x] != "continuous"]
 

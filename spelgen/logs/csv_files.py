@@ -188,7 +188,8 @@ def _beginning(content: bytes) -> Beginning:
         start += 1
     texts = [k for k in range(start) if len(cells[k]) == width and (k >= header or COMMENT.match(lines[k]))]
     units = {k: [plain_unit(x) for x in cells[k]] for k in texts}
-    # Names, and the header itself, may contain words such as `deg`.
+    # A line counts as a line of units only if more than half of its nonempty cells are units: a line of names may also
+    # contain a word such as `deg`.
     stated = [k for k, x in units.items() if sum(map(is_unit, x)) > sum(map(bool, x)) / 2]
     stated = stated if len(stated) < len(texts) else []
     below = [k for k in range(header, start) if k not in stated]

@@ -47,7 +47,8 @@ CONVERT = {
     ".npy with a dict": _PYTHON.format(
         "numpy; numpy.savez('{1}.npz', **numpy.load('{0}', allow_pickle=True).item())"
     ) + ' (only a file of a known source: pickles may contain code)',
-    # JSON has the fields of structs, as x.q; NPZ would have them as Python objects.
+    # The file is converted to JSON and not to NPZ: JSON can represent structs, whose fields are then read as columns
+    # such as x.q. NPZ would contain structs as Python objects, which are not read.
     ".mat": _PYTHON.format(
         "json, scipy.io; json.dump(scipy.io.loadmat('{0}', simplify_cells=True), open('{1}.json', 'w'), "
         "default=lambda x: x.tolist() if hasattr(x, 'tolist') else str(x))"

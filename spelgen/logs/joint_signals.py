@@ -332,8 +332,8 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
         has_unit = mapping.unit(name, signals.joint) is not None
         turns = [2 * np.pi / abs(mapping.scale(name, signals.joint)), *([] if has_unit else [360.0])]
-    # Lost samples and outliers are removed first: they cause jumps, too, but only jumps by the period or sign bit of
-    # register words determine a decoding.
+    # The decoding is derived from the jumps of the signal, which have the size of the period or of the sign bit. Lost
+    # samples and outliers cause jumps of other sizes, so they are removed first.
     is_valid = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
     for turn in turns:
         word = read_as_words(signals.raw(name)[is_valid], turn)
@@ -348,8 +348,9 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
 def find_elastic(signals: JointSignals) -> str | None:
     """Return a message if the apparent inertia of the joint shows the resonance of an elastic gear or belt.
 
-    The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration; it depends
-    on frequency as H(f) in the docstring of this module.
+    The apparent inertia H(f) at the frequency f is the torque component in phase with the acceleration, divided by the
+    acceleration. An elastic joint has H(f) = J_m + J_l / (1 - (f / f_0)^2), with the inertias J_m of the motor and J_l
+    of the link and the resonance f_0 [Hz]; a rigid joint has H(f) = J + c / f^2, where c is due to gravity.
     """
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number

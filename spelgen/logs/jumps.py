@@ -125,12 +125,15 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin: int = 0) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
-    A block is a run of equal values. It is stale if it is more than 20 times as long as the median block, and if a
-    reference signal changes by more than `min_change` within it. A quantised signal has genuine blocks: in such a
-    signal, the step at the end of a stale block must also be larger than four times the typical step (see the module).
+    A block is a run of equal values. A block is stale, except for its first sample, if it meets these conditions:
 
-    values: the signal (T,). changes: the reference signal (T,), for example the position for a torque. margin: number
-    of samples at both ends of a block in which a change of the reference signal does not count.
+    1. It has more than 20 times as many samples as the median block.
+    2. The reference signal `changes` changes by more than `min_change` within the block, not counting the first and the
+       last `margin` samples.
+    3. If the signal is quantised, the step at the end of the block is larger than four times the median step between
+       blocks: slow motion of a quantised signal also has long blocks, but these end with a step of one quantum.
+
+    values: the signal (T,). changes: the reference signal (T,), for example the velocity of the joint for its torque.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -167,10 +170,13 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    A logger may write each row m times. A block is a run of k equal rows. In a block written during motion, all rows
-    after the first are repeats. The position step at the end of such a block is as large as k normal steps: 1, 1, 1, 4,
-    5 has k = 3. The number of copies m is the median of k over the blocks during motion, or 1 if there are none. In all
-    other blocks, the arm was at rest: every m-th row is original, the rows between are repeats.
+    A logger may write each row m times. A block is a run of k equal rows, of one of two kinds:
+
+    1. The arm moved, and all rows after the first are repeats. Such a block is recognised by the position step at its
+       end, which is as large as k normal steps. Example: in the positions 1, 1, 1, 4, 5, the first three rows are a
+       block with k = 3, and the step from 1 to 4 makes up for the repeats. The number of copies m is the median of k
+       over all blocks of this kind, or 1 if there are none.
+    2. Otherwise the arm was at rest: every m-th row of the block is original, and the rows between are repeats.
 
     positions: number of leading columns that are positions.
     """

@@ -94,7 +94,8 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of an archive; `recording` is its name, None if it is the only one.
 
-    A matrix (T, n) of an archive replaces n arrays, one per joint: the column `q_<joint>` may be `q[2]`.
+    An archive may contain a matrix `q` (T, n) in place of n arrays `q_<joint>`. The mapping of the table then has names
+    such as `q[2]`, column 2 of the matrix, in place of the name `q_<joint>`.
     """
     columns: dict[str, dict[str, str | None]] = {joint: {} for joint in joints}
     for quantity in mapping.quantities if joints else ():

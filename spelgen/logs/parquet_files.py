@@ -85,7 +85,11 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
 
 
 def _lists(document: object, name: str) -> Iterator[tuple[str, list[object]]]:
-    """Yield (name, items) of the lists in a JSON document; lists within a sample (a value per joint) are omitted."""
+    """Yield (name, items) of the lists in a JSON document, such as lists with an item per sample.
+
+    Lists within a sample, such as the positions of all joints, are not yielded. If a list contains joints, each with
+    lists of samples, the lists of the joints are yielded in place of this list.
+    """
     items: Iterable[tuple[str, object]] = document.items() if isinstance(document, dict) else ()
     if isinstance(document, list):
         objects = [x for x in document if isinstance(x, dict)]

@@ -223,8 +223,9 @@ def stale_rows(
 ) -> np.ndarray:
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
-    A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
-    torque. A torque with the last value of the recording is not stale: the motor may be off while the joint moves.
+    Two kinds of constant torque are not stale. A torque equal to the largest or smallest torque of the recording may be
+    limited by the drive. A torque equal to the torque of the last sample may be the torque of a motor that was switched
+    off while the joint moved.
 
     Args:
         quantity: name of the signal, "q", "qd", "tau" or "u". Commands are never stale.
@@ -262,10 +263,11 @@ def listed_times(t: np.ndarray) -> str:
 def _order_in_time(rows: Rows) -> None:
     """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
-    Rows are sorted by time, unless positions are then less smooth, or velocities opposite. Of several rows with equal
-    times only the first is kept. If many rows have the time of the row before but other values, the resolution of the
-    clock is too low: all rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that
-    restarts or falls, and for times that cannot be reconstructed.
+    If sorting makes the positions less smooth, the clock was set back: the rows keep their order, and the times are
+    made continuous. Of several rows with equal times only the first is kept. If many rows have the time of the row
+    before but other values, the resolution of the clock is too low: all rows are kept, and evenly spaced times are
+    reconstructed. Raises LogError if the clock restarts without a continued motion, if it counts down (the velocities
+    are then opposite to dq/dt after sorting), and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
@@ -276,10 +278,13 @@ def _order_in_time(rows: Rows) -> None:
     if late:
         order = np.argsort(rows.t, kind="stable")
         message = f"{counted(late, 'time')} before that of the row above: the rows were sorted"
-        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues, the clock
-        # was set back, or its counter overflowed; else the file has several recordings, which sorting would interleave.
+        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues at the
+        # restart, the clock was set back, or its counter overflowed. If the motion does not continue, the file has
+        # several recordings, which sorting would interleave.
         if 2 * late > len(rows.t):
-            # Rows in reverse order have the velocities of the sorted positions; a time that remains has the opposite.
+            # Most times are before the time of the row above. If the rows are in reverse order, the logged velocities
+            # agree with dq/dt of the sorted rows. If the clock shows the remaining time, they are opposite to it, and
+            # sorting would reverse the motion.
             joints, quantities = len(rows.layout.joints), rows.layout.mapping.quantities
             velocities = (
                 rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros((2, 1))
@@ -393,11 +398,11 @@ def _roughness(positions: np.ndarray) -> float:
 
 
 def _continues(rows: Rows) -> bool:
-    """Return True if the motion continues at each row whose time is before the time of the row above.
+    """Return True if the motion is continuous at each row at which the time steps back, so that the clock was set back.
 
-    The motion continues at a row if a joint moves in the rows around it, and each position changes by at most twice its
-    largest change in these rows. If the time steps forward by a gap and then back, only one time is wrong and the clock
-    was not set back: False is returned.
+    The motion is continuous at such a row if a joint moves in the rows around it, and if no position changes by more
+    than twice its largest change in the rows around it. If the time steps forward by a gap and then back, a single time
+    is wrong and the clock was not set back: False is returned.
     """
     changes, steps = np.abs(np.diff(rows.positions, axis=0)), np.diff(rows.t)
     if len(changes) < 2 * TUNING.jump_window:
@@ -431,9 +436,12 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return a delayed signal (T, ...), sampled at times t (T,) [s], shifted back by its delay [s]: values(t + delay).
+    """Return a signal (T, ...) without its delay [s]: its result at the time t is the value logged at t + delay.
 
-    At the ends of a gap-free piece, the first or last value of the piece replaces values that were not logged.
+    A positive delay means that the signal was logged later than it occurred. Near the ends of a gap-free piece, where
+    t + delay is outside the piece, the first or last value of the piece is returned.
+
+    t: times of the samples (T,) [s]. values: logged signal (T, ...).
     """
     if not delay:
         return values

@@ -61,8 +61,9 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError for a file that cannot be
-    read, is a ROS bag, has joint names in a column, or has only torques or only commands. If `commands` is False, the
-    error is also raised for a file with only positions, or with commanded positions and no torques.
+    read, is a ROS bag, has joint names in a column, has positions of several arms, or has no positions but only torques
+    or only commands. If `commands` is False, LogError is also raised for a file without torques that has commanded
+    positions, or only times, positions and velocities.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -191,9 +192,10 @@ def _unknown_units(by_joint: ByJoint) -> list[tuple[str, str]]:
 
 
 def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) -> list[ColumnName]:
-    """Return the columns with quantities of a state [q; qd], such as x0, x1, ..., of which the names state nothing.
+    """Return the columns; columns of a state [q; qd], such as x0, x1, ..., get the quantities "q" and "qd".
 
-    The last half of the state's columns are the derivatives of the first half. joints: number of joints.
+    The names of a state's columns do not state their quantities. n = `joints` columns are positions and the next n are
+    velocities if the correlation of the velocities with the derivatives of the positions is above 0.9.
     """
     unstated = [x for x in columns if x.number >= 0 and not x.words & (COMMANDED | OTHERS)]
     unstated = [x for x in unstated if x.quantity in ("q", None)]
@@ -209,9 +211,9 @@ def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) ->
 
 
 def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table) -> tuple[float, float]:
-    """Return the correlation of columns x with the derivatives of columns q, and the relative distance of x and q.
+    """Return the correlation of columns x with the derivatives of columns q, and the distance std(x - q) / std(q).
 
-    Both are medians over the pairs (q, x) that move; NaN if none does.
+    Both are medians over the pairs (q, x) in which both columns change; NaN if there is no such pair.
     """
     values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
     moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
@@ -224,8 +226,12 @@ def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table)
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
     """Return the columns, with quantities for ambiguous names such as `t0`, `v0` and `u0`, derived from their values.
 
-    Numbered columns `t` are torques. `v` and `u` are velocities if they are correlated with the derivatives of the
-    positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
+    Only columns with the number of a position column get a quantity that no other column has:
+
+    - `t`: torque.
+    - `v`: velocity if its correlation with the derivative of the position is above 0.9; otherwise none.
+    - `u`: velocity if this correlation is above 0.9. Otherwise torque if it differs from the position by more than 0.3
+      standard deviations of the position; a smaller difference shows a commanded position, which gets no quantity here.
     """
     result = list(columns)
     of_number = {
@@ -264,11 +270,12 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
     """Return the column of times, the best of the candidates ``clocks``; a column named "" if the log has no times.
 
-    Without candidates, a column whose values rise like a clock is returned. If the column contains whole seconds, and
-    another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
+    Without candidates, a column whose values rise by regular steps is returned. If the column contains whole seconds,
+    and another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
     # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the name with the fewest words is used, or of several the most regular times.
+    # measurement. Without a stamp, the column whose name has the fewest words is used. Of several columns with equally
+    # few words, the column with the most regular time steps is used.
     nanoseconds = [x for x in columns if re.search(r"n(?:anos|(?:ano)?sec(?:ond)?s?)$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
@@ -376,17 +383,20 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
     """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
     times = _numbers(table, name)
     steps = np.diff(times)
-    # Ticks of 100 ns since 1601 (Windows) or the year 1 (.NET), in years from 2000 to 2080.
+    # Windows counts ticks of 100 ns since the year 1601, and .NET since the year 1. 3.2e14 ticks are 1.014 years, so
+    # dates from the year 2000 on are above 394 times 3.2e14 ticks (399 years) or 1972 times 3.2e14 ticks (1999 years).
+    # The upper bounds are 81 years later.
     if times.size and any(low < times[0] / 3.2e14 < low + 80 for low in (394, 1972)):
         return "0.1 us"
     return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: number of its columns}, such as 2 for the column `q[2]`, from joint names in the first row.
+    """Return {joint: the number in the names of its columns}, such as 2 for the columns `q[2]` and `q2`.
 
-    The names are cells of columns `name0`, `name1`, ..., or elements of a list: "elbow" in the column `name2` gives
-    {"elbow": 2}. Joints whose names are not in the row are omitted.
+    Joint names in the first row of the log state the numbers: in cells of columns `name0`, `name1`, ..., or in a list.
+    Example: "elbow" in the column `name2`, or as item 2 of a list, gives {"elbow": 2}. Joints without a name in the log
+    are omitted.
     """
     listed_names = json.loads((table.schema.metadata or {}).get(JOINTS_KEY, "[]"))
     order = {name: position for position, name in enumerate(listed_names) if name in joints}

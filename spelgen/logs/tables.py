@@ -21,7 +21,7 @@ UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
 STATED_KEY = b"stated units"  # key of {column: unit} in a table's metadata, from a line below a header
-JOINTS_KEY = b"joints"  # key of the joint names of a table's numbered columns, in their order
+JOINTS_KEY = b"joints"  # key, in a table's metadata, of the joint names in the order of the columns `q[0]`, `q[1]`, ...
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units declared in logs that spelgen writes
 
 LFS = b"version https://git-lfs"  # first bytes of a file whose content Git LFS has not fetched
@@ -254,9 +254,13 @@ def _naming(unused: Collection[str]) -> str:
 def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
     """Return {joint: pattern that finds its name as a separate word}: the joint 1 is found in `q_1`, but not in `q_12`.
 
-    A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
-    joints shoulder_pan_joint and joint_1_s. The first of these three forms in which all joints are found in `names`,
-    the column names, is used.
+    A name has three forms, of which the first is used in which all joints are found in `names`, the column names:
+
+    1. The full name.
+    2. The name without the words that all joints share: `shoulder_pan` for shoulder_pan_joint.
+    3. The name without these words and without numbers: `S` for joint_1_s.
+
+    If no form finds all joints, the full name is used.
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()

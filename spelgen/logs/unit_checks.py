@@ -83,8 +83,10 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     registers = signals.qd / mapping.scale("qd", joint)
     is_register = bool((registers == registers.round()).all())
-    # Any other common multiple of all joints is of the times, unless the velocities are values of registers: 0.1 of
-    # 0.1 us in us is no rpm, which is 0.105.
+    # If dq/dt is the same multiple of qd at all joints, and no combination of units explains this multiple within a few
+    # per cent, the times are wrong and not the units: `find_time_unit` reports this fault. Example: times in units of
+    # 0.1 us that are read as us give the multiple 0.1, which differs from the 0.105 of velocities in rpm. An exception
+    # are velocities that are whole numbers: they may be values of registers, in any unit.
     is_other = bool(keys) and not is_far and distance > 0.03 + 0.02 * len(keys["units"])
     if is_other and not is_register and _rate_by_velocities(signals):
         return None
@@ -152,8 +154,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     gear = abs(signals.factor)
     if is_far and is_known and not signals.is_whole and np.abs(signals.q).max() < TURNS * gear:
-        # If q is measured at the motor of a gear, any ratio of dq/dt to qd is possible. The correlation shows how exact
-        # the measured ratio is.
+        # If q is measured at the motor of a gear, the ratio of dq/dt to qd is the gear ratio, which may be any number.
+        # The more dq/dt and qd are correlated, the more exact is the measured ratio, and the smaller the distance.
         keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
         if signals.factor < 0:
             # The setting `sign` also reverses the torque, which is assumed to have the sense of the velocity.
@@ -200,8 +202,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 def _rate_by_velocities(signals: JointSignals) -> float | None:
     """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
 
-    Return None if the times may be right, or if the ratio of dq/dt to qd is the ratio of two units of time, such as
-    1000.
+    None is returned if the times may be right. None is also returned if the ratio of dq/dt to qd is the ratio of two
+    units of time, such as 1000: the caller then advises the unit of the times instead of a sample rate.
     """
     factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)

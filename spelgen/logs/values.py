@@ -87,8 +87,10 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """
     signals = data[:, 1 + joints :]
     empty, zero = np.isnan(signals).all(axis=1), (signals == 0).all(axis=1)
-    # Rows of zeros may also be genuine. If the arm is at rest and its motors are off, they are in long runs. If a
-    # moving arm reverses and its signals are coarse, they are less than 2 % of all rows.
+    # Rows whose velocities and torques are all 0 may be genuine in two cases. If the arm is at rest and its motors are
+    # off, such rows form long runs. If a moving arm reverses and its signals are coarse, they are less than 2 % of all
+    # rows. Rows of zeros count as rows of another publisher only if they are more than 2 % of all rows, in more than
+    # eight runs with fewer than four rows on average.
     if signals.shape[1] > joints and zero.sum() > max(TUNING.jump_window, 0.02 * len(data)):
         runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
         if runs > TUNING.jump_window and zero.sum() < 4 * runs:
