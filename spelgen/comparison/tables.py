@@ -114,7 +114,7 @@ def _ranking(medians: Mapping[str, Numbers], runs: Runs) -> Listing:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error by ``measure``}; None for an error that is not finite."""
+    """Return {model or baseline: median error by ``measure`` over all seeds and splits}; None for an infinite error."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -129,7 +129,11 @@ def _by_error(medians: Numbers) -> Numbers:
 
 
 def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFigures]) -> Listing:
-    """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
+    """Return the table of the losses of the models of a simulated arm, their errors of M, and published figures.
+
+    The losses are squared prediction errors on training and test logs. medians: {measure: {preset: median}}. published:
+    {preset: figures of a publication}.
+    """
     rows, presets = dict(medians), next(iter(medians.values()))
     # Published figures are added as further rows. The cell of a preset that the publication does not evaluate is empty.
     records = {name: published[name].model_dump(exclude_none=True) for name in presets if name in published}

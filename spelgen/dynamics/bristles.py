@@ -36,7 +36,7 @@ class BristleReach:
         return int(self.values.shape[1])
 
     def of_drives(self, joints: np.ndarray) -> np.ndarray:
-        """Return C times ``joints``: drive positions or velocities, from joint positions or velocities (..., n)."""
+        """Return the positions or velocities of the drives, C times ``joints``, the same of the joints, (..., n)."""
         return joints if self.motors is None else joints @ self.motors.T
 
 
