@@ -95,10 +95,10 @@ class _Sentences:
         # The entries of M whose value has no known geometric reason are listed last, after the explained ones.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # A reason has a placeholder for one joint of an entry; its text names the other joint, if necessary
-                # (see `zero_reason`, `balance_reason`). The placeholder is the joint of the column if it is revolute.
-                # If it is prismatic, the text names it already, or does not need it, and the placeholder is the joint
-                # of the row.
+                # The text of a reason may have a placeholder for one joint of the entry (see `zero_reason`,
+                # `balance_reason`). It is replaced by the joint of the column if this joint is revolute. A prismatic
+                # joint of the column is named in the text itself: the placeholder is then replaced by the joint of the
+                # row.
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))

@@ -102,8 +102,7 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield an error for each unknown preset and for each file of an arm that does not exist: (location, error,
-    advice).
+    """Yield (location, error, advice) for each unknown preset and for each file of an arm that does not exist.
 
     The location is the sequence of keys from the root of the YAML file, such as ("arms", "iiwa", "urdf").
     """

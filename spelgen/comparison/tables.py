@@ -114,7 +114,7 @@ def _ranking(medians: Mapping[str, Numbers], runs: Runs) -> Listing:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error by ``measure`` over all seeds and splits}; None for an infinite error."""
+    """Return {model or baseline: median error over seeds and splits}; None for an error that is not finite."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:

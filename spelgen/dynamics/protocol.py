@@ -134,7 +134,7 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the friction arguments z and direction for a call of a method of `dynamics`, after (q, qd, ...).
+    """Return the arguments z and direction of friction, which methods of `dynamics` have after (q, qd, ...).
 
     Only `RigidBodyDynamics` has the argument ``direction``, and it can be passed only after z. The result is therefore
     (z, direction), (z,) for other dynamics or without a direction, and () if z is None or friction has no state.
@@ -142,8 +142,9 @@ def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = No
     Args:
         dynamics: dynamics whose method is called.
         z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
-        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. It is
-            passed for a comparison with low-pass filtered torques, after the same filter. None: computed from qd.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. A
+            comparison with low-pass filtered torques needs the smooth sign after the same filter. None: computed from
+            qd.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()

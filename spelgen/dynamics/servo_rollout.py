@@ -148,9 +148,9 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
-    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. Reason: the force of a bristle increases
-    by strength_k |x| until the bristle slides, and is then constant. It is the smaller of both forces, so an equation
-    with any other set of sliding bristles overestimates the resistance and has a smaller |x|.
+    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. Reason: the force of a bristle is the
+    smaller of its elastic force, which increases with |x|, and its constant sliding force. An equation with any other
+    set of sliding bristles has the larger force for a bristle: it overestimates the resistance, and its |x| is smaller.
 
     Args:
         push: force on the joint, (..., n). In `advanced` it is a momentum, `slope` an inertia and x a velocity.

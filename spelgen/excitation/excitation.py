@@ -60,8 +60,7 @@ class Excitation:
         return "\n\n".join(paragraphs)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the results of the design for JSON, such as the condition number; efforts that are unknown are
-        None."""
+        """Return the results of the design for JSON; an effort (largest torque / limit) that is unknown is None."""
         efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
         return {
             "robot": self.arm.name,

@@ -42,8 +42,8 @@ class EntryPoint:
         inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
             and z, the friction state.
         outputs: {name of a result: unit}.
-            reference: function that returns the expected result, called as reference(PreparedModel, *inputs) with
-                inputs (states, ...); None for a function that only the exported estimator calls.
+        reference: function that returns the expected result, called as reference(PreparedModel, *inputs) with inputs
+            (states, ...); None for a function that only the exported estimator calls.
     """
 
     name: str

@@ -15,8 +15,8 @@ class ChainConfiguration(NamedTuple):
     """Configuration cache of ``BodyChain``: its quantities that depend on q only, in the base frame.
 
     Four point masses represent a rigid body (see ``BodyChain``). Coordinates and velocities of a point
-    mass are multiplied by the square root of its mass. The sum of their squared velocities is then twice
-    the kinetic energy, and the sum of products of two coordinates is a second moment of mass.
+    mass are multiplied by the square root of its mass. The sum of all squared velocities is then twice
+    the kinetic energy, and a sum of products of two coordinates is a second moment of mass.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
@@ -210,8 +210,8 @@ def body_factor(parameters: Tensor) -> Tensor:
     """Return the upper triangular factor T of the pseudo-inertia C T T^T C^T of a body, (..., 4, 4).
 
     C C^T is the initial pseudo-inertia of the body (see ``InertialParameters``). T is diag(s) (1 + U),
-    with the parameters U above the diagonal. From the parameters d_1 ... d_4 on the diagonal, s_i =
-    exp(d_i + d_4 / 2) for i < 4, and s_4 = exp(d_4 / 2).
+    with the elements U of ``parameters`` above the diagonal. From the parameters d_1 ... d_4 on the
+    diagonal, s_i = exp(d_i + d_4 / 2) for i < 4, and s_4 = exp(d_4 / 2).
 
     Args:
         parameters: log-Cholesky parameters as an upper triangular matrix, (..., 4, 4): logarithms of

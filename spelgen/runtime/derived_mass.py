@@ -85,8 +85,7 @@ class ConstantMass(LinearMass):
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n): zero for
-        constant M."""
+        """Return d(1/2 qd^T M qd) / d(encoding of q), (..., 2 n): zeros, because M is constant."""
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
@@ -201,11 +200,10 @@ class DerivedMass(LinearMass):
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the time derivative of the positive definite M' = C + t (M - C), (..., n, n) (see the
-        class).
+        """Return the time derivative of the mass matrix M' of the class, (..., n, n).
 
-        rate: time derivative of the encoding of q, (..., 2 n). intermediates: second result of
-        ``forward``.
+        M' = C + t (M - C) is made positive definite by the factor t. rate: time derivative of the
+        encoding of q, (..., 2 n). intermediates: second result of ``forward``.
         """
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
@@ -275,8 +273,10 @@ class DenseMass(nn.Module):
         self.network = network
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of the network that gives the triangular matrix U and the
-        vector e."""
+        """Return the parameter cache: layers of the network that gives the triangular U and the vector e.
+
+        M is computed from U and e (see the class).
+        """
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
@@ -291,11 +291,10 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lower triangular U without its unit diagonal, (..., 3 n, 3 n), and the vector e,
-        (..., 3 n).
+        """Return U without its diagonal of ones, (..., 3 n, 3 n), and the vector e, (..., 3 n).
 
-        M = (U^-1 A)^T diag(1 / e) U^-1 A is a block of a matrix with three rows per joint (see the
-        class).
+        M is computed from the lower triangular U and from e: it is a block of a matrix with three rows
+        per joint (see the class).
         raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and
         softplus^-1(e).
         """
