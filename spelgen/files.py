@@ -134,7 +134,7 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager that adds the file name `path` to an OSError about this file; other errors are unchanged.
+    """Context manager that sets `path` as the file name of an OSError about this file; other errors are unchanged.
 
     Such an error may have no file name, as on a full disk, or the name of the hidden file that `replacing` writes
     before it is renamed to `path`. It is recognised by a file name that is absent or contains the name of `path`.

@@ -149,7 +149,7 @@ def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFig
 
 
 def _sizes(runs: Runs) -> Listing:
-    """Return a table of the sizes of the models of a simulated arm, and of the time of a training step."""
+    """Return a table of the numbers of outputs, inputs and parameters of models, and of the time of a training step."""
     rows = {}
     for label in next(iter(runs.values()))[0].sizes:
         rows[label] = {name: _combined([run.sizes[label] for run in x], min) for name, x in runs.items()}

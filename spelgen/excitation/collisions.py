@@ -59,8 +59,8 @@ class Collisions:
 
         bounds: position limits of the joints. Pairs that are too close at nearly all random positions within these
         limits are not compared (``ignored``). The limits of prismatic joints also bound the length of the arm, from
-        which the largest displacement of a point of the arm is computed. Raises LookupError if no collision shape of
-        the URDF can be read.
+        which the largest displacement of a point of the arm is computed. Raises LookupError if the URDF has no
+        collision shape that can be read.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)

@@ -38,7 +38,7 @@ class EntryPoint:
     """A function of the model that exports contain, such as inverse_dynamics.
 
     Attributes:
-        about: description.
+        about: description of the result, such as "the torques that give qdd".
         inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
             and z, the friction state.
         outputs: {name of a result: unit}.
@@ -214,7 +214,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     range of positions and velocities. memory: number of values in the friction state z, (states, memory).
     """
     random = np.random.default_rng(0)
-    # Velocities are mostly within the limits: at higher speeds, which logs do not contain, friction is extrapolated.
+    # Most velocities are within the limits, where the model is used: above them, friction is only extrapolated.
     speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*joint.working_range, states) for joint in coordinates], axis=-1)
     return {

@@ -5,9 +5,9 @@ f_j and constant matrices A_k and B_j.
 
 Let W be the span of M(q), and T_i the span of the changes M(q) - M(q') when only joint i moves, each for all q and for
 all inertial parameters or the parameters of the URDF (see `Structure.assume`). U is the sum of all T_i. Every change of
-M is a sum of the B_j, so the minimal number of functions f_j is dim U. The A_k and B_j together span W, so the minimal
-number of constants c_k is dim W - dim U. A linear functional of M depends only on the joints in a set J if and only if
-it vanishes on T_i for every i outside J; this test selects the functionals that define the f_j.
+M is a linear combination of the B_j, so the minimal number of functions f_j is dim U. The A_k and B_j together span W,
+so the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only on the joints in a set J
+if and only if it vanishes on T_i for every i outside J; this test selects the functionals that define the f_j.
 
 All tests compute ranks or zeros of random samples of M and its changes in a prime field (``field``): exact with an
 error probability of about 1e-16, without tolerances.
