@@ -157,5 +157,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor: all without disturbance observer, and the model with one."""
+    """Return True if charts show a predictor. Of predictors with disturbance observer, only the model is shown."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

@@ -85,8 +85,8 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
     columns: texts of each column; column 0 has the names of the rows and is in no group.
     """
-    # Numbers cannot be wrapped. Names of rows are wrapped between words, or else within words, if the table is then
-    # split into fewer parts.
+    # Numbers cannot be wrapped, but names of rows can. There are three forms: not wrapped, wrapped between words, and
+    # wrapped within words. The first form with the smallest number of groups is used.
     names = columns[0][1:]
     forms = (
         names,

@@ -54,12 +54,16 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
+    """Nonzero entries of the input matrix G (n, n) of an arm, joint torques per logged torque, and diagnostics.
 
-    A motor that drives several joints couples them: it has an entry, joint torque per motor torque, for each of its
-    joints. If the logs contain motor torques, these entries are part of G and are stored in ``entries``. If the logs
-    contain joint torques, G is the identity for the driven joints. The entries of coupling motors are then stored in
-    ``couplings``; they are used only for the motor speeds (see `drives`).
+    Motors are coupled if several of them drive the same joints, as in a differential.
+
+    - Logs with motor torques: ``entries`` has the entries of all motors, joint torque per motor torque, and
+      ``couplings`` is empty.
+    - Logs with joint torques: ``entries`` has a 1 on the diagonal of G for each driven joint. ``couplings`` has the
+      joint torques per motor torque of coupled motors, which determine only the motor speeds (see `drives`).
+
+    joints: number n of joints.
     """
 
     joints: int
@@ -127,8 +131,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Joints that are driven by several motors are omitted here: their entries of G, which include the gear ratios, are
-    # in `couplings`.
+    # Joints of coupled motors are omitted here: their entries of G, which include the gear ratios, are in `couplings`.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)

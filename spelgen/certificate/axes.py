@@ -100,11 +100,11 @@ class Axes:
     def keep_offset(self, slider: int, hinge: int) -> bool:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
-        ``hinge`` and is parallel to the axis of ``slider``. If the relation is true, the entry of M in the row of
-        ``slider`` and the column of ``hinge`` is constant. Reason: if only ``hinge`` rotates, the velocity of a point
-        along ``slider`` is proportional to the signed distance of the point from the plane. If the two axes are
-        parallel, this velocity is zero for any such plane.
+        The plane contains the axis of the revolute joint ``hinge``, which is nearer to the root; it is parallel to the
+        axis of ``slider`` and moves with the child link of ``hinge``. Let d be the signed distance of a point from the
+        plane, and a the angle between both axes. If only ``hinge`` moves, at 1 rad/s, the velocity of the point along
+        ``slider`` is d sin(a). The entry (slider, hinge) of M is the sum of mass times d sin(a) over these points: it
+        is constant if all d are constant, and zero for parallel axes.
         """
         # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
         # any plane that is fixed to the child link of `hinge`.

@@ -252,9 +252,9 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # These formulas need to be valid only for the inertials of the URDF. A monomial may occur with several base
-        # parameters. If the sum of coefficient times URDF value over the base parameters is zero, the monomial is
-        # removed.
+        # These formulas need to be valid only for the inertials of the URDF. The same monomial may occur with several
+        # base parameters. If its terms (coefficient times the URDF value of the base parameter) add up to zero, the
+        # monomial does not affect M or V and is removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

@@ -163,7 +163,7 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return a text for users about the input matrix G, the position servos and the passive joints of the model."""
+        """Return a text for users: entries of the input matrix G, servos, coupled motors and joints without a drive."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]

@@ -182,12 +182,14 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 
 
 def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the values of the two compared quantities for the B moving bodies of an arm at S positions q, (S, n).
+    """Return two quantities by which Pinocchio's and spelgen's model of an arm are compared, at S positions q, (S, n).
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
-    (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
-    column. The diagonal entries of M are doubled (upper triangle plus its transpose). This has no effect, because each
-    entry is compared relative to its own magnitude.
+    (S, B, B + 1): M of the joints of the B moving bodies, which are the n coordinates and the mimic joints as
+    independent joints; the last column is the gravity torque. The diagonal entries of M are doubled in both models,
+    which has no effect: each entry is compared relative to its own magnitude.
+
+    dynamics: one of the two models. arm: chain with the names of the bodies.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]

@@ -243,8 +243,8 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         # divided by the sum of |weight| times scale over the entries, because rounding errors are proportional to this
         # sum.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # A term may change if one of its own joints moves; the minimal form is wrong only if another joint changes the
-        # term.
+        # A term may change if one of its own joints, `term.joints`, moves: these changes are replaced by zero. The
+        # minimal form is correct only if all other changes are zero up to rounding errors.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
@@ -271,8 +271,8 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # For each k, as many outputs as possible do not depend on the first k joints. The rank of a matrix shows for each k
-    # that the derivation has found the largest possible number.
+    # In the minimal form, the number of outputs that do not depend on the first k joints is the largest possible one,
+    # for each k. The ranks below prove this.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)

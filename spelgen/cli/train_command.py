@@ -183,7 +183,8 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     progress = fit.checkpoint
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
+    # Only fits with the rollout objective have epochs, whose number is printed below. For other fits, the result is
+    # replaced by the summary of a servo fit or, without validation windows, by the number of steps.
     if not isinstance(config, Rollout):
         from spelgen.fitting.servo.report import servo_summary
 

@@ -102,7 +102,10 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield (location in the YAML file, error, advice) for each unknown preset and for each absent file."""
+    """Yield (location, error, advice) for each unknown preset and for each file of an arm that does not exist.
+
+    The location is the sequence of keys from the root of the YAML file, such as ("arms", "iiwa", "urdf").
+    """
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in PRESET_NAMES and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)

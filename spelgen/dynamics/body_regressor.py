@@ -67,9 +67,9 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4), with T' the time
-    # derivative of its homogeneous transform T. `chain.forward` returns T times four given points; the columns of the
-    # identity as points give T itself.
+    # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4). T is the homogeneous
+    # transform of the body, T' its time derivative. `chain.forward` returns T times four given points: T itself if the
+    # points are the columns of the identity. `rises` is T'' minus the acceleration of gravity.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))

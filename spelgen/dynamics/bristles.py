@@ -36,7 +36,11 @@ class BristleReach:
         return int(self.values.shape[1])
 
     def of_drives(self, joints: np.ndarray) -> np.ndarray:
-        """Return C times ``joints``: drive positions or velocities, from joint positions or velocities (..., n)."""
+        """Return the positions of the drives, (..., n), from the positions ``joints`` of the joints, (..., n) [rad, m].
+
+        They are C times ``joints``, with the matrix C = `motors`. Velocities of the drives are computed from joint
+        velocities in the same way.
+        """
         return joints if self.motors is None else joints @ self.motors.T
 
 

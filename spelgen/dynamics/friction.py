@@ -141,7 +141,8 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
-        # Power is equal on both sides of the gears, so the torque of drive j acts on joint i with the factor C_ji.
+        # C is `motors`. The velocities of the drives are C qd, and power is equal on both sides of the gears: the
+        # torque of drive j acts on joint i with the factor C_ji.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 

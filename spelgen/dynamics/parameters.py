@@ -137,8 +137,9 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the torque of the residual terms of a model, (..., n) [Nm, N]; zeros for a model without them.
 
-    These terms are added to the mass matrix M and the potential energy V. q, qd, qdd: positions [rad, m], velocities
-    [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
+    It is the contribution of R(q), which is added to the mass matrix M, and of all terms that are added to the
+    potential energy V, including splines and torque ripple. The factor of friction is not included. q, qd, qdd:
+    positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)

@@ -61,7 +61,10 @@ class FrictionState(Protocol):
         """Number of bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, elements) [rad, m], after a long motion at constant qd, (..., n) [rad/s, m/s]."""
+        """Return the friction state z after a long motion at constant velocities qd, (..., n) [rad/s, m/s].
+
+        z: deflections of the bristles of each joint, (..., n, elements) [rad, m].
+        """
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state, (..., n, elements), after a displacement of the joints, (..., n) [rad, m].
@@ -131,16 +134,17 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the friction arguments for a call of a method of `dynamics`, which follow the arguments (q, qd, ...).
+    """Return the arguments z and direction of friction, which methods of `dynamics` have after (q, qd, ...).
 
-    The result is () if z is None or friction has no state; `direction` is then ignored, since it can be passed only
-    after z. The result is (z, direction) for a `RigidBodyDynamics` and a given direction, otherwise (z,).
+    Only `RigidBodyDynamics` has the argument ``direction``, and it can be passed only after z. The result is therefore
+    (z, direction), (z,) for other dynamics or without a direction, and () if z is None or friction has no state.
 
     Args:
         dynamics: dynamics whose method is called.
         z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
-        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles; None:
-            computed from qd. A comparison with low-pass filtered torques needs the smooth sign after the same filter.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. A
+            comparison with low-pass filtered torques needs the smooth sign after the same filter. None: computed from
+            qd.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()

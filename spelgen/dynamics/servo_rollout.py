@@ -128,7 +128,9 @@ def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
         # The inertia couples the joints, so the sliding bristles of one joint depend on the motion of all joints. The
-        # mean velocity of the step is found by fixed-point iteration; two iterations suffice.
+        # mean velocity of the step is found by two fixed-point iterations. Each iteration solves the coupled equations
+        # with the bristles as linear springs: `rise` is their change of force, and `secant` is `rise` divided by the
+        # velocity.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -146,9 +148,9 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
-    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. The reason: a bristle resists with the
-    smaller of its elastic and its sliding force. The valid equation therefore has the smallest resistance, and its |x|
-    is the largest.
+    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. Reason: the force of a bristle is the
+    smaller of its elastic force, which increases with |x|, and its constant sliding force. An equation with any other
+    set of sliding bristles has the larger force for a bristle: it overestimates the resistance, and its |x| is smaller.
 
     Args:
         push: force on the joint, (..., n). In `advanced` it is a momentum, `slope` an inertia and x a velocity.

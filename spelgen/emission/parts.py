@@ -47,8 +47,9 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 class NetworkTuning:
     """Constants of untrained networks: numbers of hidden units, and the scale of inputs."""
 
-    # [1] Factor of the encoded positions, inputs of friction networks. It is below one, so that an untrained network
-    # depends less on positions than on velocities. The velocities are divided by typical speeds.
+    # [1] Factor of the inputs of friction networks that encode positions, such as cos q and sin q. The other inputs are
+    # velocities, divided by typical speeds. The factor is below one, so that an untrained network depends less on
+    # positions than on velocities.
     position_sensitivity: float = 0.1
     # [1] Number of hidden units per joint of the friction networks.
     friction_units: int = 8
@@ -87,7 +88,7 @@ class ModelParts:
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
-    """Return the tables and the constructor call of the model that ``spec`` describes."""
+    """Return the tables (joints, links, functions, constants) and the constructor call of the model of ``spec``."""
     rows = {"JOINTS": tuple(map(_joint, spec.joints))}
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)

@@ -41,8 +41,9 @@ from spelgen.structure.structure import Structure, derive
 class ModelTuning:
     """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
 
-    # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
-    # positions. Both are generalised eigenvalues with respect to the mean of the nominal M over these positions.
+    # [1] Lower bound of the generalised eigenvalues of a trained M, divided by the smallest generalised eigenvalue of
+    # the nominal M at random positions. A generalised eigenvalue x of M solves M v = x M0 v, with the mean M0 of the
+    # nominal M over these positions.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -168,7 +169,8 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     """Return the rows of the matrix C, for which C qd are the motor velocities; () if C is the identity."""
     speeds = actuation.drives().speeds
-    # The motors of most arms are not coupled: C is the identity, and the module has no matrix.
+    # Most arms have no coupled motors: C, the motor velocities per joint velocity, is the identity and is omitted from
+    # the module.
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
     return tuple(map(tuple, speeds.tolist()))
@@ -266,8 +268,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # A second moment below `min_second_moment` times the largest is raised, too: rounding to `inertia_digits` digits
-    # could make the body physically inconsistent.
+    # A consistent body is also changed if a second moment is below `min_second_moment` times the largest: rounding to
+    # `inertia_digits` digits could make the body physically inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten

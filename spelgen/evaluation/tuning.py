@@ -37,7 +37,7 @@ class EvaluationTuning:
     # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
     # assessment recommends rough simulation.
     rough_prediction: float = 0.3
-    # [rad, m] Logs in which no joint has a larger range of positions contain no motion.
+    # [rad, m] Logs contain no motion if the range of positions of each joint is below this number.
     smallest_motion: float = 0.01
     # [1] Logs that cover less than this fraction of a joint's range are reported as narrow.
     narrow_range: float = 0.5

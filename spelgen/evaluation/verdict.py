@@ -172,9 +172,10 @@ def _relative(errors: StateErrors | None) -> float:
 def _better_baselines(results: Results, good_torques: bool) -> list[str]:
     """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
 
-    Constant velocity has a sentence of its own: at the horizons at which it predicts better than the model, the model
-    is recommended for torques only, if ``good_torques`` is True (torque errors small enough for a use). A second
-    sentence lists all other baselines with the horizons, or "in torque".
+    1. A sentence lists the horizons at which the baseline of constant velocity predicts better than the model. If
+       ``good_torques`` is True (torque errors small enough for a use), it recommends the model for torques only at
+       these horizons.
+    2. A sentence lists the best other baselines that are better than the model, with their horizons, or "in torque".
     """
     times = []
     better: dict[str, list[str]] = {}

@@ -55,11 +55,12 @@ class Collisions:
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
-        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
+        """Add the collision shapes of all objects, and select the pairs of objects whose distances are computed.
 
-        bounds: position limits of the joints. The pairs in ``ignored`` are determined at random positions within these
-        limits. The limits of prismatic joints also bound the length of the arm, from which the largest displacement of
-        a point of the arm is computed.
+        bounds: position limits of the joints. Pairs that are too close at nearly all random positions within these
+        limits are not compared (``ignored``). The limits of prismatic joints also bound the length of the arm, from
+        which the largest displacement of a point of the arm is computed. Raises LookupError if the URDF has no
+        collision shape that can be read.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
@@ -118,12 +119,12 @@ class Collisions:
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first distance of a motion that is below the clearance; None if there is none.
+        """Return the first contact of a motion, a distance below the clearance; None if there is none.
 
-        Distances are computed at selected positions of the motion. They are so close that, between two successive
-        selected positions, each point of the arm moves by at most 1.5 clearances relative to any object. In between, a
-        distance is therefore at most 0.75 clearances smaller than at the nearer selected position. If all computed
-        distances are at least the clearance, there is no collision.
+        Distances are computed at selected positions of the motion. Between two successive selected positions, each
+        point of the arm moves by at most 1.5 clearances relative to any object. In between, a distance is therefore at
+        most 0.75 clearances smaller than at the nearer selected position. If all computed distances are at least the
+        clearance, there is no collision.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])

@@ -43,7 +43,7 @@ class ExcitationTuning:
     collision_penalty: float = 0.1
     # [1] Largest number of designs, each with another seed and a smaller range, until one has no contact.
     attempts: int = 5
-    # [1] Factor by which the position range is reduced for each further design.
+    # [1] After a design with a contact, the range of positions of the next design is multiplied by this factor.
     range_factor: float = 0.85
 
 

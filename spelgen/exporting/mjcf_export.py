@@ -111,8 +111,8 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         controls: inputs of the actuators, (states, n).
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off: the reference of `check_mjcf` has neither, since MuJoCo's friction
-    # model differs from the model's.
+    # Limits of joint torques and friction are switched off in MuJoCo. The reference of `check_mjcf` has no friction,
+    # since MuJoCo's friction model differs from the model's. Its only torque limits are the limits of the servos.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0

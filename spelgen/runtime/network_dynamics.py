@@ -245,14 +245,16 @@ class DenseFriction(NetworkFriction):
         # row-major order, to the matrix L.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
-        # The initial L is diagonal, in units of the square root of typical friction / typical speed.
+        # L is a factor of the dissipation matrix D = L L^T. Its initial value is 0.35 times the identity,
+        # in units of the square root of typical friction / typical speed.
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
         """Return the parameter cache: layers of a network whose outputs are n rows of L in D = L L^T.
 
-        Each joint has ``axes`` rows in L (see the class), of which D needs only the last one. A row has n
-        * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
+        L has ``axes`` rows per joint, one per axis of the joint frame, but a joint moves only about or
+        along the last axis: the other rows do not affect D, (n, n), and are not computed. A row has n *
+        axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)

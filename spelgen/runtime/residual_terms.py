@@ -19,8 +19,9 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of cubic B-splines over the range of a joint, for its torque term and its friction factor.
 SPLINES = 34
-# Number of harmonics of the joint's revolution in the torque ripple. For a gear ratio above this number,
-# the first two harmonics of the motor's revolution are added, which represent errors of gear and motor.
+# Number of harmonics of the joint's revolution in the torque ripple of a joint with a gear ratio above
+# this number. The first two harmonics of the motor's revolution are added, which represent errors of gear
+# and motor. With a smaller gear ratio, they are replaced by two more harmonics of the joint's revolution.
 HARMONICS = 64
 # Largest magnitude of the logarithm of the friction factor, so that the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
@@ -121,8 +122,8 @@ class ResidualTerms(nn.Module):
         # no influence on the minima.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
         # R may reduce the armature by at most 90 %. A term is a function or constant times its
-        # coefficient. Each term may reduce the armature by the fraction `part`: 0.9 / largest number of
-        # terms in a row of R.
+        # coefficient. Each term may reduce the armature by the fraction `part`, which is 0.9 divided by
+        # the largest number of terms in a row of R.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
@@ -137,15 +138,17 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). The bound of a
-        function or constant with the coefficients k_ij in R_ij is part * min_ij sqrt(d_i d_j) / |k_ij|,
-        with ``part`` = 0.9 / (largest number of terms in a row of R) and d_i = 1 / (sum of row i of
-        |A^-1|). A + R is positive definite if no function or constant exceeds its bound.
+        R is the residual term of M: R_ij = sum_k c_ijk x_k, with the functions and constants x_k and
+        their coefficients c_ijk. A + R is positive definite if no |x_k| exceeds its bound
 
-        Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
-        dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
-        sqrt(d_i d_j) are less than one. The second matrix, scaled to a unit diagonal, is therefore strictly
-        diagonally dominant.
+            |x_k| <= part * min_ij sqrt(d_i d_j) / |c_ijk|,    1 / d_i = sum_j |A^-1|_ij,
+
+        where ``part`` = 0.9 / (largest number of terms in a row of R).
+
+        Proof: A + R = (A - D) + (D + R) with D = diag(d). D^-1 - A^-1 is diagonally dominant, so D^-1 >=
+        A^-1 and A - D >= 0. The bounds give sum_j |R_ij| / sqrt(d_i d_j) <= 0.9 for each row i: D^(-1/2)
+        (D + R) D^(-1/2), which is the identity plus a matrix with these row sums, is strictly diagonally
+        dominant, and D + R > 0.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.

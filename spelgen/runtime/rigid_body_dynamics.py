@@ -129,7 +129,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Coefficient k, (n,) [Nm s/rad, N s/m]: drives add the torque k qd to the measured torque."""
+        """Coefficient k, (n,) [Nm s/rad, N s/m]: drives apply k qd in addition to the measured torque."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
@@ -211,11 +211,12 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K) [rad, m], after a long motion at constant qd, (..., n).
+        """Return the friction state z, (..., n, K) [rad, m], after a long motion at constant qd.
 
-        It is the initial z of simulations if the past motion is unknown. Friction with this z exceeds
-        friction without a state by at most 7.4 % of dry friction: the maximum of tanh x - x / sqrt(1 +
-        x^2), at x = qd / smoothing velocity = 1.6. The difference vanishes at high velocities.
+        qd: joint velocities, (..., n) [rad/s, m/s]. z is the break-away displacement times tanh(x), with
+        x = motor velocity / smoothing velocity. It is the initial z of simulations if the past motion is
+        unknown. Friction without a state has the factor x / sqrt(1 + x^2) in place of tanh(x). The
+        difference is at most 7.4 % of dry friction, at x = 1.6, and vanishes at high velocities.
         """
         # z is tanh(qd / smoothing velocity) times the break-away displacement: tanh reaches 1 at a few times
         # the smoothing velocity. The smooth sign of ``FrictionConstants.torque`` reaches 1 slowly: with it, z

@@ -63,7 +63,7 @@ class Link(NamedTuple):
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # displacement about or along the joint axis at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of `joint`
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: as the joint `joint`
 
 
 class Function(NamedTuple):

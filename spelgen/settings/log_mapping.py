@@ -73,7 +73,8 @@ def _scaled(value: object, validate: Callable[[object], str], info: ValidationIn
     if not match or (match[1] and not float(match[1])):
         return validate(value)
     factor, name = match[1].strip(), match[2]
-    # "grad" is a degree in German, and 0.9 degrees in English: drafts are tested, but a mapping must be unambiguous.
+    # "grad" is a degree in German, and 0.9 degrees in English. A mapping must be unambiguous, so it is an unknown unit
+    # here. Drafts of mappings, which are tested with the logs, may read it as degrees.
     plain = "" if name.lower().startswith("grad") else plain_unit(name)
     multiple, _, unit = (mapped_unit(str(info.field_name), plain) or "").rpartition(" ")
     if factor and multiple:
@@ -97,7 +98,8 @@ Decoding = Literal["period", "sign_bit"]
 def plain_unit(text: str) -> str:
     """Return a unit as written in a log, in lower case, without brackets and signs of products.
 
-    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm", and so is "N·m x1000".
+    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm". In "N·m x1000", the logged
+    values are torques in N·m multiplied by 1000: the unit is also "0.001 nm".
     """
     unit = text.strip(" []()").lower().replace("\u00d7", "x")
     number = r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
@@ -455,7 +457,7 @@ class LogMapping(Group):
         return float(factor or 1), unit or None
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit, without factor, of a logged quantity of a joint; None if the settings contain none."""
+        """Return the unit of a logged quantity of a joint, "deg" for the setting "0.01 deg"; None if it is not set."""
         return self._unit(quantity, joint)[1]
 
     @property

@@ -107,7 +107,8 @@ class Unusable:
 
     def __getattr__(self, name: str) -> NoReturn:
         # copy and pickle test whether attributes such as `__deepcopy__` exist, and expect AttributeError if they do
-        # not. pydantic reads the values of a group through its attributes `__pydantic...`: this raises the errors.
+        # not. pydantic reads the attributes `__pydantic...` of a group to read its values: like any other read, this
+        # raises the errors of the settings.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)

@@ -252,9 +252,10 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _groups_with(group: type[BaseModel], location: Location) -> list[str]:
-    """Return the nearest groups that have the last key of a location, such as "under 'logs'"; [] if nowhere.
+    """Return texts that name the groups which have the last key of a location, such as "under 'logs'"; [] if none has.
 
-    group: class of the root of the document.
+    The group at the location and its inner groups are searched first, then the groups that contain it, up to the root.
+    Of the groups found, only the groups with the shortest path are returned. group: class of the document's root.
     """
     paths: list[Location] = []
     level = len(location)

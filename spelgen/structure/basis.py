@@ -1,14 +1,15 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-A_k and B_j are constant matrices, c_k constants and f_j functions of q. Each f_j is a linear functional of M: a
-weighted sum of the entries of M. A functional depends only on the joints in a set J if and only if it vanishes on all
-changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
-all changes.
+A_k and B_j are constant matrices, c_k constants and f_j functions of q. U is the span of all changes M(q) - M(q'). Each
+f_j is a linear functional of M: a weighted sum of the entries of M. A functional depends only on the joints in a set J
+if and only if it vanishes on all changes of M caused by joints outside J. Together, the f_j must determine every change
+in U.
 
-The f_j are selected greedily. The sets J are sorted in two steps. The first criterion is their joint closest to the
-root: sets with only joints at the tip are tried first. The second criterion is their size, small sets first. For each
-set, single entries of M are tried before sums of entries. The sets of functionals that are linearly independent on U
-form a matroid, for which the greedy selection is optimal.
+The f_j are selected greedily from functionals that depend only on a set J of joints, for one set after another. Sets
+without joints near the root are first; of the sets with the same joint closest to the root, small sets are first. For
+three joints, the order is {3}, {2}, {2, 3}, {1}, {1, 2}, {1, 3}, {1, 2, 3}. For each set, single entries of M are tried
+before sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
+selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -150,9 +151,9 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
     """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
 
-    A set is sorted first by its joint closest to the root: joints near the tip come first. Sets with the same joint
-    closest to the root are sorted by size, small sets first (see the module). spans: samples of M and the spans of its
-    changes.
+    Sets without joints near the root are first; of the sets with the same joint closest to the root, small sets are
+    first. For three joints, the order is {3}, {2}, {2, 3}, {1}, {1, 2}, {1, 3}, {1, 2, 3}. spans: samples of M and the
+    spans of its changes.
     """
     # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
     all_subsets_up_to = 8
@@ -171,15 +172,14 @@ def _candidates(
 
     f_j is a function in the minimal form of M (see the module). A candidate is a weighted sum of the entries of M,
     which varies only with the positions of ``joints``. It is given by its weights, (entries,), in the prime field and
-    in double precision. Sums of few entries are first.
+    in double precision. A sum is M_e - sum_b w_b M_b, with an entry e outside `bound` and entries b in `bound`, whose
+    weights w_b cancel the changes of M_e by all other joints. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the candidates may depend on.
-        kernel: (m, entries), weights of a basis of all sums that do not change if other joints move. Each row has the
-            coefficient 1 for one entry of M that is not in `bound`; its other nonzero coefficients belong to entries in
-            `bound`.
-        bound: indices of the entries of M that are pivots of an echelon basis of the changes by other joints.
+        kernel: (m, entries), weights in the prime field of all these sums, one row per entry e outside `bound`.
+        bound: indices of entries of M whose changes by the other joints determine these changes of all entries.
         tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """
@@ -206,10 +206,10 @@ def _candidates(
 
 
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
+    """Return the weights with which a weighted sum of all entries of M is the entry ``index``: 1 at ``index``, else 0.
 
-    The first array has elements of the prime field, the second one the same numbers in double precision. The rows and
-    columns of the entries are ``spans.keys``.
+    The result is two arrays, (entries,): the weights as elements of the prime field, for exact ranks, and as floats.
+    The row and column of each entry are ``spans.keys``.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1

@@ -57,7 +57,10 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return the `Nominal` of an arm over random positions; ``structure`` has the terms f_j B_j and c_k A_k of M."""
+    """Return typical magnitudes of M, V and torques over random positions of an arm, by which models are scaled.
+
+    structure: has the varying terms f_j B_j and the constant terms c_k A_k of M.
+    """
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]

@@ -206,7 +206,7 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
     # 1. This takes fewer products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # The complex number (x + i y)^2 has twice the angle of x + i y.
+        # The square of the complex number x + i y has twice its angle: (x + i y)^2 = x^2 - y^2 + 2 i x y.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -255,10 +255,10 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 
 def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return the inertia of a body, displaced by its joint, about the fixed axes of the joint's frame at q = 0.
+    """Return the inertia of a body that its joint has displaced, expressed in the joint frame at q = 0, which is fixed.
 
-    inertia: inertia of the body in the frame that moves with it. transform: rotation about z, or translation along z,
-    from the moving frame to the frame at q = 0.
+    inertia: inertia of the body in the frame that moves with it. transform: pose of this moving frame in the fixed
+    frame, a rotation about z or a translation along z.
     """
     s, c, _ = transform.rotation[1]
     # An integer c indicates a prismatic joint: its rotation is the identity, with integers, so no rotation is needed.

@@ -153,7 +153,9 @@ class Spans:
         change_bases: Echelon basis of each T_i, (dim T_i, entries), with the entries in the order ``order``.
         varying: Basis of U, (dim U, entries).
         floats: Samples of M in double precision, (1 + n, 2 S, entries): in block 1 + k, only coordinate k differs from
-            block 0. They determine the values of nonzero coefficients.
+            block 0. The prime field determines the entries with nonzero weights in the minimal form of M; a
+            least-squares fit to these samples determines the weights as floats. 2 S samples give the fit a better
+            condition than S.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -186,8 +188,9 @@ class Spans:
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return an echelon basis of the changes of M if joints other than ``joints`` move, (dimension, entries).
 
-        It is a basis, in the prime field, of the sum of the spans T_i (see the class) of these other joints i. The
-        columns are the entries of M in the order of the attribute ``order``.
+        T_i is the span of all changes M(q) - M(q') if only joint i moves. The result is a basis, in the prime field, of
+        the sum of T_i over all joints i that are not in ``joints``. The columns are the entries of M in the order of
+        the attribute ``order``.
         """
         others = [basis for k, basis in enumerate(self.change_bases) if k not in joints]
         return field.row_basis(np.concatenate([self.varying[:0], *others]))

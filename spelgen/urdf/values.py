@@ -118,7 +118,11 @@ class Element:
         return child
 
     def _find_ignored(self, tag: str, parent: etree._Element) -> None:
-        """Add errors for content that would be ignored: a misspelt element ``tag`` in ``parent``, or content in it."""
+        """Add errors for content that would be ignored.
+
+        If the element ``tag`` is absent, this is a misspelt element in ``parent``. If it is present, this is text or
+        elements inside it, and its misspelt attributes.
+        """
         if self.xml is None:
             for sibling in parent.iterchildren(etree.Element):
                 name = etree.QName(sibling).localname
