@@ -72,7 +72,8 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
 @pytest.mark.parametrize(
     ("transmissions", "sidecar", "expected"),
     [
-        # torques at the joints: gears have no effect, and G is the identity
+        # by default, logged torques are joint torques: gears have no effect, and G is the identity, except that
+        # the diagonal entry of a passive joint is zero
         (WRIST, "", {(i, i): ("fixed", 1.0) for i in (1, 2, 3)}),
         (WRIST, "joints: {roll: {actuated: false}}", {(i, i): ("fixed", 1.0) for i in (1, 2)}),
         (
@@ -86,7 +87,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
                 (3, 3): ("coupled", -60.0),
             },
         ),
-        # the settings file has precedence over the URDF; gains that neither states are trained
+        # the coupling in the settings has precedence over the URDF's; j1 has a gear in neither: its gain is trained
         (
             WRIST[1:],
             COUPLED,

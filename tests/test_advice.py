@@ -103,7 +103,7 @@ def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("turn", [2 * np.pi, -2 * np.pi])
 def test_offset_of_angles_of_another_turn(arm, turn):
-    """Angles that are logged one turn beyond the limits of a joint are right after the advised offset."""
+    """If angles are logged one revolution beyond the limits of a joint, the advised offset corrects them."""
 
     def within_limits(arm, rng):
         t, q = pick_and_place(arm, rng)
@@ -118,7 +118,7 @@ def test_offset_of_angles_of_another_turn(arm, turn):
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_angles_beyond_both_limits_are_of_no_other_turn(arm):
-    """If a joint moves by more than its range, no offset corrects it, and the message advises none."""
+    """If the angles of a joint span more than its range, no offset shifts all of them into it, and none is advised."""
 
     def wide(arm, rng):
         t, q = pick_and_place(arm, rng)

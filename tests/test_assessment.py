@@ -1,4 +1,4 @@
-"""Each sentence of the assessment in a report agrees with the figures of the evaluation."""
+"""Each sentence of the assessment in a report agrees with the numbers of the evaluation (relative errors, nMSE)."""
 
 from dataclasses import replace
 
@@ -169,7 +169,7 @@ def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     still = "velocity stays constant"
     better = "A constant velocity predicts better 1 s ahead: there, use the model for torques only."
     assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
-    # A torque nMSE of 0.4 is too large for torques, too: no use is recommended in place of the prediction.
+    # With a torque nMSE of 0.4, torques are not accurate either: "use the model for torques only" is omitted.
     assert "better 1 s ahead. " in f"{verdict(evaluation(0.9, 0.4, **{still: 0.6})).because} "
     held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
     assert "A constant velocity" not in verdict(held).because

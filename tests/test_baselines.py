@@ -1,4 +1,4 @@
-"""Baselines are integrated with steps of their own, identified from the same logs, and kept with a run."""
+"""Baselines are identified from the training logs, saved in the run folder, and integrated with accurate steps."""
 
 import hashlib
 import json
@@ -50,7 +50,7 @@ class Slider:
 
 
 class Bristled(Slider):
-    """A slider with hysteretic friction whose stiffness at rest is 2000 N/m on 1 g, and a damping rate of 5000 1/s."""
+    """A slider with hysteretic friction: a bristle of 2 N that breaks away at 1 mm, which is 2000 N/m at rest."""
 
     elements, reach, force = 1, torch.tensor([[1e-3]], dtype=torch.float64), 2.0
 

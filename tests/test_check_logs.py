@@ -45,7 +45,10 @@ def arm(loaded):
 
 @pytest.fixture(scope="module")
 def log(arm) -> Trajectory:
-    """Return a log of 20 s of smooth motion at 100 Hz within the limits, with the URDF's torques and friction."""
+    """Return a log of 20 s of smooth motion within the limits, at 100 Hz with a jitter of the times.
+
+    Its torques are torques of the URDF's rigid bodies plus viscous and dry friction.
+    """
     random = np.random.default_rng(0)
     t = np.cumsum(0.01 * (1 + 0.1 * random.uniform(-1, 1, 2000)))
     middle, width, speed = np.array([0.0, 0.8, 0.2]), np.array([0.5, 0.2, 0.8]), np.array([0.5, 0.7, 1.1])
@@ -97,7 +100,7 @@ def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
 
 @pytest.fixture(scope="module")
 def loaded_joint(loaded, log) -> int:
-    """Return the index of the joint with the largest gravity torques; one check of the log serves all tests."""
+    """Return the index of the joint with the largest gravity torques. The log is checked once per test module."""
     joints = check_logs([log], loaded).joints
     return max(range(3), key=lambda k: joints[k].gravity.relative_deviation or 0)
 
@@ -378,7 +381,8 @@ def test_logs_of_real_arms_have_no_errors(shared):
 def test_a_payload_is_not_another_unit_of_torques(shared, name):
     """The gravity torque of a payload is not mistaken for another unit of the torques.
 
-    At wrist 2 it is 36 times the gravity torque of the URDF's wrist. The load may be named as a part of the last link.
+    At wrist 2 it is 36 times the gravity torque of the URDF's wrist. The only finding allowed is the warning
+    `urdf-inertials`, which advises to add the load to the last link.
     """
     folder = shared / "logs" / "ur10e"
     real = load_arm(folder / "ur10e.urdf")
@@ -536,8 +540,8 @@ def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
 def test_seconds_of_recorded_logs_show_a_coupling(shared):
     """The coupling of the TX40's wrist is found in the first 5.4 s of its log.
 
-    The coupling lowers the squared torque residual in each of ten blocks of the log: a thousand times in one, three
-    times in the others.
+    The coupling lowers the squared torque residual in each of ten blocks of the 5.4 s: by a factor of 1000 in one
+    block, and of 3 to 20 in the others.
     """
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)
@@ -547,7 +551,10 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
 
 @pytest.mark.parametrize("name", ["ga_N12T25", "ga_N12T25_again", "opt"])
 def test_degrees_of_a_recorded_arm_with_coarse_encoders_are_one_error(shared, name):
-    """In degrees, the steps of coarse encoders exceed thresholds in rad, and yet no signal is reported as frozen."""
+    """If angles of coarse encoders are logged in degrees, the only error is the unit: no signal is reported as frozen.
+
+    In degrees, the steps of the encoders exceed thresholds in rad.
+    """
     folder = shared / "logs" / "airbot"
     airbot = load_arm(folder / "airbot.urdf")
     (log,) = read_logs([folder / f"{name}.parquet"], airbot)

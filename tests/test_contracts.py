@@ -31,7 +31,7 @@ LARGE = {
     "phnode": None,
     "phnode-kan": None,
     "closed-form": 1.5,
-}  # largest scale of parameters: at 3.0 phnode would invert an ill-conditioned matrix
+}  # standard deviation of large parameters; default: 3.0, for which phnode would invert an ill-conditioned matrix
 
 each_case = pytest.mark.parametrize(
     ("variant", "robot"),
@@ -63,7 +63,10 @@ def module_of(tmp_path_factory):
 
 @pytest.fixture
 def random_model(module_of):
-    """Return a model of a variant and a robot with random parameters of this standard deviation."""
+    """Return a function (variant, robot, seed, deviation) that returns a model with random parameters.
+
+    deviation: standard deviation of the parameters; None: see `randomise`.
+    """
 
     def model(variant, robot, seed, deviation=None):
         made = module_of(variant, robot).Model(seed=seed)

@@ -45,7 +45,7 @@ SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])
 
 @pytest.fixture(scope="module")
 def wrist(tmp_path_factory):
-    """Return a module and the loaded arm: six joints, with a differential at the last two."""
+    """Return an emitted module and its arm of six joints; a differential couples the motors of the last two."""
     folder = tmp_path_factory.mktemp("wrist")
     names = [f"j{k}" for k in range(1, 7)]
     shutil.copy(ROBOTS / "six_dof.urdf", folder / "arm.urdf")
@@ -59,7 +59,7 @@ def wrist(tmp_path_factory):
 
 
 def moved(model, seconds, seed=0):
-    """Return q, qd, qdd and torque of a smooth motion: rigid bodies, and friction and rotors at the motors."""
+    """Return q, qd and qdd, (T, 6) each, of a random motion at 100 Hz: sums of four sines. `model` is not used."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 0.01)[:, None, None]
     speed, phase, size = (rng.uniform(*x, (4, 6)) for x in ((0.7, 4.0), (0.0, 6.3), (0.2, 0.5)))
     q, qd, qdd = ((size * speed**k * np.sin(speed * t + phase + k * np.pi / 2)).sum(axis=1) for k in range(3))

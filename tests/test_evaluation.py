@@ -1,4 +1,4 @@
-"""Errors of an evaluation equal the errors of exact solutions, baselines are exact, and results are valid JSON."""
+"""Evaluation: the true model has no error, baselines equal dynamics derived by hand, and results are valid JSON."""
 
 import json
 import re
@@ -168,7 +168,7 @@ def motions(model, count=4, samples=25, rate=20.0, seed=0) -> list[Trajectory]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    """Return the folder of a run whose trained model is the one that made the logs."""
+    """Return a run folder. Its model also made the logs, and a learning rate of 1e-12 hardly changes the model."""
     folder = tmp_path_factory.mktemp("run")
     module = write_module(folder)
     model = load_module(module)
@@ -488,6 +488,6 @@ def test_a_diverged_predictor_keeps_its_column():
 
 
 def test_a_column_without_a_star_ends_with_its_digits():
-    """Blanks that align the digits with starred numbers are only in columns with a star."""
+    """Only columns with a star get trailing blanks, which align digits: `model` has starred numbers, `URDF` none."""
     shown = table("errors", {"a": {"model": 1.0, "URDF": 2.0}, "b": {"model": 3.0, "URDF": 4.0}})
     assert shown.head == ("", "model  ", "URDF") and shown.rows == (("a", "1 *", "2"), ("b", "3 *", "4"))

@@ -98,7 +98,7 @@ def test_a_function_of_one_joint_is_exported_at_this_joint():
     model = with_parts("scara")
     functions = model.residuals
     functions.raw_torque_splines[1, 20] = 1.0
-    # ripple at two frequencies, the largest of which is twice the gear ratio
+    # ripple with 3 periods per revolution of the joint, and with 160: twice the gear ratio of 80
     functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)
     # a prismatic joint has no revolutions, and so no ripple is exported
     functions.raw_torque_ripple[2, 3] = 1.0
