@@ -47,7 +47,7 @@ FLAGS = ("-O2",)
 
 
 def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = True) -> Trained:
-    """Return a model whose parameters are changed by normal numbers with standard deviation ``size``.
+    """Return a model to whose parameters random normal numbers with standard deviation ``size`` are added.
 
     Without ``residuals`` the parameters of residual terms are unchanged.
     """

@@ -1,4 +1,4 @@
-"""Payload, friction and contact estimates of the live estimator on recordings: every figure of docs/live.md.
+"""Payload, friction and contact estimates of the live estimator on recordings: all numbers of docs/live.md.
 
     python benchmarks/live.py [FOLDER] [--arms ur10e panda ...] [--runs FOLDER]
 
@@ -76,7 +76,10 @@ class Case:
         return self.compiled.run(log.t, log.q, log.qd, log.tau if tau is None else tau)
 
     def samples(self, log: Trajectory, *, pauses: bool = False) -> DynamicsSamples | None:
-        """Return the filtered samples of a log, on which torques are compared; None if nothing moves."""
+        """Return the filtered samples of a log, for comparisons of torques; None if there are 50 or fewer.
+
+        pauses: if True, samples at standstill between motions are included.
+        """
         reach = bristle_reach(self.fit.model)
         found = dynamics_samples([log], pauses=pauses, preprocessing=self.fit.preprocessing, reach=reach)
         return found[0] if found and len(found[0].q) > 50 else None

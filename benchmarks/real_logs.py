@@ -147,7 +147,7 @@ def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
-    """Return the fit with part of its parameters refitted to a log, as by `spelgen train --from`; adapt: which part."""
+    """Return the fit with parameters refitted to a log, as by `spelgen train --from`; adapt: option of `TorqueFit`."""
     return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
 
 

@@ -312,7 +312,7 @@ def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Mo
 
 
 def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelgen.Trajectory]:
-    """Simulate two motions of a case; return their logs: noisy positions, differences as velocities, noisy torques."""
+    """Simulate two motions of a case; return logs of noisy positions and torques, with finite differences as qd."""
     logs, own_rng, process = [], np.random.default_rng([case.number, 3]), truth.process
     for name in ("first", "second"):
         make = fourier_motion if case.motion == "excitation" else pick_and_place

@@ -43,7 +43,7 @@ class Polynomials:
 def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
     """Return the exact polynomials of M and V of ``arm``.
 
-    inertials: the URDF's inertial values are inserted; otherwise inertial parameters are variables.
+    inertials: if True, the URDF's inertial parameters are inserted as numbers; otherwise they are variables.
     """
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]

@@ -365,7 +365,7 @@ def columns_of(columns, quantity, joints):
 def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, tmp_path, form):
     """Wrapped servo commands and positions are unwrapped together.
 
-    They wrap at different rows, and may start a revolution apart.
+    Commands and positions wrap at different rows, and their first values may differ by a revolution.
     """
     for number, name in enumerate(ROBOTS):
         text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
