@@ -116,7 +116,7 @@ def keep_all(estimate: Any) -> Any:
 
 
 def no_occam_factor(estimate: Any) -> float:
-    """Replace `fraction_occam_factor`: the friction state is chosen by its likelihood only."""
+    """Return a log Occam factor of 0 in place of `fraction_occam_factor`: only likelihoods choose friction states."""
     return 0.0
 
 

@@ -37,7 +37,7 @@ Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def main() -> None:
-    """Fit recordings separately, and print the shares of differences between fits that lie inside the intervals."""
+    """Fit groups of recordings, and print per quantity the share of differences between fits within 95 % intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -67,7 +67,11 @@ def main() -> None:
 def groups(
     logs: Sequence[spelgen.Trajectory], parts: int, halvings: int
 ) -> Iterator[list[list[spelgen.Trajectory]]]:
-    """Yield groups of recordings, to fit and compare: one group of all parts, or per halving a group of two halves."""
+    """Yield groups of training sets. Each set is fitted, and the fits of a group are compared in pairs.
+
+    If `halvings` is 0, there is one group, in which each of the `parts` parts of each recording is a set. Otherwise
+    each halving of the recordings is a group of two sets.
+    """
     if not halvings:
         yield [[part] for part in parts_of(logs, parts)]
     for number in range(halvings):
@@ -99,7 +103,11 @@ def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, n
 
 
 def estimates(fit: spelgen.Fit) -> Estimates:
-    """Return {quantity: (values, half 95 % intervals)}, (k,) each: base, drives, M and g, or `servo_estimates`."""
+    """Return {quantity: (values, half 95 % intervals)} of a fit, (k,) each.
+
+    A fit to torques has the quantities "base" (base parameters), constants of the drives by name, "M" (its diagonal)
+    and "g" (gravity torques), both at `POSITIONS` random positions. A fit of servos has `servo_estimates`.
+    """
     if fit.record.servo is not None:
         return servo_estimates(fit.record.servo)
     posterior, result = fit.posterior, {}

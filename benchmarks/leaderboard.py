@@ -95,7 +95,7 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return the training durations [s]: each of `SECONDS` that the recordings exceed, and infinity for all."""
+        """Return the training durations [s]: `SECONDS` below 95 % of the total, and infinity for all recordings."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
@@ -118,7 +118,10 @@ class Problem:
             raise LogError("no moving samples", expected="motion faster than 0.02 rad/s")
 
     def samples_of(self, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-        """Return the filtered torque samples of logs, as `train` and `evaluate` use them."""
+        """Return the filtered torque samples of logs, as `train` and `evaluate` use them.
+
+        pauses: if True, samples at standstill between motions are included.
+        """
         return dynamics_samples(logs, pauses=pauses, preprocessing=self.preprocessing, reach=self.reach)
 
     @cached_property
@@ -154,10 +157,10 @@ def urdf_values(problem: Problem) -> Prediction:
 
 
 def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> Torque:
-    """Return the torque of ridge regression; its penalty is chosen by cross-validation over blocks of time.
+    """Return the torque function of ridge regression, whose penalty is chosen by cross-validation over blocks of time.
 
-    The penalty is relative to the squared length of each column of the regressor of rigid bodies, viscous and Coulomb
-    friction, armature and offset; each joint is weighted by the range of its torque.
+    The regressor has columns of rigid bodies, viscous and Coulomb friction, armature and offset. The rows of a joint
+    are divided by the standard deviation of its torque. The penalty is relative to the squared length of each column.
     """
     friction = FrictionModel()
 
@@ -167,7 +170,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
     tau = np.concatenate([x.tau for x in samples])
     scale = np.maximum(tau.std(axis=0), 1e-3 * tau.std(axis=0).max())[:, None]
-    # regressor (T, n, K), each joint divided by the range of its torque
+    # regressor (T, n, K), each joint divided by the standard deviation of its torque
     rows = np.concatenate([*map(columns, samples)]) / scale
     length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
     length[length == 0] = 1.0
@@ -180,7 +183,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
         return np.linalg.solve(gram[:-1, :-1] + penalty * np.eye(len(length)), gram[:-1, -1])
 
     def held_out_error(penalty: float) -> float:
-        # share of the samples that are in training blocks, by which the penalty is scaled
+        # The penalty is relative to the Gram matrix of all samples; training blocks have only this share of samples.
         share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS
         error = 0.0
         for block, gram in zip(blocks, grams, strict=True):
@@ -193,9 +196,10 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
 
 def by_least_squares(*, memory: bool) -> Method:
-    """Return the method "least squares of `identify`", with Coulomb friction or, if `memory`, with bristle states.
+    """Return the method that fits rigid bodies and friction by the least squares of `spelgen identify`.
 
-    Joints are weighted by the range of their torque.
+    Each joint has the weight 1 / standard deviation of its torque. memory: if True, friction has bristle states;
+    otherwise it is Coulomb friction.
     """
     method = LeastSquares("range", friction=FrictionModel(memory=memory))
 
@@ -261,7 +265,10 @@ def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
 
 
 def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield the documented splits of an arm's recordings; `shanghai` has a split per recording, which is its test."""
+    """Yield the documented splits of an arm's recordings into training and test recordings.
+
+    `ur10e` and `airbot` have one split. `shanghai` has a split per recording: it is the test, all others are training.
+    """
 
     def chosen(names: Iterable[str]) -> tuple[Trajectory, ...]:
         return tuple(logs[x] for x in names)

@@ -33,7 +33,10 @@ def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
 
 
 def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
-    """Return the table of errors: a row per cell of the splits, and medians per arm and duration of motion pairs."""
+    """Return the table of nMSE per method, with a row for each cell (fold, duration, group of test recordings).
+
+    Motion pairs (one motion is the training, another the test) have one row per arm and duration, with the median.
+    """
     table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
     for (fold, seconds, group), errors in cells.items():
         arm, kind = fold.split("/")
@@ -57,13 +60,19 @@ def _median(values: Sequence[float]) -> str:
 
 
 def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`; None if one of them is absent."""
+    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`.
+
+    errors: nMSE by method. Return None if `hybrid` has no error, or none of `REFERENCES` has one.
+    """
     best = min((errors[name] for name in REFERENCES if name in errors), default=None)
     return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
 
 
 def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines on the error of the preset `hybrid` divided by the smallest of `REFERENCES`, and the worst cells."""
+    """Return a summary of the ratio of the error of `hybrid` to the smallest error of `REFERENCES`, over all cells.
+
+    A cell is a fold, a duration and a group of test recordings. Cells with ratios above `GOALS[1]` are listed.
+    """
     ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
     if not ratios:
         return []

@@ -250,7 +250,10 @@ class Arrays(pickle.Unpickler):
 
 
 def delan_characters(read: Read, folder: Path) -> None:
-    """Write the arrays of the simulated arm that draws characters, of Deep Lagrangian Networks; dt 0.04 s."""
+    """Write the data set of Deep Lagrangian Networks, a simulated arm that draws characters, as an NPZ file.
+
+    The sample interval is 0.04 s. read: function that returns the bytes of a file of their repository.
+    """
     content = Arrays(io.BytesIO(read("data/character_data.pickle"))).load()
     arrays = {"labels": np.array(content["labels"])}
     for name in sorted(content.keys() - {"labels"}):

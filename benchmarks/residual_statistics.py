@@ -4,7 +4,7 @@
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The residual is from least
 squares with bristle states, in the training samples of each documented split; it does not depend on the fit of the
-presets. `benchmarks/truth.py` prints the same figures of its simulated arms for comparison.
+presets. `benchmarks/truth.py` prints the same statistics of simulated arms for comparison.
 """
 
 from __future__ import annotations

@@ -5,9 +5,10 @@
 A hold begins two seconds after a joint's command became constant and lasts a minute at most; other joints may move.
 Holds in which the measured position moves by more than one encoder step are omitted. Creep is the largest displacement
 from the position at the beginning of the hold; motions of other joints cause a little of it, measured and predicted.
-`measured at rest`: the largest predicted creep over holds in which the measured joint does not move at all, and their
-number. `beyond measured`: the largest difference between predicted and measured creep. The model is fitted to the
-training logs and predicts each log, training and test, from its first state.
+The columns `measured` and `model` have the largest measured and predicted creep. `measured at rest` has the largest
+predicted creep over the holds without any measured motion, and the number of these holds. `beyond measured` has the
+largest excess of predicted over measured creep. The model is fitted to the training logs and predicts each log,
+training and test, from its first state.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int
 
     Holds with a measured displacement of more than an encoder step are omitted.
 
-    q: (T, n) predicted positions [rad]. step: of the encoder [rad].
+    q: (T, n) predicted positions [rad]. step: resolution of the encoder [rad].
     """
     assert log.u is not None
     found = []

@@ -1,12 +1,12 @@
-"""An arm under position servos in MuJoCo: as a simulated robot for other benchmarks, and as a rival of a fitted model.
+"""An arm under position servos in MuJoCo: a simulated robot for other benchmarks, and a rival of a fitted model.
 
     python benchmarks/servo_mujoco.py RUN --train LOGS... --test LOGS...
 
-MuJoCo's position actuators are how such an arm is usually simulated. kp, kv, armature and frictionloss of each joint,
-an offset of its commands and the delay are fitted to windows of the training logs, starting from the parameters of the
-run's model, by `mujoco.minimize`, the least squares of `mujoco.sysid`. The bodies are the URDF's, and dry friction has
-the stiffest constraint that MuJoCo allows, as `spelgen export --to mjcf` writes both. The actuators, the model and its
-other baselines then predict the positions of the test logs from their commands.
+Such an arm is usually simulated with MuJoCo's position actuators. The rival has the bodies of the URDF and these
+actuators. Its kp, kv, armature, frictionloss and command offset of each joint, and one delay, are fitted to windows of
+the training logs by `mujoco.minimize`, the least squares of `mujoco.sysid`. The initial values are the parameters of
+the run's model. Dry friction has the stiffest constraint that MuJoCo allows, as in the files of `spelgen export --to
+mjcf`. The rival, the run's model and its other baselines then predict positions of the test logs from the commands.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ FIT_STEP = 5e-3
 # number of windows and of solver steps of the fit of actuators, which takes half a minute
 WINDOWS, ITERATIONS = 60, 8
 DIFFERENCE = 1e-4  # finite-difference step of the unknowns of the fit
-# bounds of the fit: change of log drives; offset [rad, m]; delay [s]
+# bounds of the fit: change of log(kp), log(kv), log(armature), log(frictionloss) [1]; offset [rad, m]; delay [s]
 LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4
 
 
@@ -101,11 +101,11 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
     """Simulate an arm with servos from rest at the first command; return the positions of its links, (T, n) [rad].
 
     Args:
-        model: of `arm_with_servos`; its servos control motor positions, before the backlash of the gears.
+        model: result of `arm_with_servos`; its servos control motor positions, before the backlash of the gears.
         joints: names of the n driven joints.
         u: (T, n) commands [rad].
         dt: time between commands and between positions [s].
-        delay: of the commands [s].
+        delay: delay of the commands [s].
     """
     data = mujoco.MjData(model)
     drive = [model.joint(x).qposadr[0] for x in joints]
@@ -232,14 +232,17 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
     def actuators(x: np.ndarray) -> PositionActuators:
-        """Return the actuators for unknowns x (5 n + 1,): logarithms of 4 n drives, n command offsets, the delay."""
+        """Return the actuators for unknowns x, (5 n + 1,).
+
+        x: logarithms of kp, kv, armature and frictionloss of n joints, n command offsets [rad, m], and the delay [s].
+        """
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
         return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        """Return the position errors, (samples n,), after the burn-in of each window, for unknowns x (5 n + 1,)."""
+        """Return the position errors of S samples, (S n,), after the burn-in of each window, for unknowns x."""
         candidate = actuators(x)
         model = candidate.model()
         model.opt.timestep = 1 / windows.rate / steps
@@ -248,13 +251,14 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Return the position errors, (samples n, C), for C vectors of unknowns, the columns of x (5 n + 1, C)."""
+        """Return the position errors of S samples, (S n, C), for C vectors of unknowns, the columns of x."""
         return np.stack([errors(column) for column in x.T], axis=1)
 
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Return the derivative of the position errors by finite differences, (samples n, 5 n + 1).
+        """Return the derivative of the position errors of S samples with respect to x, (S n, 5 n + 1).
 
-        An unknown such as kp is changed at all joints at once: its effect on other joints is small and neglected.
+        The differences are finite. Each of the five parameters per joint, such as kp, is changed at all joints at once.
+        The effect of a joint's parameter on other joints is small and neglected.
         """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):

@@ -10,16 +10,20 @@ preset, `hybrid`, least squares with Coulomb friction and with bristle states, a
 it is installed, are fitted to the same samples. Results are appended to a file of JSON lines; a run continues where it
 stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
 
-A star marks the true value. M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative
-error of a diagonal entry; g error: root mean square error divided by the root mean square of g*; error of the base
-parameters: likewise, each parameter multiplied by its root mean square torque along the test motion; friction error:
-likewise, without offsets; torque nMSE on another motion without noise, unfiltered and after a low-pass of 8 Hz.
+The errors are measured along a test motion without noise. A star marks a true value, rms is the root mean square:
 
-Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are in units of
-the logged torques, at the logged positions, and the true base parameters are the least-squares solution for the rigid
-torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982). The
-motion is the motion of the links, with the zeros of the sensors: motors with backlash have peaks of acceleration, and a
-regression on these peaks has a bias that no fit to filtered logs has.
+- M: mean of |M - M*| / |M*| (Frobenius norm); also the relative error of each diagonal entry's mean, of which the
+  largest is printed;
+- g: rms(g - g*) / rms(g*);
+- base parameters b: |w (b - b*)| / |w b*|, with the weight w = rms of each parameter's column of the regressor;
+- friction f: rms(f - f*) / rms(f*), after the mean of each joint (the offset) is subtracted from f and f*;
+- torque: nMSE (mean squared error / variance of the torque, mean over joints), unfiltered and low-passed at 8 Hz.
+
+True values are the output of sensors without noise. If torque units and zero positions of the sensors are wrong, M*, g*
+and torques have the wrong units, at the logged positions. The true base parameters are then the least-squares solution
+for the rigid torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1,
+1982). Its regressor has the motion of the links plus the zero offsets, not the motion of the motors: motors with
+backlash have peaks of acceleration, and a regression on these peaks has a bias that no fit to filtered logs has.
 
 Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
 the residuals of recordings if their folder is given.
@@ -87,7 +91,7 @@ class Case:
 
     number: int
     arm: str
-    urdf_error: float  # [1] relative standard deviation of the given URDF's inertials; infinite: placeholders
+    urdf_error: float  # [1] relative standard deviation of the URDF's inertials; infinite: dummy inertials
     friction: str
     armature: bool
     offsets: bool
@@ -150,7 +154,7 @@ class Truth:
         self.spring = np.zeros(n)
         if case.springs:
             joint = rng.integers(n)
-            # the spring's torque has the sign of gravity torque at the spring's own joint
+            # the spring has the torque `spring` sin(q) at one joint, like gravity of a pendulum that hangs at q = 0
             self.spring[joint] = 0.3 * size[joint]
         self.asymmetry = 0.3 * rng.normal(size=n) * (case.friction == "asymmetric")
         self.load = np.abs(gravity + self.spring * np.sin(middle.numpy())).mean(axis=0)
@@ -168,12 +172,15 @@ class Truth:
         return np.einsum("tij,tj->ti", self._rigid_mass(torch.from_numpy(q)), qdd) + bias
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return M with armatures at logged positions q (T, n), in the unit of logged torques, (T, n, n)."""
+        """Return M with armatures at logged positions q (T, n), (T, n, n) [kg m^2, kg].
+
+        The row of each joint is multiplied by `gain`, the factor from its true torque to its logged torque.
+        """
         mass = self._rigid_mass(torch.from_numpy(q - self.process.zero)) + np.diag(self.armature)
         return self.process.gain[:, None] * mass
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque of gravity and springs at logged positions q (T, n), in units of logged torques, (T, n)."""
+        """Return the torque of gravity and springs at logged positions q, times `gain` as in logs, (T, n) [Nm, N]."""
         return self.process.gain * self._gravity(q - self.process.zero)
 
     def _gravity(self, q: np.ndarray) -> np.ndarray:
@@ -196,7 +203,7 @@ class Truth:
         return self.viscous * qd + dry * (1 + self.asymmetry * direction)
 
     def sliding_friction(self, sliding: SteadySliding) -> np.ndarray:
-        """Return the friction of steady sliding in the unit of logged torques, (speeds, n): see `SteadySliding`."""
+        """Return the friction of steady sliding, times `gain` as in logs, (speeds, n) [Nm, N]: see `SteadySliding`."""
         q = sliding.q - self.process.zero
         rows = []
         for speed in sliding.speeds:
@@ -208,18 +215,18 @@ class Truth:
     def sensed(
         self, motion: Motion, temperature: np.ndarray | float = 1.0
     ) -> tuple[Motion, np.ndarray, np.ndarray]:
-        """Return the motion, the torque and its friction torque, (T, n) each, of the motors as ideal sensors show them.
+        """Return the motion of the motors, their torque, and the friction in this torque, as logged without noise.
 
-        Ideal sensors have the errors of units and zeros of the case, and no noise.
+        All arrays are (T, n). Positions include the zero offsets of the case, torques are multiplied by its `gain`.
 
         Args:
-            motion: of the links, at the rate `FINE`.
+            motion: motion of the links, at the rate `FINE`; motors deviate from it by the deflection of the joints.
             temperature: factor on friction, (T, n) or one number.
         """
         q, qd, qdd = motion
         link = self._rigid_torque(motion) + self.spring * np.sin(q)
         if self.case.errors:
-            # motors move relative to the links: velocity and acceleration of the deflection are differences
+            # motors move relative to the links; rates of the deflection are computed by finite differences
             twist = self.process.deflection(link, self.inertia)
             rate = np.gradient(twist, 1 / FINE, axis=0)
             q, qd, qdd = q + twist, qd + rate, qdd + np.gradient(rate, 1 / FINE, axis=0)
@@ -243,12 +250,13 @@ class Truth:
         return base.combination[inertial, :count], columns[:, :, base.columns[inertial]]
 
     def base_parameters(self, motion: Motion, combination: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the true base parameters (r,), or the pseudo-true ones (see the module) if units or zeros are wrong.
+        """Return the true base parameters (r,), or pseudo-true ones (see the module) if the case has `errors`.
 
         Args:
-            motion: of the links.
-            combination: (r, K) of `inertial_columns`, for this motion with the zeros of the sensors added.
-            columns: (T, n, r) likewise.
+            motion: motion of the links without zero offsets, for the true torque.
+            combination: (r, K) matrix from K inertial parameters and armatures to base parameters.
+            columns: (T, n, r) regressor of the base parameters, along the motion with zero offsets added to q. Both
+                arrays are results of `inertial_columns`.
         """
         bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
         exact = combination @ np.concatenate([bodies, self.armature])
@@ -266,7 +274,7 @@ class Truth:
 
 
 def _limit(value: float | None, default: float) -> float:
-    """Return a position limit of the simulated motion: the URDF's limit, clipped to +-2.5; default if it has none."""
+    """Return a position limit of the simulated motion [rad, m]: the URDF's, clipped to +-2.5, or else the default."""
     return default if value is None else float(np.clip(value, -2.5, 2.5))
 
 
@@ -304,7 +312,7 @@ def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Mo
 
 
 def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelgen.Trajectory]:
-    """Simulate two motions of a case; return their logs: noisy positions, differences as velocities, noisy torques."""
+    """Simulate two motions of a case; return logs of noisy positions and torques, with finite differences as qd."""
     logs, own_rng, process = [], np.random.default_rng([case.number, 3]), truth.process
     for name in ("first", "second"):
         make = fourier_motion if case.motion == "excitation" else pick_and_place

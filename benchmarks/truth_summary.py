@@ -27,7 +27,10 @@ CAUSES: dict[str, Callable[[Row], Any]] = {
 
 
 def summary(rows: Sequence[Row], methods: Sequence[str], recordings: Path | None = None) -> str:
-    """Return all tables as text, over the rows without a failed fit; recordings: folder to compare residuals with."""
+    """Return all tables as text, over the cases (rows) in which no fit of the default or of least squares failed.
+
+    recordings: folder of recordings, with whose torque residuals the residuals of simulated arms are compared.
+    """
     ours = (DEFAULT, *LEAST_SQUARES)
     good = [row for row in rows if not any("error" in row["results"][name] for name in ours)]
     if not good:
@@ -59,7 +62,10 @@ def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
 
 
 def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield lines on the error of `hybrid` divided by the smaller error of least squares: all cases, then per cause."""
+    """Yield lines on the ratios of `by_better_least_squares`: over all cases, then for each value of each of `CAUSES`.
+
+    `CAUSES` are properties of the cases, such as the kind of friction.
+    """
     for key, goal in (("mass", 1.2), ("nmse", 1.02)):
         ratio = np.array([by_better_least_squares(row, key) for row in rows])
         limits = sorted({1.0, 1.02, 1.2, 2.0})
@@ -86,7 +92,7 @@ def by_cause(rows: Sequence[Row], cause: str) -> Iterator[tuple[Any, np.ndarray]
 
 
 def by_better_least_squares(row: Row, key: str) -> float:
-    """Return one error of the default, named by `key`, divided by the smaller error of the two least squares."""
+    """Return the error `key` of `hybrid`, divided by the smaller of the errors of the two `LEAST_SQUARES` methods."""
     errors = {name: row["results"][name][key] for name in (DEFAULT, *LEAST_SQUARES)}
     return float(errors[DEFAULT] / min(errors[name] for name in LEAST_SQUARES))
 
@@ -94,7 +100,7 @@ def by_better_least_squares(row: Row, key: str) -> float:
 def interval_lines(rows: Sequence[Row]) -> Iterator[str]:
     """Yield lines on the share of true values within the default's 95 % intervals, and the width of the intervals.
 
-    width: 1 / (95 % quantile of error / half width); 1 is right, more is too wide.
+    The width is 1 / (95 % quantile of error / half interval): 1 is right, more than 1 is too wide.
     """
     rows = [row for row in rows if "intervals" in row["results"][DEFAULT]]
     if not rows:

@@ -72,10 +72,10 @@ def geodesic_distance(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
 def group_rates(
     model: GroupModel, parts: Sequence[torch.Tensor], p: torch.Tensor, tau: torch.Tensor
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
-    """Rates of the joints' R, (..., 3, 3), or r, (..., 3), and of their momenta p, (..., n, 3), in joint frames.
+    """Return the rates of each joint's position on the group, and of all momenta, by eq. 15 and 18 of the paper.
 
-    tau: (..., n) input. Eq. 18 for a turning joint, with the rows r_1, r_2, r_3 of R, and eq. 15 for a
-    sliding one:
+    parts: position of each joint (see `to_group`), a rotation matrix R or a vector r. p: (..., n, 3) momenta in joint
+    frames. tau: (..., n) input. A turning joint, with the rows r_1, r_2, r_3 of R, and then a sliding joint have:
 
         r_j' = r_j x dH/dp,  p' = p x dH/dp + sum_j r_j x dH/dr_j - D dH/dp + G u
         r' = dH/dp,          p' = -dH/dr - D dH/dp + G u
@@ -103,7 +103,10 @@ def group_rates(
 def _turning(
     rotation: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return dR/dt, (..., 3, 3), and the torque of H on a turning joint, (..., 3); see `group_rates`."""
+    """Return dR/dt and, without the terms of D and G, dp/dt, (..., 3), of a turning joint; see `group_rates`.
+
+    rotation: R; slope: dH/dR; R and its derivatives are (..., 3, 3). velocity: dH/dp, (..., 3).
+    """
     rate = torch.linalg.cross(rotation, velocity.unsqueeze(-2).expand_as(rotation), dim=-1)
     torque = torch.linalg.cross(p, velocity, dim=-1) + torch.linalg.cross(rotation, slope, dim=-1).sum(dim=-2)
     return rate, torque
@@ -112,5 +115,8 @@ def _turning(
 def _sliding(
     position: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return dr/dt and the force of H on a sliding joint, (..., 3) each; see `group_rates`."""
+    """Return dr/dt and, without the terms of D and G, dp/dt, (..., 3) each, of a sliding joint; see `group_rates`.
+
+    slope: dH/dr. velocity: dH/dp.
+    """
     return velocity, -slope

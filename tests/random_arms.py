@@ -100,7 +100,7 @@ def _drawn(write: _Writer, kinds: list[str], plates: set[int], follows: str, sid
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writer of URDF elements with random numbers of a style."""
+    """Writer of URDF elements with random numbers; ``style`` has the angles, offsets and axes to choose from."""
 
     style: _Style
     random: Random
@@ -128,7 +128,7 @@ class _Writer:
         return f'<link name="{name}">\n{_element("inertial", lines)}</link>\n'
 
     def origin(self) -> str:
-        """Return an <origin> with offsets and angles of the style."""
+        """Return an <origin> with three random offsets and three random angles from the writer's `style`."""
         xyz = " ".join(self.random.choice(self.style.offsets) for _ in range(3))
         rpy = " ".join(self.random.choice(self.style.angles) for _ in range(3))
         return f'<origin xyz="{xyz}" rpy="{rpy}"/>'

@@ -166,7 +166,7 @@ def table(head: tuple[str, ...], lines: Iterator[tuple[str, ...]]) -> str:
 
 
 def other_defaults(group: type[Group]) -> Iterator[str]:
-    """Yield a sentence per subclass of a group, if it has the keys of the group: the defaults that differ."""
+    """Yield a sentence for each subclass of a group that has the same keys as the group: the different defaults."""
     for subclass in group.__subclasses__():
         if subclass.model_fields.keys() == group.model_fields.keys():
             pairs = zip(subclass.model_fields.items(), group.model_fields.values(), strict=True)

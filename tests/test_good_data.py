@@ -342,7 +342,10 @@ NO_LIMITS = {
 
 
 def unlimited_arm(robots, folder, name, form):
-    """Write and load one of the project's robots without finite position limits; form: how the <limit> states it."""
+    """Return one of the project's robots without limits of position, velocity and effort.
+
+    form: key of `NO_LIMITS`, which are attributes of a <limit> that mean "unlimited".
+    """
     text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
     (folder / "x.urdf").write_text(text)
     return load_arm(folder / "x.urdf")

@@ -60,7 +60,7 @@ def folder(name: str) -> str:
 
 
 def test_every_file_imports_only_from_its_layer_and_those_above():
-    """Each file imports only from its own layer and from layers above it in LAYERS.
+    """Each file imports only from its own folder and from folders before it in FOLDERS.
 
     The runtime, which emitted modules contain, imports only itself, torch and the standard library (CARRIED).
     """
@@ -77,7 +77,7 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
 
 
 def test_no_file_imports_from_a_higher_layer():
-    """No file imports the modules that NEVER lists for it, directly or indirectly: derivation imports no torch."""
+    """No file imports, directly or through other files, a module that NEVER lists for it, such as torch in `arm`."""
     wrong = {}
     for name, never in NEVER.items():
         modules = reached(name) - PLAIN
