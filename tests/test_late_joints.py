@@ -1,4 +1,4 @@
-"""Delays of single joints and wrongly stated units are named with the line that corrects them."""
+"""Errors about delays of single joints and about wrong units advise the settings line that corrects the log."""
 
 import re
 from dataclasses import replace
@@ -178,7 +178,7 @@ def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_t
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize(("third", "is_motor_torque"), [(-121.0, False), (121.0, True)])
 def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp_path):  # noqa: F811
-    """If all joints are logged at their motors, the lines have the gear ratios that explain the torques."""
+    """If all positions are logged at the motors, the error advises gear ratios that agree with the torques."""
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, third, 80.0])
     tau = log.tau / (gears if is_motor_torque else 1.0)
     wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=tau)
@@ -192,7 +192,10 @@ def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
-    """Joints at their motors with the torques of other joints: neither degrees nor another unit is advised."""
+    """Positions at the motors get neither degrees nor gear ratios if the torques do not show the ratios.
+
+    The torque columns are permuted. The error then names the setting of gear ratios, without numbers.
+    """
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, 121.0, 80.0])
     wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[:, [2, 0, 3, 1]])
     error = told(arm, wrong)

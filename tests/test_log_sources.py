@@ -24,7 +24,7 @@ STATES = [
 
 
 def documents(names):
-    """Return {name of a form: JSON document}; all documents contain the same recording."""
+    """Return {layout: JSON document}: the same recording in six layouts that the reader accepts."""
     stamps = [{"sec": int(t), "nanosec": round(t % 1 * 1e9)} for t in T.tolist()]
     order = [2, 0, 3, 1]
     points = [

@@ -52,7 +52,10 @@ def centres(q):
 
 
 def clearances(q):
-    """Return exact distances at q (..., 3), (..., 9) [m]: a-c, a-d, b-d; b, c, d to the floor; b, c, d to the wall."""
+    """Return the exact distances of the spheres of links a (base) to d at q (..., 3) [rad], (..., 9) [m].
+
+    They are a to c, a to d, b to d; b, c and d to the floor; b, c and d to the wall.
+    """
     b, c, d = np.moveaxis(centres(q), -2, 0)
     own = [np.linalg.norm(x, axis=-1) - BASE - RADIUS for x in (c, d)]
     own.append(np.linalg.norm(d - b, axis=-1) - 2 * RADIUS)

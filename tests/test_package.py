@@ -111,9 +111,10 @@ def canonical(name: str) -> str:
 
 
 def test_every_package_is_pinned_by_hash():
-    """The pinned requirements contain each dependency of the package, with hashes.
+    """Pinned requirements with hashes contain each dependency of the package.
 
-    `make demo` installs these, Pinocchio and CasADi (for C), and no other extra.
+    requirements.txt, for `make demo`, has the dependencies without extras and the extras Pinocchio and CasADi (for C
+    code); requirements-tools.txt has all extras.
     """
     demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
     assert demo.items() <= tools.items()
