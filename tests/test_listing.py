@@ -98,7 +98,7 @@ def test_a_table_too_wide_for_the_words_of_its_names_is_cut_into_several():
 def test_a_name_is_broken_within_a_word_only_to_avoid_another_table():
     """Names of joints are broken within a word only if the table is then split into fewer parts.
 
-    Here it has two parts with broken and with whole names.
+    Here the table has two parts with broken and with whole names, so the names remain whole.
     """
     for cells in (["0.00131"] * 11, ["1.31e-04"] * 12):
         rows = [(name, *cells) for name in ("1 (0.05 s)", "joint_wrist_yaw [rad]")]

@@ -69,7 +69,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """Return the path of a run folder of the model: its noise levels are `levels`, from logs of half a minute."""
+    """Return the path of a run folder with the model and the noise levels `levels`, from half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
     folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
@@ -535,9 +535,9 @@ def test_scales_of_peaks_are_shrunk_by_their_error(levels):
 
 
 def test_thresholds_hold_in_a_log_that_differs(levels):
-    """Thresholds from three logs, one with doubled residuals, give at most one alarm in a fourth log with doubled ones.
+    """Thresholds from three logs give at most one alarm in a log of doubled residuals if one of the three is doubled.
 
-    Thresholds from three logs with equally large residuals give more than three alarms in the fourth log.
+    If the residuals of the three logs are equally large, the thresholds give more than three alarms in the doubled log.
     """
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]

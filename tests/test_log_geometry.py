@@ -370,7 +370,7 @@ def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
 def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
     """If velocities of a joint contradict its positions, the checks of geometry use derivatives of the positions.
 
-    The velocities are scaled, or noise: a warning names them, and a reversed joint is still found.
+    Here the velocities are 1.5 times too large, or noise. A warning names them, and a reversed joint is still found.
     """
     log, rng = recorded(arm, 21), np.random.default_rng(21)
     noise = rng.normal(size=len(log.t)) * log.qd[:, joint].std()
@@ -591,7 +591,8 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
 def test_presliding_hysteresis_does_not_change_a_zero_offset(arm, seed, angle):
     """The zero of a joint is named to 0.1 rad although its friction has a hysteresis of 0.05 rad.
 
-    If the model had no hysteresis, an offset wrong by 0.4 rad would compensate friction, or none would be found.
+    If the friction model had no hysteresis, the offset would be wrong by 0.4 rad, as it would compensate friction, or
+    would not be found.
     """
     log = recorded(arm, seed, pick_and_place, noise=0.01)
     log = replace(log, tau=log.tau + 0.4 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))

@@ -1,4 +1,4 @@
-"""Logs in the forms of public simulators and robot drivers are read with their original values by a drafted mapping."""
+"""Suggested mappings read the original values from logs in the formats of public simulators and robot drivers."""
 
 import json
 import subprocess

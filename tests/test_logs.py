@@ -412,7 +412,7 @@ def test_what_never_changes_in_any_trajectory_is_said():
 
 
 def test_noise_of_a_joint_at_rest_is_no_motion():
-    """Noise of positions and velocities at a joint at rest is no contradiction of velocities and positions.
+    """Noise at a joint at rest is not reported as a contradiction of velocities and derivatives of positions.
 
     The only remark is that the joint is at rest.
     """

@@ -1,6 +1,6 @@
 """If one of several recordings has a fault, the error names this recording.
 
-A settings line would apply to all recordings: the error advises none, or states that all must have the fault.
+A settings line would apply to all recordings: the error advises none, or one for the case that all have the fault.
 """
 
 from dataclasses import replace

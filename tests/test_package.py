@@ -113,8 +113,8 @@ def canonical(name: str) -> str:
 def test_every_package_is_pinned_by_hash():
     """Pinned requirements with hashes contain each dependency of the package.
 
-    requirements.txt, for `make demo`, has the dependencies without extras and the extras Pinocchio and CasADi (for C
-    code); requirements-tools.txt has all extras.
+    requirements.txt, which `make demo` installs, has the mandatory dependencies, Pinocchio and CasADi (for C code), but
+    no other extra; requirements-tools.txt has all extras.
     """
     demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
     assert demo.items() <= tools.items()

@@ -47,7 +47,7 @@ from tests.test_closed_form import drawn
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
-    """Base parameters of fits have the names and combinations of the exact ones: the report matches both by name."""
+    """Base parameters of fits have the same names and combinations as in `identify`: reports match them by name."""
     urdf = robots / f"{robot}.urdf"
     if robot in ("followed", "gantry"):
         urdf = tmp_path / f"{robot}.urdf"

@@ -149,7 +149,7 @@ def _count(sizes: np.ndarray) -> int:
 
 
 def told(structure: Structure) -> Facts:
-    """Return the `Facts` that a structure states, which spelgen derived."""
+    """Return the `Facts` of a structure that spelgen derived."""
     n = len(structure.joints)
     return Facts(
         entries=tuple((entry.kind, entry.joints) for entry in structure.entries),

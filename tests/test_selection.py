@@ -81,7 +81,7 @@ def test_a_function_is_selected_by_held_out_blocks(hybrid):
 
 
 def test_samples_next_to_a_held_out_block_are_not_fitted(hybrid):
-    """Gaps are left on both sides of held-out blocks: a residual that is constant across borders selects no function.
+    """Held-out blocks have gaps on both sides: a residual that is constant across their borders selects no function.
 
     Otherwise the half of a constant segment on one side of a border would predict the half on the other side.
     """

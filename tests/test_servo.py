@@ -154,7 +154,7 @@ def test_intervals_count_correlated_errors_once():
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
-    )  # told would be a fiftieth of var(found) if it counted the 50 equal errors of a window as independent
+    )  # the jackknife variance `told` would be a fiftieth if the 50 equal errors of a window were independent
 
 
 def test_blocks_of_intervals_are_whole_motions():

@@ -110,7 +110,7 @@ def test_a_state_of_positions_and_velocities_is_recognised_by_its_values(
 ):
     """A suggested mapping assigns the first half of a state [q; qd] to positions and the last half to velocities.
 
-    The names of the columns are of the whole state, so the assignment results from the values.
+    The column names (x0 to x7) do not distinguish both halves, so the values determine the assignment.
     """
     if form == "matrices":
         path = tmp_path / "log.npz"
@@ -132,7 +132,7 @@ def test_matrices_of_two_arms_are_refused(scara, tmp_path, form):
 
 
 def test_units_and_clocks_in_the_middle_of_names(scara, tmp_path):
-    """Suggestions recognise units before joint numbers (load_0.1%_0), and stamp_nanos as a part of the time.
+    """A unit in a column name may precede the joint number (load_0.1%_0); times may be two columns, one of nanoseconds.
 
     Columns of disturbance torques (DistTrq) are not suggested as joint torques.
     """
@@ -165,7 +165,8 @@ def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
 def test_times_that_fall_are_called_so(scara, tmp_path):
     """If times fall from row to row, such as remaining times, the error states this and advises `sample_rate`.
 
-    At other falling times, the error advises to begin a new recording; here each row would be a recording.
+    Times that fall only at some rows are start times of recordings, which the error advises to number; here each row
+    would be a recording.
     """
     head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in scara.chain.joint_names)]
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))

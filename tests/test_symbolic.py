@@ -15,9 +15,9 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """The structure agrees with the exact polynomials of M and V: it states their numbers of independent terms.
+    """Numbers of varying terms (outputs) and constant terms of M equal ranks of the exact polynomials' coefficients.
 
-    Outputs are the varying terms of M. Zero entries and the joints of each entry, output and V agree, too.
+    The zero entries of M, and the joints that each entry, each output and V depend on, are also equal.
     """
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))

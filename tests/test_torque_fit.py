@@ -291,8 +291,8 @@ def test_a_fit_is_as_good_as_least_squares_for_any_urdf(emitted, robots, tmp_pat
 def test_torques_that_no_bodies_have_are_named(emitted, monkeypatch):
     """Torques that no physically consistent bodies can cause, here by a negative inertia at a joint, give a warning.
 
-    Ridge regression has a smaller held-out error than the fit, and is named in the warning. The fit is repeated twice,
-    with the torque noise bounded by the held-out error of the regression.
+    Ridge regression has a smaller held-out error than the fit; the warning states this error. The fit is repeated
+    twice, with the torque noise bounded by the held-out error of the regression.
     """
     bounds, staged_fit = [], torque_fit._staged_fit
 

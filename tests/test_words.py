@@ -95,7 +95,7 @@ def test_pages(path):
 
 
 def test_docstrings_and_comments_do_not_get_worse():
-    """No package has more of the unclear constructions that tests/words.py counts than its stored bounds.
+    """The number of each unclear construction in a package, counted by tests/words.py, is at most its stored bound.
 
     The bounds, in tests/golden/words.json, are only lowered (`python tests/words.py --write`).
     """
