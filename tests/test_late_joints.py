@@ -1,4 +1,4 @@
-"""Delays of single joints and wrongly stated units are named with the line that corrects them."""
+"""Errors about delays of single joints and about wrong units advise the settings line that corrects the log."""
 
 import re
 from dataclasses import replace
@@ -161,7 +161,7 @@ def test_a_wrong_unit_of_a_prismatic_joint_is_named(robots, stated, logged):
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize(("ratio", "is_motor_torque"), [(50.0, False), (-101.0, True)])
 def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_torque, tmp_path):  # noqa: F811
-    """If the motion of one motor is logged before its gear, the advised line has the gear ratio, not another unit."""
+    """If the motion of one joint is logged at its motor, the advised line states the gear ratio, not another unit."""
     log = recorded(arm, 15, noise=0.01)
     factors = np.where(np.arange(log.q.shape[1]) == 1, ratio, 1.0)
     tau = log.tau / (factors if is_motor_torque else 1.0)
@@ -178,7 +178,7 @@ def test_positions_of_one_motor_get_the_ratio_of_its_gear(arm, ratio, is_motor_t
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize(("third", "is_motor_torque"), [(-121.0, False), (121.0, True)])
 def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp_path):  # noqa: F811
-    """If all joints are logged at their motors, the lines have the gear ratios that explain the torques."""
+    """If all positions are logged at the motors, the error advises gear ratios that agree with the torques."""
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, third, 80.0])
     tau = log.tau / (gears if is_motor_torque else 1.0)
     wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=tau)
@@ -192,7 +192,10 @@ def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
-    """Joints at their motors with the torques of other joints: neither degrees nor another unit is advised."""
+    """If torques do not show the gear ratios of positions logged at the motors, no unit such as degrees is advised.
+
+    Here the torque columns are permuted. The error advises to state counts_per_turn: 2 pi times the gear ratio.
+    """
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, 121.0, 80.0])
     wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[:, [2, 0, 3, 1]])
     error = told(arm, wrong)

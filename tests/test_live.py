@@ -69,7 +69,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """Return a run folder of the model, with the noise levels `levels`, which state half a minute of logs."""
+    """Return the path of a run folder with the model and the noise levels `levels`, from half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
     folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
@@ -177,7 +177,8 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     # predictions of more than 0.3 s ahead do not include the disturbance
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
-    # Before the first payload report, the payload is part of the external torque: `compensate_external` includes it.
+    # Before the first payload report, no load is known. `compensate_external` adds the external torque to the predicted
+    # torque, and thereby the weight of the payload.
     part, k = dataclasses.replace(log, tau=tau)[:180], 179
     for compensated in (False, True):
         early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
@@ -357,7 +358,7 @@ def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
         assert intake.accept(log.t[1], log.q[1], log.qd[1], factor * largest) == refusal
     stored = levels.model_dump(mode="json")
     assert len(stored.pop("saturation")) == model.n
-    # runs of earlier versions have no entry `saturation`: all their torque limits are used
+    # runs of earlier versions have no entry `saturation`: it is 1, so that torques are saturated at the torque limit
     assert NoiseLevels.model_validate(stored).saturation.tolist() == [1.0]
 
 
@@ -384,7 +385,7 @@ def test_hostile_samples_give_finite_estimates(arm, levels, run):
 
 
 def test_one_log_has_one_result(arm, levels, run):
-    """Samples one at a time give the same estimates as a whole log, in the same bytes each time."""
+    """Two replays of a log give bitwise equal estimates; samples one at a time give them up to rounding errors."""
     _model, log, _ = arm
     short = log[:600]
     _, states = estimates(run, levels, short, short.tau)
@@ -417,9 +418,10 @@ def test_the_payload_is_the_map_estimate(offset):
     linear, precision = precision @ mean, precision - np.diag(TUNING.load_prior**-2.0)
 
     def cost(factor):
-        """Return the cost of the payload whose pseudo-inertia has this triangular root (10,), so that it is consistent.
+        """Return the negative log posterior of the payload with the pseudo-inertia L L^T.
 
-        The prior mean is 2 kg.
+        L is lower triangular with the entries `factor` (10,): each such payload is physically consistent. The mean mass
+        of the prior is 2 kg.
         """
         triangle = np.zeros((4, 4))
         triangle[np.tril_indices(4)] = factor
@@ -489,7 +491,7 @@ def test_errors_that_recur_with_the_motion_do_not_become_a_payload(levels):
 def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
     """Thresholds from one short log of each of 300 arms give less than one false alarm per minute, on average.
 
-    The peaks of residuals are exponentially distributed.
+    The logs consist of exponentially distributed random peaks, for which the expected rate of alarms is known.
     """
     random, windows = np.random.default_rng(0), round(60 * minutes / TUNING.window)
     alarms = []
@@ -500,14 +502,16 @@ def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
         # expected alarms per minute: probability that a peak exceeds its threshold, times peaks per minute
         alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
     assert np.mean(alarms) < 1.0
-    # thresholds are not arbitrarily high; without estimation errors they would be log(720) + 1 = 7.6
+    # Thresholds are not arbitrarily high. The known distribution would give log(720) + 1 = 7.6: peaks exceed x with
+    # probability exp(1 - x), and six joints have 720 peaks per minute, of which one may exceed the threshold.
     assert np.median(thresholds) < 25.0
 
 
 def test_scales_of_peaks_are_shrunk_by_their_error(levels):
-    """Scales of peaks are shrunk towards each other by their standard error.
+    """The peak scales of the joints are shrunk towards their mean, strongly if their standard errors are large.
 
-    Equal scales become nearly equal; different scales that many peaks determine remain different.
+    A scale is the parameter of the exponential distribution of the peaks of a joint's residual. Estimates of equal true
+    scales become nearly equal; different true scales with small standard errors, from many peaks, remain different.
     """
     random, n = np.random.default_rng(2), len(EFFORT)
 
@@ -531,9 +535,9 @@ def test_scales_of_peaks_are_shrunk_by_their_error(levels):
 
 
 def test_thresholds_hold_in_a_log_that_differs(levels):
-    """If one of three logs has doubled residuals, a fourth log with doubled residuals causes at most one alarm.
+    """Thresholds from three logs give at most one alarm in a log of doubled residuals if one of the three is doubled.
 
-    With thresholds from three logs of equal residuals, it causes more.
+    If the residuals of the three logs are equally large, the thresholds give more than three alarms in the doubled log.
     """
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]

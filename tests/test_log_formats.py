@@ -361,9 +361,9 @@ def test_arrays_that_promise_more_than_they_hold_are_refused(tmp_path):
 
 
 def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monkeypatch):
-    """A new log format needs only a reader and its name in FORMATS, as docs/extending.md states.
+    """A new log format needs only a reader and an entry in FORMATS, as docs/extending.md states.
 
-    Reading, folders, messages and suggestions then include it.
+    Files of the format are then found in folders, read, named in messages, and get a suggested mapping.
     """
 
     def read(file, joints, mapping):
@@ -909,7 +909,7 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # the first message, received twice, is no header
+    # A message that is received twice, here the first one, is no repeated header: a header would begin a new recording.
     lines = joint_states()
     (tmp_path / "log.csv").write_text("\n".join([lines[0], *lines]) + "\n")
     assert len(read_logs([tmp_path / "log.csv"], ("a", "b"))) == 1

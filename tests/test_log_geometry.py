@@ -157,7 +157,7 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
 
 
 def test_two_reversed_joints_are_not_taken_for_a_third(shared):
-    """The error names both reversed joints, not the single correction that fits best and concerns the torque only."""
+    """The error names both reversed joints, although the best single correction reverses the torque of one joint."""
     arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
     wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
     error = told(arm, wrong)
@@ -201,7 +201,8 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
-    # for rpr on a ceiling, an equivalent reading with a joint of opposite sense may be listed first
+    # For rpr on a ceiling, the error may first advise a joint of opposite sense, which explains the torques equally
+    # well.
     assert lines, error
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
@@ -224,7 +225,10 @@ def test_compensated_gravity_is_called_so(arm, part):
 
 
 def test_another_unit_is_offered_as_gain(arm):
-    """Torques in another unit get a gain. It has the relative error of the URDF's masses, which determine gravity."""
+    """For torques in another unit, the error advises a gain for each joint, within a factor of 2 of the true gain.
+
+    Gains are found from gravity torques, so their relative errors are the errors of the masses in the URDF.
+    """
     log = recorded(arm, 6)
     error = told(arm, replace(log, tau=log.tau / 0.003))
     gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
@@ -364,7 +368,10 @@ def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
 
 @pytest.mark.parametrize("joint", [0, 1])
 def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
-    """The derivatives of positions are used in place of velocities that are wrong for no known reason."""
+    """If velocities of a joint contradict its positions, the checks of geometry use derivatives of the positions.
+
+    Here the velocities are 1.5 times too large, or noise. A warning names them, and a reversed joint is still found.
+    """
     log, rng = recorded(arm, 21), np.random.default_rng(21)
     noise = rng.normal(size=len(log.t)) * log.qd[:, joint].std()
     for velocity in (1.5 * log.qd[:, joint], noise):
@@ -377,7 +384,11 @@ def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
 
 
 def test_the_sense_of_a_joint_is_more_likely_than_an_exchange_that_explains_little_more(arm):
-    """An exchange of columns may explain errors of the friction model better, by less than wrong hypotheses do."""
+    """A reversed joint is listed before exchanged columns, even if the cost of exchanged columns is somewhat lower.
+
+    Exchanged columns may also explain errors of the friction model. The reversed joint is omitted if it lowers the cost
+    only a little. Costs are relative to the unchanged log.
+    """
     order, _, _, _, sense, *_ = kinds_of_faults(arm.chain)
     present = Hypothesis.unchanged(arm.chain)
     sign = np.ones_like(present.scale)
@@ -415,7 +426,10 @@ def test_training_refuses_it_unless_it_is_accepted(arm):
 
 
 def test_a_line_keeps_what_the_mapping_states(arm):
-    """An advised line keeps the gain and the sense that the mapping already states, multiplied by the correction."""
+    """Advised gains and signs are the values in the mapping times the correction.
+
+    Here the correction is -1: the sign -1 becomes 1, the gain 14.2 becomes -14.2.
+    """
     joint = arm.chain.joint_names[1]
     mapping = LogMapping.model_validate({"joints": {joint: {"gain": 14.2, "sign": -1}}})
     error = told(arm, flipped(recorded(arm, 8), 1, True, False), mapping)
@@ -441,7 +455,7 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
 def test_gravity_along_all_axes_is_called_compensated(tmp_path):
     """Without gravity torques in a log, compensated gravity is reported, not a direction of gravity.
 
-    Both axes are horizontal, so that gravity along the axes would give the same torques.
+    The axes of both joints are parallel: gravity along the axes would cause no torques, as compensated gravity does.
     """
     rows = (
         ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
@@ -482,9 +496,9 @@ def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
 
 @pytest.mark.parametrize("of_all", [False, True])
 def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
-    """Torques that are logged as magnitudes are named, of one joint or of all joints.
+    """If torques of one joint or of all joints are logged as magnitudes |tau|, the error names these joints.
 
-    The torque of each named joint has the less frequent sign in more than a tenth of the samples.
+    Joints whose true torque has one sign in at least nine tenths of the samples are not named.
     """
     log = recorded(arm, 14)
     share = np.minimum((log.tau > 0).mean(axis=0), (log.tau < 0).mean(axis=0))
@@ -559,9 +573,9 @@ def hysteresis(q, breakaway):
 
 @pytest.mark.parametrize("seed", [0, 1, 5])
 def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_path):
-    """Exchanged joints are named although friction has a hysteresis of 0.05 rad.
+    """Exchanged joints are named although friction has a hysteresis: bristles slip at a displacement of 0.05 rad.
 
-    The hysteresis is 1.5 % of the torque in both orders of the joints.
+    The bristles cause torques of 0.3 standard deviations of the joint's torque, which must not be taken as a delay.
     """
     arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
     log = recorded(arm, seed, noise=0.005)
@@ -577,7 +591,8 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
 def test_presliding_hysteresis_does_not_change_a_zero_offset(arm, seed, angle):
     """The zero of a joint is named to 0.1 rad although its friction has a hysteresis of 0.05 rad.
 
-    If the model had no hysteresis, an offset wrong by 0.4 rad would compensate friction, or none would be found.
+    If the friction model had no hysteresis, the offset would be wrong by 0.4 rad, as it would compensate friction, or
+    would not be found.
     """
     log = recorded(arm, seed, pick_and_place, noise=0.01)
     log = replace(log, tau=log.tau + 0.4 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))

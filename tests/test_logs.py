@@ -412,7 +412,10 @@ def test_what_never_changes_in_any_trajectory_is_said():
 
 
 def test_noise_of_a_joint_at_rest_is_no_motion():
-    """Noise of the encoder and of the velocities of a joint at rest is no error, although no motion explains it."""
+    """Noise at a joint at rest is not reported as a contradiction of velocities and derivatives of positions.
+
+    The only remark is that the joint is at rest.
+    """
     rng, length = np.random.default_rng(0), len(swing().t)
     noisy = changed(q={1: 0.5 + 1e-6 * rng.normal(size=length)}, qd={1: 1e-4 * rng.normal(size=length)})
     notes = check([noisy], JOINTS, ("revolute", "revolute"))

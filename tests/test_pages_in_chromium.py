@@ -102,7 +102,7 @@ def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages)
     plain = pages[0].with_name("plain.html")
     text = pages[0].read_text(encoding="utf-8")
     plain.write_text(text.replace("script-src 'sha256", "script-src 'sha512"), encoding="utf-8")
-    # the content security policy allows only scripts whose digest it names, so that no script runs
+    # The content security policy allows only scripts with the stated digest, which is now wrong: no script runs.
     browser.open(plain)
     assert browser.run(shown) == ["block", "none", "none"]
 
@@ -136,7 +136,8 @@ def test_the_arm_fills_its_frame(browser, pages):
         browser.open(path)
         left, right, top, bottom = browser.run(EXTENT)
         assert 0.0 < left < right < 1.0 and 0.0 < top < bottom < 1.0
-        # the frame shows the whole motion, and is not much larger
+        # The frame has room for the whole motion; the arm at its current position extends over more than 30 % of the
+        # width or height.
         assert max(right - left, bottom - top) > 0.3
 
 

@@ -68,7 +68,7 @@ def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
     """M of spel has the zeros, constants and relations of the derived structure.
 
-    Its networks depend on all joints, as in the paper.
+    Its networks depend on all joints, as in the paper (Wang, Chen and Ding, Sci Rep 15:33179, 2025).
     """
     model = random_model(robot, tmp_path, seed=1, preset=preset)
     for weight in model.mass.network.parameters():
@@ -114,9 +114,10 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
 def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
-    """The emitted module equals the port-Hamiltonian system on rotation matrices, eq. 15 and 18 of the paper.
+    """The emitted module equals the port-Hamiltonian system on rotation matrices, with three axes per joint.
 
-    That system has three axes per joint and automatic derivatives; the emitted module has one axis per joint.
+    It is eq. 15 and 18 of Wang, Chen and Ding (Sci Rep 15:33179, 2025), with automatic derivatives (lie_group.py); the
+    emitted module has one axis per joint. Velocities and forces of the other two axes are zero.
     """
     design = NETWORKS if preset == "hybrid" else None
     model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)

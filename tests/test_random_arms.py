@@ -75,7 +75,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Facts:
-    """Facts on a structure, by spelgen or by Pinocchio: entries of M, V, outputs, constants, base parameters."""
+    """Facts on the structure of an arm, by spelgen or by Pinocchio.
+
+    entries: (zero, constant or varying, its joints) for each entry of M. potential: joints that V depends on.
+    outputs_from: numbers of varying terms of M that do not depend on the first 0, 1, ... joints. constants: number of
+    constant terms.
+    """
 
     entries: tuple[tuple[str, tuple[int, ...]], ...]
     potential: tuple[int, ...]
@@ -85,9 +90,9 @@ class Facts:
 
 
 def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
-    """Return the facts by Pinocchio at random configurations.
+    """Return `Facts` on the structure of an arm, computed by Pinocchio at random configurations.
 
-    inertials: with the inertial values of the URDF; otherwise random ones.
+    inertials: True for the inertial values of the URDF, False for random values at each configuration.
     """
     reading = Reading(arm)
     n = len(arm.joints)
@@ -144,7 +149,7 @@ def _count(sizes: np.ndarray) -> int:
 
 
 def told(structure: Structure) -> Facts:
-    """Return the facts by spelgen's derivation."""
+    """Return the `Facts` of a structure that spelgen derived."""
     n = len(structure.joints)
     return Facts(
         entries=tuple((entry.kind, entry.joints) for entry in structure.entries),

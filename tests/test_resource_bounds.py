@@ -1,6 +1,6 @@
 """Hostile URDF files are refused or built by `inspect` and `build` within 10 s and 1 GB each.
 
-Seconds refer to the reference in time_bounds.py.
+The 10 s are processor time of the reference machine in time_bounds.py.
 """
 
 from __future__ import annotations

@@ -54,7 +54,8 @@ MODIFIED = {
         (0.088, RIGHT, 0, 0, False),
     ],
 }
-# per link, in its DH frame: mass, centre of mass, and (xx, yy, zz) or (xx, xy, xz, yy, yz, zz); same sources
+# per link, in its DH frame: mass [kg], centre of mass [m], and inertia about it [kg m^2], (xx, yy, zz) or (xx, xy, xz,
+# yy, yz, zz); from the sources in the settings files
 INERTIALS = {
     "two_link": 2 * [(1, (-0.5, 0, 0), (0.6, 0.6, 1))],
     "rpr": [

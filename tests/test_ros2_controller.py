@@ -142,7 +142,7 @@ def test_a_preceding_controller_is_tracked(arm):
     controller.call("chain", 1)
     q, _, _ = simulated.run(controller, 1.0, lambda t: controller.write(*circle(t)))
     assert np.abs(q - [circle(k * PERIOD)[0] for k in range(len(q))]).max() < 5e-4
-    # after the last write, the interfaces' values are used for one cycle only
+    # Values that the preceding controller writes are used for one cycle only: without new values, joints are damped.
     _, qd, _ = simulated.run(controller, 1.5)
     assert controller.text("state") == "damping: no reference within reference_timeout"
     assert np.abs(qd[0]).max() > 0.3
@@ -218,7 +218,8 @@ def test_states_that_are_not_finite_end_in_damping(arm, mode, bad):
     controller.update(START, qd)
     before = controller.text("state")
     tau = controller.update([bad, START[1]], qd)
-    # the controller damps at the last valid position of the joint, with valid velocities
+    # The torques are the gravity at the last valid position plus M times the acceleration -5 qd, which damps the
+    # velocities. Velocities that are not finite count as zero.
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], -5 * qd), rtol=1e-12)
     tau = controller.update(START, [bad, -0.1])
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0.5]), rtol=1e-12)
@@ -233,7 +234,7 @@ def test_a_state_that_stays_invalid_is_latched_until_the_next_activation(arm):
     for _ in range(int(0.1 / PERIOD) + 2):
         tau = controller.update([np.nan, np.nan], [np.nan, np.nan])
         np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0]), rtol=1e-12)
-    # after the next valid state, the controller damps at this state
+    # after the next valid state, gravity and the damping acceleration -5 qd are computed from this state
     tau = controller.update(START + np.array([0.01, 0.02]), [0.1, -0.2])
     expected = torques(arm[0], START + np.array([0.01, 0.02]), [0, 0], [-0.5, 1.0])
     np.testing.assert_allclose(tau, expected, rtol=1e-12)

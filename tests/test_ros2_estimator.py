@@ -32,7 +32,7 @@ LOAD = f"""<link name="load"><inertial><origin xyz="{" ".join(map(str, CENTER))}
 
 
 def arm_in(folder, *, loaded=False):
-    """Return the UR10e, with a load if `loaded`; both arms have the tip link of the arm without load."""
+    """Return the UR10e; if `loaded`, its URDF has a further link, the load, which is fixed to wrist_3 in its frame."""
     text = (ROBOTS / "ur10e.urdf").read_text()
     (folder / "ur10e.urdf").write_text(text.replace("</robot>", LOAD) if loaded else text)
     shutil.copy(ROBOTS / "ur10e.yaml", folder)

@@ -299,10 +299,11 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Return the parameters of the bodies of the first release, for 0.01 added to each of its parameters.
+    """Return current log-Cholesky parameters of bodies whose first-release parameters are 0.01 instead of 0.
 
-    The first release had lower triangular Cholesky factors of the pseudo-inertia, relative to the nominal ones. With
-    0.01 added, their diagonal entries are exp(0.01), and their other entries 0.01. bodies: a `BodyChain`.
+    In the first release, the pseudo-inertia was L T (L T)^T with the lower triangular Cholesky factor L of the nominal
+    pseudo-inertia. Here the lower triangular T has diagonal entries exp(0.01) and other entries 0.01. bodies: a
+    `BodyChain`.
     """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)

@@ -154,7 +154,7 @@ def test_intervals_count_correlated_errors_once():
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
-    )  # the variance would be a fiftieth if all errors of a window were independent
+    )  # the jackknife variance `told` would be a fiftieth if the 50 equal errors of a window were independent
 
 
 def test_blocks_of_intervals_are_whole_motions():
@@ -229,7 +229,8 @@ def test_reported_intervals_cover_the_truth(fitted):
             # tolerance for the different Stribeck curves: only the simulator's falls as a Gaussian
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
-    # small gravity of the elbow does not separate dry friction from a dead zone
+    # The elbow carries a small gravity load, under which dry friction and a dead zone cause the same position errors:
+    # only their sum, static_error, is determined.
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
@@ -272,7 +273,8 @@ def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
     with torch.no_grad():
         heavy.bodies.raw[:, -1] += np.log(1.2)
     held, q = [], np.random.default_rng(0).uniform(-1.5, 1.5, (4, 2))
-    # ten short logs, since the time of a fit depends on the duration of its windows and not on their number
+    # Ten short logs instead of a long one: all windows are simulated in one batch, so the time of a fit depends on the
+    # duration of the windows, not on their number.
     second = spelgen.fit(heavy, servo_logs(10, 2.0, other, seed=4))
     for fit, servos in ((fitted, TRUTH), (second, other)):
         posterior, kp = fit.posterior, np.array(servos.kp)
@@ -308,7 +310,9 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             stated = posterior.drives[name][k]
             value, high = joint[ratio]["value"], joint[ratio]["high"]
             assert stated.value == pytest.approx(value)
-            # not equal: the record has the interval of the logarithm, and for the lag includes 3 % of the delay
+            # Posterior and record (config.json) have different upper ends: the record's interval is symmetric in the
+            # logarithm of the ratio. Both contain a model error of 3 %, for the lag (kd/kp plus delay) of the whole lag
+            # in the record, and of kd/kp only in the posterior.
             assert 0.5 < (stated.high - value) / (high - value) < 1.05
     with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
         posterior.torque(*np.zeros((3, 1, 2)))
@@ -415,7 +419,10 @@ def test_incompatible_models_and_logs_are_reported(arm, logs, robots):
 
 
 def moved(model, seconds, count=1):
-    """Simulate logs of a model in which the commands of both joints jump at the same time, with small steps."""
+    """Simulate `count` logs of a model, in which the commands of both joints jump every 0.5 s at the same time.
+
+    seconds: duration of a log [s]. The integration step is 2.5 ms; the logs have one sample per 20 ms.
+    """
     with torch.no_grad():
         model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)

@@ -188,7 +188,8 @@ def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm
 
 
 def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
-    # the mapping states degrees for positions and commands: commands in rad, converted too, are nearly constant
+    # The mapping states degrees for positions and commands. Commands in rad are therefore multiplied by pi / 180, too,
+    # and are nearly constant.
     small = changed(logs, u=lambda x: np.radians(x.u))
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     assert len(errors) == 1
@@ -284,7 +285,8 @@ def test_position_errors_show_senses_and_order_of_servos(arm, seed):
     logs = [replace(x, mapping=LogMapping(input="position")) for x in servo_logs(1, 20.0, seed=seed)]
     assert not spelgen.check_logs(logs, arm).errors
     (error,) = map(str, spelgen.check_logs([opposite(x, 1) for x in logs], arm).errors)
-    # gravity of this arm determines the relative sense of its two joints only
+    # Gravity torques of this arm are the same if both joints are reversed. They determine the sense of one joint
+    # relative to the other, but not which joint is reversed.
     assert "elbow: {sign: -1}" in error and "--accept joint-sense" in error
     exchanged = changed(logs, q=lambda x: x.q[:, ::-1], qd=lambda x: x.qd[:, ::-1], u=lambda x: x.u[:, ::-1])
     (error,) = map(str, spelgen.check_logs(exchanged, arm).errors)

@@ -52,9 +52,9 @@ def test_a_planar_chain_separates_shared_functions():
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
-    """M equals the sum over outputs and constants, times their matrices.
+    """M(q) = sum_j f_j(q) B_j + sum_k c_k A_k for outputs f_j, constants c_k, and matrices B_j, A_k of the structure.
 
-    Values of outputs and constants are the weighted entries of M that the structure states.
+    The values of f_j and c_k are computed from M: as the weighted sums of its entries that the structure states.
     """
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.chain)
@@ -69,16 +69,19 @@ def test_smallest_form_is_exact(robots, robot):
 
 
 def test_factors_are_exact_fractions(robots):
-    """Factors in M are exact fractions: by eq. 20 of the paper, M_11 of two_link has twice the function of M_21."""
+    """Factors in M are exact fractions: M_11 of two_link has the factor 2 of the function of q that M_21 contains.
+
+    The factor is in eq. 20 of Wang, Chen and Ding, Sci Rep 15:33179, 2025.
+    """
     structure = derive(load_arm(robots / "two_link.urdf").chain)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """An arm with random geometry has n(n+1)/2 - 1 outputs and one constant.
+    """M of an arm with n joints and random geometry has n(n+1)/2 - 1 varying terms (outputs) and one constant term.
 
-    All entries of M except M_nn vary, with one linear relation between them.
+    All entries of the lower triangle vary independently, except M_nn, which is constant.
     """
     structure = derive(random_arm(joints, seed))
     assert (len(structure.outputs), len(structure.constants)) == (joints * (joints + 1) // 2 - 1, 1)

@@ -108,7 +108,10 @@ def test_names_of_columns_may_be_in_any_character_set_of_spreadsheets(scara, tmp
 def test_a_state_of_positions_and_velocities_is_recognised_by_its_values(
     scara, tmp_path, form, state, torque
 ):
-    """A draft assigns the last half of a state [q; qd] to the velocities; its names do not state them."""
+    """A suggested mapping assigns the first half of a state [q; qd] to positions and the last half to velocities.
+
+    The column names (x0 to x7) do not distinguish both halves, so the values determine the assignment.
+    """
     if form == "matrices":
         path = tmp_path / "log.npz"
         np.savez(path, **{"t": T, state: np.column_stack([Q, QD]), torque: TAU})
@@ -129,7 +132,10 @@ def test_matrices_of_two_arms_are_refused(scara, tmp_path, form):
 
 
 def test_units_and_clocks_in_the_middle_of_names(scara, tmp_path):
-    """A unit may precede a number, and a stamp may be called nanos; torques of disturbances are not torques."""
+    """A unit in a column name may precede the joint number (load_0.1%_0); times may be two columns, one of nanoseconds.
+
+    Columns of disturbance torques (DistTrq) are not suggested as joint torques.
+    """
     head = ["stamp_seconds", "stamp_nanos", *(f"q{k}/°" for k in range(4))]
     head += [f"{name}_{k}" for name in ("speed", "load_0.1%", "DistTrq") for k in range(4)]
     whole = np.floor(1.7e9 + T)
@@ -157,7 +163,11 @@ def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
 
 
 def test_times_that_fall_are_called_so(scara, tmp_path):
-    """The error about the time that remains does not advise to make a recording of each row."""
+    """If times fall from row to row, such as remaining times, the error states this and advises `sample_rate`.
+
+    Times that fall only at some rows are start times of recordings, which the error advises to number; here each row
+    would be a recording.
+    """
     head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in scara.chain.joint_names)]
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
     with pytest.raises(LogError, match=r"got times that fall from .*write 'sample_rate: HZ'"):
@@ -170,7 +180,10 @@ def test_times_that_fall_are_called_so(scara, tmp_path):
 
 @pytest.mark.parametrize("file", ["struct.mat", "flat.mat", "dict.npy"])
 def test_files_of_matlab_and_pickles_are_converted_by_the_printed_command(scara, tmp_path, file):
-    """The command converts structs and dicts, too; a pickle only with a warning. MATLAB 7.3 files are HDF5."""
+    """The error about a MATLAB or pickled file prints a command that converts it, also from a struct or dict.
+
+    It warns of pickles, which may execute code. For files of MATLAB 7.3, which are HDF5, it advises h5py.
+    """
     arrays = {"t": T, "q": Q, "qd": QD, "tau": TAU}
     if file == "dict.npy":
         np.save(tmp_path / file, arrays, allow_pickle=True)
@@ -208,7 +221,7 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
         LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"
     ):
         suggest_mapping(path, scara.chain.joint_names)
-    with pytest.raises(LogError, match="or write their names under 'logs'"):  # and not: rename effort to q
+    with pytest.raises(LogError, match="or write their names under 'logs'"):  # not to rename effort to q
         read_logs(path, scara)
 
 

@@ -15,7 +15,10 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """Outputs, constants and relations of the structure agree with the coefficients of the exact polynomials."""
+    """Numbers of varying terms (outputs) and constant terms of M equal ranks of the exact polynomials' coefficients.
+
+    The zero entries of M, and the joints that each entry, each output and V depend on, are also equal.
+    """
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
 
@@ -68,9 +71,10 @@ def _joints_of(polynomial, n: int) -> set[int]:
 
 
 def test_two_link_is_the_papers_equation_20(robots):
-    """The polynomials of two_link are eq. 20 of the paper: M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]].
+    """M of two_link is [[7/2 + 2 f, 5/4 + f], [5/4 + f, 5/4]] with f = cos(q2) / 2, as derived by hand.
 
-    Each link is 1 m long, with its centre of mass in the middle.
+    M has the form of eq. 20 of Wang, Chen and Ding, Sci Rep 15:33179, 2025. Each link is 1 m long and has 1 kg and
+    1 kg m^2 at its centre of mass in the middle.
     """
     true = polynomials(load_arm(robots / "two_link.urdf").chain, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {

@@ -51,9 +51,10 @@ def recordings(loaded):
 
 
 def test_the_protocol_is_the_papers(loaded):
-    """The settings have the simulation of the paper: six PID controllers on sines of 30 degrees at 1/8 Hz.
+    """The settings state the simulation of Wang, Chen and Ding (Sci Rep 15:33179, 2025).
 
-    There are 24,000 samples at 500 Hz, 70 % of them for training; the controller has 125 Hz.
+    Six PID controllers at 125 Hz track sines of 30 degrees at 1/8 Hz. There are 24,000 samples at 500 Hz, 70 % of them
+    for training.
     """
     protocol, motion = loaded.settings.simulation, loaded.settings.tracking
     assert (protocol.sample_rate, motion.control_rate, motion.frequency) == (500, 125, 1 / 8)
@@ -241,9 +242,9 @@ def test_every_joint_whose_range_is_too_small_is_reported():
 
 
 def test_by_default_an_arm_is_controlled(shared):
-    """By default, simulated arms are under a controller.
+    """By default, simulated arms move under a controller.
 
-    One of the two arms would fall within a second, the other would be stopped by friction at once.
+    Without a controller, one of the two arms (no friction) would fall within a second; friction would stop the other.
     """
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")

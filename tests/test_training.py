@@ -51,7 +51,7 @@ QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
 
 
 def quick(**changed) -> Rollout:
-    """Return the options `QUICK` with changes; with another optimizer than AdamW, its options are omitted."""
+    """Return the options `QUICK` with changes; batch and learning_rate are omitted for optimizers other than AdamW."""
     options = QUICK.model_dump(exclude_unset=True) | changed
     if options["optimizer"] != "adamw":
         options = {name: x for name, x in options.items() if name not in ("batch", "learning_rate")}

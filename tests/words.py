@@ -73,7 +73,7 @@ def constructions(text: str) -> Counter[str]:
 
 
 def files() -> list[tuple[str, Path]]:
-    """Return the package and the path of each file; this file is omitted, as its table consists of the words."""
+    """Return (package, path) of each checked file; this file is omitted, as it contains all counted constructions."""
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
     kept = [path for path in paths if path != Path(__file__) and "golden" not in path.parts]
     return [(path.parent.relative_to(ROOT).as_posix(), path) for path in kept]
