@@ -58,8 +58,8 @@ def wrist(tmp_path_factory):
     return import_source(generate(arm, preset="closed-form"), folder / "wrist.py"), arm
 
 
-def moved(model, seconds, seed=0):
-    """Return q, qd and qdd, (T, 6) each, of a random motion at 100 Hz: sums of four sines. `model` is not used."""
+def moved(seconds, seed=0):
+    """Return q, qd and qdd, (T, 6) each, of a random motion at 100 Hz: sums of four sines."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 0.01)[:, None, None]
     speed, phase, size = (rng.uniform(*x, (4, 6)) for x in ((0.7, 4.0), (0.0, 6.3), (0.2, 0.5)))
     q, qd, qdd = ((size * speed**k * np.sin(speed * t + phase + k * np.pi / 2)).sum(axis=1) for k in range(3))
@@ -95,14 +95,14 @@ def test_motor_speeds_are_of_the_joint_that_each_moves_most(wrist):
 
 
 def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
-    module, arm = wrist
+    _, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     errors = []
     for drives in (arm.actuation.drives(), None):
-        motion = moved(module, 20.0)
+        motion = moved(20.0)
         tau, _ = on_motors(*motion, arm, strength, armature)
         found = least_squares(arm.chain, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), drives)
-        fresh = moved(module, 10.0, seed=1)
+        fresh = moved(10.0, seed=1)
         tau, measured = on_motors(*fresh, arm, strength, armature)
         errors.append(np.square(found.torque(*fresh) - tau).mean(axis=0) / tau.var(axis=0))
         if drives is not None:
@@ -119,11 +119,11 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
 def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     module, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
-    motion = moved(module, 6.0)
+    motion = moved(6.0)
     _, tau = on_motors(*motion, arm, strength, armature)
     model = module.Model()
     fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
-    fresh = moved(module, 10.0, seed=1)
+    fresh = moved(10.0, seed=1)
     _, tau = on_motors(*fresh, arm, strength, armature)
     with torch.no_grad():
         found = model.inverse_dynamics(*(torch.from_numpy(x) for x in fresh)).numpy()
@@ -133,10 +133,10 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
 def test_derivatives_are_right_for_coupled_motors(wrist):
     """With coupled motors, derivatives of the fit with respect to every parameter equal finite differences."""
     module, arm = wrist
-    motion = [x[::40] for x in moved(module, 4.0)]
+    motion = [x[::40] for x in moved(4.0)]
     _, tau = on_motors(*motion, arm, np.ones(6), np.ones(6))
     model = module.Model(seed=1)
-    z = bristles_along(moved(module, 4.0)[0], bristle_reach(model))[::40]
+    z = bristles_along(moved(4.0)[0], bristle_reach(model))[::40]
     jacobian = TorqueJacobian(model, TorqueSamples.of([DynamicsSamples("x", *motion, tau, z)]))
     noise = torch.ones(6).double()
     start = jacobian.rigid.flatten(jacobian.rigid.initial)
@@ -161,7 +161,7 @@ def test_energy_and_memory_are_those_of_the_motors(wrist):
     module, _ = wrist
     model = module.Model()
     with torch.no_grad():
-        q, qd, _ = (torch.from_numpy(x[:50]) for x in moved(module, 1.0))
+        q, qd, _ = (torch.from_numpy(x[:50]) for x in moved(1.0))
         torque, dissipation = model.friction_torque(q, qd), model.dissipation(q, qd)
         torch.testing.assert_close((dissipation @ qd.unsqueeze(-1)).squeeze(-1), torque)
         assert torch.linalg.eigvalsh(dissipation).min() >= 0
@@ -190,7 +190,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     np.testing.assert_allclose(arm.actuation.drives().speeds, driven.actuation.drives().speeds)
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     module = import_source(generate(arm, preset="closed-form"), tmp_path / "joint_torques.py")
-    motion, fresh = moved(module, 6.0), moved(module, 10.0, seed=1)
+    motion, fresh = moved(6.0), moved(10.0, seed=1)
     (tau, _), (expected, _) = (on_motors(*x, driven, strength, armature) for x in (motion, fresh))
     samples = [DynamicsSamples("x", *motion, tau)]
     found = least_squares(arm.chain, samples, LeastSquares("range"), arm.actuation.drives())
@@ -210,7 +210,7 @@ def recorded(arm, logged_at, ratio, late=0.0):
     """
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 20.0, 0.01)
-    q, qd, qdd = moved(None, 20.0, seed=3)
+    q, qd, qdd = moved(20.0, seed=3)
     speeds = np.eye(6)
     speeds[5, 4] = ratio
     friction = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0])

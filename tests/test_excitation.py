@@ -82,7 +82,7 @@ def test_a_random_motion_beyond_effort_limits_is_called_so(found):
     assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
 
 
-def test_the_condition_number_is_that_of_the_regressor(arm, found):
+def test_the_optimised_motion_excites_all_base_parameters(arm, found):
     """The optimised motion excites all 36 base parameters: Pinocchio's rigid-body regressor along it has rank 36.
 
     Relative to the largest singular value, the 36th is above 1e-3 and the 37th below 1e-9.

@@ -76,7 +76,7 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
     assert {name: found for name, found in wrong.items() if found} == {}
 
 
-def test_no_file_imports_from_a_higher_layer():
+def test_no_file_imports_a_module_that_is_excluded_for_it():
     """No file imports, directly or through other files, a module that NEVER lists for it, such as torch in `arm`."""
     wrong = {}
     for name, never in NEVER.items():

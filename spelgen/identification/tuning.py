@@ -106,7 +106,8 @@ class LogGeometryTuning:
     min_angle: float = 0.09
     # [rad] Tilts of the base below this bound are errors of the mounting and are not reported.
     min_tilt: float = 0.06
-    # [m] Zero offsets of prismatic joints below this bound are calibration errors and are not reported.
+    # [m, rad] Zero offsets of prismatic joints below this bound are calibration errors and are not reported. It is also
+    # the accuracy, in rad, of large zero offsets of revolute joints.
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are not reported: friction causes an apparent delay of up to 30 ms.
     min_delay: float = 0.03
