@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import LogError
+from spelgen.logs.arm_mapping import log_source
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
@@ -681,6 +682,25 @@ def test_minutes_of_a_clock_are_converted(scara, tmp_path):
     head = ["time [min]", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     path = written(tmp_path / "log.csv", head, np.column_stack([T / 60, Q, QD, TAU]))
     require_same(suggested(path, scara)[0])
+
+
+def test_velocities_per_minute_are_converted(scara, tmp_path):
+    """Velocities in rad/min and in mm/min, a unit of feed rates, are converted with the factor of their unit."""
+    units, factors = ["rad per min", "rad/min"] * 2, np.full(4, 60.0)
+    slider = log_source(scara).joint_types.index("prismatic")
+    units[slider], factors[slider] = "mm/min", 60e3
+    head = ["t", *(f"q{k}" for k in range(4)), *(f"qd{k} [{x}]" for k, x in enumerate(units))]
+    rows = np.column_stack([T, Q, factors * QD, TAU])
+    path = written(tmp_path / "log.csv", [*head, *(f"tau{k}" for k in range(4))], rows)
+    require_same(suggested(path, scara)[0])
+
+
+@pytest.mark.parametrize("index", [T, (1e9 * T).astype("datetime64[ns]")])
+def test_an_index_of_pandas_without_a_name_is_the_clock(scara, tmp_path, index):
+    """The first column of a CSV needs no name if its values are times: pandas writes an index so."""
+    head = ["", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = [[x, *row] for x, row in zip(index, np.column_stack([Q, QD, TAU]), strict=True)]
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
 
 
 def test_exponents_of_fortran_are_read(scara, tmp_path):

@@ -107,6 +107,8 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     text = _beginning(content)
     content, footer = _without_footer(content, text)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
+    # pandas writes the index of a table, often its times, as a first column without a name.
+    columns = names or [name or f"column {k}" for k, name in enumerate(text.names, start=1)]
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
     wrong: list[pa.csv.InvalidRow] = []
@@ -127,7 +129,7 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     # costs 0.02 s for 17 MB.
     table = pa.csv.read_csv(
         pa.BufferReader(content),
-        pa.csv.ReadOptions(use_threads=False, skip_rows=text.lines, column_names=names or text.names),
+        pa.csv.ReadOptions(use_threads=False, skip_rows=text.lines, column_names=columns),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),

@@ -363,7 +363,7 @@ def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]
     for quantity, named in by_joint.items():
         for joint, column in named.items():
             unit = mapped_unit(quantity, column.unit)
-            if unit is None and quantity == "qd" and "q" in units[joint]:
+            if not column.unit and quantity == "qd" and "q" in units[joint]:
                 unit = f"{units[joint]['q']}/s"
             if unit is None and quantity == "tau" and column.words & CURRENT:
                 unit = "A"

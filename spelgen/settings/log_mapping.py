@@ -47,6 +47,9 @@ UNIT_NAMES: dict[str, dict[str, str]] = {
     }.items()
 }  # fmt: skip
 UNIT_NAMES["qd"] |= {f"{name}/s": f"{unit}/s" for name, unit in UNIT_NAMES["q"].items()}
+for _name, _unit in UNIT_NAMES["q"].items():
+    _factor, _, _plain = _unit.rpartition(" ")
+    UNIT_NAMES["qd"].setdefault(f"{_name}/min", f"{float(_factor or 1) / 60:.11g} {_plain}/s")
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
@@ -112,6 +115,7 @@ def plain_unit(text: str) -> str:
         size = float(match[2] or match[5])
         factor = f"{1 / size if size > 1 and (match['x'] or match[5]) else size:.9g} "
     unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", unit)
+    unit = re.sub(r"(/|[\s_]per[\s_])min(utes?)?$", "/min", unit)
     return factor + re.sub(r"[\s.·⋅*-]", "", unit)
 
 
