@@ -199,8 +199,11 @@ def _change(
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
-    quantity = float(best.quantities[0, 0])
-    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    factor, offset = 1.0, float(best.quantities[0, 0])
+    if best is refits[0]:
+        # `torque` is a compromise of both parts: the refitted parameters give the torque before the change.
+        scaled, before = columns[0][..., 0], rows @ best.parameters
+        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * before).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
     # Other faults of the log cause a large residual.
     if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
@@ -217,6 +220,7 @@ class _Refit(NamedTuple):
 
     Attributes:
         misfit: negative log likelihood.
+        parameters: (K,) parameters of the arm.
         errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
         residual: torques of the model minus the logged torques, (S, n) [Nm, N].
         quantities: (R, D) quantities of the parts.
@@ -224,6 +228,7 @@ class _Refit(NamedTuple):
     """
 
     misfit: float
+    parameters: np.ndarray
     errors: np.ndarray
     residual: np.ndarray
     quantities: np.ndarray
@@ -253,4 +258,4 @@ def _refit(
         fit = replace(fit, errors=errors, parameters=parameters)
     shape = len(parts), size
     added = covariance[count:, count:].reshape(*shape, *shape)
-    return _Refit(problem.misfit(errors), errors, residual, change[count:].reshape(shape), added)
+    return _Refit(problem.misfit(errors), parameters, errors, residual, change[count:].reshape(shape), added)

@@ -211,12 +211,16 @@ class PositionUnit(WrongScale):
 
         A single joint is omitted if the hypothesis of `base` already changes its unit.
         """
-        yield from super().fits(problem, base)
-        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
-        if base.errors.max() <= GEOMETRY.explained:
-            return
+        units = list(super().fits(problem, base))
+        yield from units
+        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained, and
+        # the factors of several joints must halve the residual.
+        lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
-        yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
+        for joints in self._groups if lowest.max() > GEOMETRY.explained else ():
+            if not is_changed[joints].any():
+                fit = self._free(problem, base, joints)
+                yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
         """Return the least-squares fit with the best factor on the positions of each of m joints.

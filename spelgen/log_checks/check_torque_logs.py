@@ -108,11 +108,9 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints. An error about an unknown unit
-        # of positions is an exception: the torques may show the unit, and an error that states it then replaces it.
+        # The model is fitted only to logs without errors, since faults give wrong hints. An error about a guessed unit
+        # of positions is an exception: an error that states the unit by the torques replaces it.
         self._guessed = summary.guessed
-        if summary.is_presumed and moving is not None:
-            summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]
         is_sound = len(summary.errors) <= bool(self._guessed)
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
@@ -321,6 +319,9 @@ class TorqueLogs:
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
+        if isinstance(unexplained, LogError) and self._guessed:
+            do = f"positions beyond two turns have an unknown unit: {GIVE_GEAR}; {unexplained.do}"
+            unexplained = replace(unexplained, do=do)
         if unexplained is not None:
             yield unexplained
             return
@@ -376,7 +377,7 @@ class TorqueLogs:
         if not motion <= {(None, None), *stated}:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
-        # two turns.
+        # two turns. If this is true of most joints, they may all be logged at their motors.
         width = np.array(
             [
                 min(high - low, 4 * np.pi) if high > low else np.inf
@@ -385,41 +386,11 @@ class TorqueLogs:
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
+        if 2 * len(self._guessed) > len(turning):
+            wide = [turning]
         candidates = position_factors(problem.arm, problem.unchanged.scale[0])
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
-
-    def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
-        """Return an error; the error that most positions are in degrees is replaced if the torques contradict degrees.
-
-        The positions may be the positions of the motors, before gears. If gear ratios of the joints explain the
-        torques much better than degrees, they are advised. If neither explains the torques, no setting is advised.
-        """
-        problem = self._problem(samples)
-        if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
-            return error
-        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
-        coarse = problem.thinned(2 * GEOMETRY.coarse_samples).with_hysteresis()
-        factors = position_factors(problem.arm, problem.unchanged.scale[0])
-        unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
-        fault = PositionUnit([], [turning], PositionUnit([]))
-        best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
-        is_explained = (
-            unit.errors.mean() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
-        )
-        if best.cost > unit.cost - GEOMETRY.needed or is_explained:
-            return error
-        if best.errors.max() <= GEOMETRY.explained:
-            finding = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
-            return finding if isinstance(finding, LogError) else error
-        # the log may have another fault in addition to positions in degrees
-        converted = self._problem(unit.hypothesis.signals(problem.samples))
-        if converted is not None:
-            _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
-            if better and better[0].errors.mean() <= GEOMETRY.explained:
-                return error
-        message, _, unit_text = error.got.partition(": ")
-        do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
-        return replace(error, got=message, do=do)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
