@@ -315,11 +315,16 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        """Return the text that the positions have another unit, with its name, or with the factor of a gear.
+
+        The text also states an opposite sense, unless the hypothesis contains `JointSense`, whose text states it.
+        """
         motion, torque = correction.factors
         texts, ratios = [], dict[str, list[str]]()
+        is_stated = any(isinstance(x, JointSense) for x in correction.hypothesis.faults)
+        is_reversed = [bool(x < 0) and not is_stated for x in motion]
         for k in np.flatnonzero(self.has(motion, torque)).tolist():
-            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * is_reversed[k]
             if unit:
                 texts.append(f"positions in {unit}{sense}")
             else:

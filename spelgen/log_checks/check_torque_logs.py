@@ -108,10 +108,11 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints. An error about a guessed unit
-        # of positions is an exception: an error that states the unit by the torques replaces it.
+        # The model is fitted only to logs without errors, since faults give wrong hints. Errors about a guessed unit of
+        # positions are an exception: an error that states the unit by the torques replaces them.
         self._guessed = summary.guessed
-        is_sound = len(summary.errors) <= bool(self._guessed)
+        guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
+        is_sound = bool(guesses) or not summary.errors
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         if moving is None:
@@ -123,13 +124,14 @@ class TorqueLogs:
             # samples.
             samples = [motion, motion if moving is None else moving]
             loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
-            if self._guessed:
-                errors = [x for x in geometry if isinstance(x, LogError)]
-                geometry = [*(errors or [x for x in summary.errors if isinstance(x, LogError)])]
-                summary.errors.clear()
+            geometry: Sequence[SpelgenError | Diagnostic] = []
+            if not unscaled:
+                geometry = self._geometry_findings(samples, evidence, accepted, loads)
+            if guesses:
+                geometry = [x for x in geometry if isinstance(x, LogError)] or guesses
+                summary.errors[:] = [x for x in summary.errors if x not in guesses]
             summary.extend(geometry)
-            is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
+            is_right = not any(isinstance(x, SpelgenError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
             if is_right:
