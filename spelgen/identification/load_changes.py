@@ -205,8 +205,9 @@ def _change(
         scaled, before = columns[0][..., 0], rows @ best.parameters
         factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * before).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
-    # Other faults of the log cause a large residual.
-    if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
+    # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
+    remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
+    if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained:
         return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction

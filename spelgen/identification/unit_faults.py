@@ -81,8 +81,8 @@ class TorqueUnit(WrongScale):
         The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
         the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
-        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
-        joint is small.
+        significantly below the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that
+        the torques do not determine is 1. The factors of all joints are tried only if several have another unit.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if gravity torques in the log gave a candidate.
@@ -98,27 +98,24 @@ class TorqueUnit(WrongScale):
         # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
         if not (is_other.any() or has_gravity):
             return
-        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
             rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
             return problem.fit(present.changed(self, scale=rounded))
 
-        for factors, changed in (
-            (single, is_other),
-            (gains, is_free & (is_other.any() | is_other_unit(common))),
-        ):
-            if not changed.any() or not (changed | (factors == 1)).all():
-                continue
+        is_common, units = bool(is_other_unit(common)), np.eye(len(gains))
+        several = is_free & (is_common or is_other.sum() > 1)
+        for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
+            factors = np.where(changed, factors, 1.0)
             fit = fitted(factors)
             # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
-            # masses may change it by less than this factor.
-            steps = [
-                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
-            ]
-            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
-            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
-            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+            # masses may change it by less than this factor. Other factors become 1.
+            for joint in np.flatnonzero(changed):
+                steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
+                changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
+            fit = fitted(np.where(changed, factors, 1.0))
+            is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
+            if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
                 yield fit
 
