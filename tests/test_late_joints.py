@@ -192,14 +192,29 @@ def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
-    """If torques do not show the gear ratios of positions logged at the motors, no unit such as degrees is advised.
-
-    Here the torque columns are permuted. The error advises to state counts_per_turn: 2 pi times the gear ratio.
-    """
+    """Joints at their motors with torques of another motion: neither degrees nor another unit is advised."""
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, 121.0, 80.0])
-    wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[:, [2, 0, 3, 1]])
+    wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[::-1, [2, 0, 3, 1]])
     error = told(arm, wrong)
     assert "'units: {" not in error and "counts_per_turn', 2 pi times the gear ratio" in error
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize("motion", ["degrees", "motors"])
+def test_the_unit_of_positions_is_named_together_with_the_order_of_the_torques(arm, motion, tmp_path):  # noqa: F811
+    """One error has the lines of both faults: the unit or the gear ratios, and the columns of the torques."""
+    log, order = recorded(arm, 17, noise=0.01), [2, 0, 3, 1]
+    factors = np.full(4, 180 / np.pi) if motion == "degrees" else np.array([101.0, 50.0, 121.0, 80.0])
+    wrong = replace(log, q=log.q * factors, qd=log.qd * factors, tau=log.tau[:, order])
+    error = told(arm, wrong)
+    assert (
+        "--accept torque-order --accept joint-unit" in error
+        or "--accept joint-unit --accept torque-order" in error
+    )
+    write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
+    _, (read,) = mended(arm, error, tmp_path / "log.csv")
+    assert (np.abs(read.q - log.q).max(axis=0) < 0.03 * np.ptp(log.q, axis=0)).all()
+    np.testing.assert_allclose(read.tau, log.tau, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
@@ -210,6 +225,7 @@ def test_degrees_are_advised_also_if_a_joint_has_another_fault(arm, reversed_joi
     degrees = 180 / np.pi
     error = told(arm, replace(log, q=degrees * log.q, qd=degrees * log.qd, tau=log.tau * sign))
     assert "units: {q: deg, qd: deg/s}" in error and "counts" not in error.partition("write")[2]
+    assert (reversed_joint is None) == ("--accept torque-sense" not in error)
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)

@@ -210,11 +210,15 @@ def _change(
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
-    quantity = float(best.quantities[0, 0])
-    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    factor, offset = 1.0, float(best.quantities[0, 0])
+    if best is refits[0]:
+        # `torque` is a compromise of both parts: the refitted parameters give the torque before the change.
+        scaled, before = columns[0][..., 0], rows @ best.parameters
+        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * before).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
-    # A large residual after the change shows that the log has another fault, so the change is not reported.
-    if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
+    # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
+    remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
+    if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained:
         return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
@@ -230,6 +234,7 @@ class _Refit(NamedTuple):
 
     Attributes:
         misfit: negative log likelihood.
+        parameters: (K,) parameters of the arm.
         errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
         residual: torques of the model minus the logged torques, (S, n) [Nm, N].
         quantities: (R, D) quantities of the parts.
@@ -237,6 +242,7 @@ class _Refit(NamedTuple):
     """
 
     misfit: float
+    parameters: np.ndarray
     errors: np.ndarray
     residual: np.ndarray
     quantities: np.ndarray
@@ -268,4 +274,4 @@ def _refit(
         fit = replace(fit, errors=errors, parameters=parameters)
     shape = len(parts), size
     added = covariance[count:, count:].reshape(*shape, *shape)
-    return _Refit(problem.misfit(errors), errors, residual, change[count:].reshape(shape), added)
+    return _Refit(problem.misfit(errors), parameters, errors, residual, change[count:].reshape(shape), added)

@@ -82,11 +82,11 @@ class TorqueUnit(WrongScale):
     ) -> Iterator[HypothesisFit]:
         """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
 
-        The factors are the gains of a fit in which the torque of each joint has an unknown gain. The dynamic coupling
-        of the joints determines the ratios of the gains, and the masses of the URDF their common factor. Gains also
-        compensate errors of the masses, which lowers the cost a little. Separate factors are therefore yielded only if
-        (1) the cost with them, plus a penalty for each factor, is significantly below the cost of `lowest`, (2) each
-        factor is determined, and (3) the relative residual of each joint is small.
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
+        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
+        significantly below the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that
+        the torques do not determine is 1. The factors of all joints are tried only if several have another unit.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if the gravity in the logged torques gave at least one candidate.
@@ -103,27 +103,24 @@ class TorqueUnit(WrongScale):
         # only if the torques contain gravity, which is compared to the URDF's gravity torques.
         if not (is_other.any() or has_gravity):
             return
-        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
             rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
             return problem.fit(present.changed(self, scale=rounded))
 
-        for factors, changed in (
-            (single, is_other),
-            (gains, is_free & (is_other.any() | is_other_unit(common))),
-        ):
-            if not changed.any() or not (changed | (factors == 1)).all():
-                continue
+        is_common, units = bool(is_other_unit(common)), np.eye(len(gains))
+        several = is_free & (is_common or is_other.sum() > 1)
+        for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
+            factors = np.where(changed, factors, 1.0)
             fit = fitted(factors)
             # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
-            # masses may change it by less than this factor.
-            steps = [
-                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
-            ]
-            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
-            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
-            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+            # masses may change it by less than this factor. Other factors become 1.
+            for joint in np.flatnonzero(changed):
+                steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
+                changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
+            fit = fitted(np.where(changed, factors, 1.0))
+            is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
+            if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
                 yield fit
 
@@ -220,13 +217,16 @@ class PositionUnit(WrongScale):
         A group is omitted if the hypothesis of `base` already changes the unit of one of its joints. All groups are
         omitted if `base` explains the torques.
         """
-        yield from super().fits(problem, base)
-        # An optimised factor also compensates small errors of the model: it is tried only if `base` does not explain
-        # the torques.
-        if base.errors.max() <= GEOMETRY.explained:
-            return
+        units = list(super().fits(problem, base))
+        yield from units
+        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained, and
+        # the factors of several joints must halve the residual.
+        lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
-        yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
+        for joints in self._groups if lowest.max() > GEOMETRY.explained else ():
+            if not is_changed[joints].any():
+                fit = self._free(problem, base, joints)
+                yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
         """Return the least-squares fit with the best factors on the positions of a group of m joints.
@@ -329,11 +329,16 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name or the gear ratio, if it is known."""
+        """Return the text that the positions have another unit, with its name, or with the factor of a gear.
+
+        The text also states an opposite sense, unless the hypothesis contains `JointSense`, whose text states it.
+        """
         motion, torque = correction.factors
         texts, ratios = [], dict[str, list[str]]()
+        is_stated = any(isinstance(x, JointSense) for x in correction.hypothesis.faults)
+        is_reversed = [bool(x < 0) and not is_stated for x in motion]
         for k in np.flatnonzero(self.has(motion, torque)).tolist():
-            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * is_reversed[k]
             if unit:
                 texts.append(f"positions in {unit}{sense}")
             else:

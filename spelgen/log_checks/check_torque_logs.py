@@ -109,12 +109,11 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints. An error about an unknown unit
-        # of positions is an exception: the torques may show the unit, and an error that states it then replaces it.
+        # The model is fitted only to logs without errors, since faults give wrong hints. Errors about a guessed unit of
+        # positions are an exception: an error that states the unit by the torques replaces them.
         self._guessed = summary.guessed
-        if summary.is_presumed and moving is not None:
-            summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]
-        is_sound = len(summary.errors) <= bool(self._guessed)
+        guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
+        is_sound = bool(guesses) or not summary.errors
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         if moving is None:
@@ -126,13 +125,14 @@ class TorqueLogs:
             # samples.
             samples = [motion, motion if moving is None else moving]
             loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
-            if self._guessed:
-                errors = [x for x in geometry if isinstance(x, LogError)]
-                geometry = [*(errors or [x for x in summary.errors if isinstance(x, LogError)])]
-                summary.errors.clear()
+            geometry: Sequence[SpelgenError | Diagnostic] = []
+            if not unscaled:
+                geometry = self._geometry_findings(samples, evidence, accepted, loads)
+            if guesses:
+                geometry = [x for x in geometry if isinstance(x, LogError)] or guesses
+                summary.errors[:] = [x for x in summary.errors if x not in guesses]
             summary.extend(geometry)
-            is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
+            is_right = not any(isinstance(x, SpelgenError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
             if is_right:
@@ -323,6 +323,9 @@ class TorqueLogs:
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
+        if isinstance(unexplained, LogError) and self._guessed:
+            do = f"positions beyond two turns have an unknown unit: {GIVE_GEAR}; {unexplained.do}"
+            unexplained = replace(unexplained, do=do)
         if unexplained is not None:
             yield unexplained
             return
@@ -379,7 +382,7 @@ class TorqueLogs:
         if not motion <= {(None, None), *stated}:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
-        # two turns.
+        # two turns. If this is true of most joints, they may all be logged at their motors.
         width = np.array(
             [
                 min(high - low, 4 * np.pi) if high > low else np.inf
@@ -388,45 +391,11 @@ class TorqueLogs:
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
+        if 2 * len(self._guessed) > len(turning):
+            wide = [turning]
         candidates = position_factors(problem.arm, problem.unchanged.scale[0])
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
-
-    def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
-        """Return `error`, or its replacement if it states positions in degrees, and the torques contradict degrees.
-
-        The positions may have been measured at the motors, before gears. If gear ratios explain the torques much better
-        than degrees, the replacement advises them. If neither explains the torques, it states that degrees do not
-        explain them, and advises to write the units.
-
-        samples: filtered samples of all recordings. error: any error of the earlier checks.
-        """
-        problem = self._problem(samples)
-        if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
-            return error
-        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
-        coarse = problem.thinned(2 * GEOMETRY.coarse_samples).with_hysteresis()
-        factors = position_factors(problem.arm, problem.unchanged.scale[0])
-        unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
-        fault = PositionUnit([], [turning], PositionUnit([]))
-        best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
-        is_explained = (
-            unit.errors.mean() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
-        )
-        if best.cost > unit.cost - GEOMETRY.needed or is_explained:
-            return error
-        if best.errors.max() <= GEOMETRY.explained:
-            finding = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
-            return finding if isinstance(finding, LogError) else error
-        # Positions in degrees may explain the torques together with another fault of the log, such as a wrong sense.
-        # The error about degrees is then right.
-        converted = self._problem(unit.hypothesis.signals(problem.samples))
-        if converted is not None:
-            _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
-            if better and better[0].errors.mean() <= GEOMETRY.explained:
-                return error
-        message, _, unit_text = error.got.partition(": ")
-        do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
-        return replace(error, got=message, do=do)
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""

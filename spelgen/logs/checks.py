@@ -82,15 +82,13 @@ AnyCheck = Check[Any]
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions have an unknown unit; later checks may find the unit from the torques.
-    is_presumed: True if a finding about the unit of positions is based only on the range of the positions; later checks
-    test whether the torques contradict it.
+    guessed: names of joints whose unit of positions is concluded from their range only, so that the torques may show
+    another one.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
-    is_presumed: bool = False
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
@@ -331,13 +329,12 @@ class LogChecks:
                 continue
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
-                # At most half of the joints have this fault, so their unit is uncertain: it is removed from the message
-                # (the text after the colon), and no setting is advised. The check of the torques gets their names.
-                message, _, _ = message.partition(": ")
+            if advice.is_guess:
                 summary.guessed.update(names)
-                entries = {}
-            summary.is_presumed |= advice.is_guess
+                if 2 * len(names) <= len(self._limited(names[0])):
+                    # The unit, after the colon of the message, is not certain.
+                    message, _, _ = message.partition(": ")
+                    entries = {}
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
             if names[0] in self._joints:
