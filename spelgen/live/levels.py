@@ -153,14 +153,15 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
-    # them. `limit` is the torque limit in the URDF, but at least 1.2 times the largest logged torque. Without a limit
-    # in the URDF it is a guess, 2.5 times the largest logged torque, which a payload may exceed. A torque then counts
-    # as saturated only from `TUNING.jump` times the guess on.
-    limit = np.maximum(np.where(np.isfinite(effort), effort, 2.5 * largest), 1.2 * largest)
+    # them. A torque limit in the URDF is unknown if logged torques exceed it by more than noise. Instead of an unknown
+    # limit, `limit` is a guess: torques above it (for example under a payload) do not count as saturated up to
+    # `TUNING.jump` times it.
+    is_known = (effort < np.inf) & (1.2 * effort >= largest)
+    limit = np.where(is_known, np.maximum(effort, 1.2 * largest), 2.5 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
         speed=np.abs(joined_column(logs, "qd")).max(axis=0), encoder=encoder, effort=limit, point=point, delay=delay,
-        minutes=sum(log.duration for log in logs) / 60, saturation=np.where(effort < np.inf, 1.0, TUNING.jump),
+        minutes=sum(log.duration for log in logs) / 60, saturation=np.where(is_known, 1.0, TUNING.jump),
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments, pairs = [], []
