@@ -48,10 +48,10 @@ def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> Rows
             continue
         lists = {text: tuple(_list_of(text)) for text in column.unique().drop_null().to_pylist()}
         of_arm = [x for x in lists.values() if set(names.values()) <= set(x)]
-        others = [x for x in lists.values() if len(x) >= len(names) and set(x).isdisjoint(first)]
-        if others and not of_arm:
+        other_arms = [x for x in lists.values() if len(x) >= len(names) and set(x).isdisjoint(first)]
+        if other_arms and not of_arm:
             raise LogError(
-                f"joint states of {', '.join(first)} and of {', '.join(others[0])}", file=file,
+                f"joint states of {', '.join(first)} and of {', '.join(other_arms[0])}", file=file,
                 expected=", ".join(names.values()), do="write each joint's name as 'name' under 'logs', 'joints'",
             )  # fmt: skip
         if len(lists) > 1:

@@ -206,12 +206,12 @@ def logged_column(table: pa.Table, name: str, by_names: RowsByNames | None = Non
     lists, index = table.column(element[0]), element[1]
     if not by_names:
         return _elements(lists, index)
-    wanted = next(iter(by_names))[index : index + 1]
+    joint = next(iter(by_names))[index : index + 1]
     values = pa.nulls(len(table))
     for names, rows in by_names.items():
-        if set(wanted) <= set(names):
-            place = names.index(*wanted) if wanted else index
-            values = pa.compute.if_else(rows, _elements(lists, place), values)
+        if set(joint) <= set(names):
+            index_in_row = names.index(*joint) if joint else index
+            values = pa.compute.if_else(rows, _elements(lists, index_in_row), values)
     return values
 
 
