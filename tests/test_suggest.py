@@ -703,6 +703,15 @@ def test_an_index_of_pandas_without_a_name_is_the_clock(scara, tmp_path, index):
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
 
 
+@pytest.mark.parametrize("gripper", [0, 1])
+def test_columns_of_a_free_base_at_rest_are_omitted(scara, tmp_path, gripper):
+    """States of MuJoCo with a free base: the base has seven positions and six velocities, a gripper one of each."""
+    signals = {"qpos": (7, Q), "qvel": (6, QD), "qfrc_actuator": (6, TAU)}
+    log = {x: np.pad(values, ((0, 0), (base, gripper))) for x, (base, values) in signals.items()}
+    np.savez(tmp_path / "log.npz", time=T, **log)
+    require_same(suggested(tmp_path / "log.npz", scara)[0])
+
+
 def test_exponents_of_fortran_are_read(scara, tmp_path):
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = [[f"{x:.15E}".replace("E", "D") for x in row] for row in np.column_stack([T, Q, QD, TAU])]

@@ -111,17 +111,20 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     ):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
-    moving = [x for x in columns_of["q"] if len(set(_numbers(table, x.name).tolist())) > 1]
+    moving = _changing(columns_of["q"], table)
     require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
-    # to a base or gripper at rest.
+    # to a base or gripper at rest. A base at rest has seven positions, but six velocities and torques.
     moved = {x.number for x in best_signal(moving, len(joints))}
     if len(moved) == len(joints):
+        count = len(columns_of["q"])
         for quantity, named in columns_of.items():
-            complete = [x for x in named if x.number in moved]
-            columns_of[quantity] = complete if {x.number for x in complete} == moved else named
+            complete = (
+                [x for x in named if x.number in moved] if len(named) == count else _changing(named, table)
+            )
+            columns_of[quantity] = complete if len({x.number for x in complete}) == len(moved) else named
     # The order of numbered columns may differ from the order of the arm's joints: ROS often sorts joints by name. If
     # cells of the log contain joint names, they state the order.
     order = _order_in_cells(table, joints)
@@ -265,6 +268,11 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
             )
             got = f"joints in the column {name!r}"
             raise LogError(got, file=file, expected="all joints in each row", do=do)
+
+
+def _changing(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
+    """Return the columns whose values are not all the same."""
+    return [x for x in columns if len(set(_numbers(table, x.name).tolist())) > 1]
 
 
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
