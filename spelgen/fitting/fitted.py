@@ -80,7 +80,7 @@ class Fit:
 
     @property
     def best_validation(self) -> float:
-        """Lowest validation loss: `rollout_loss`; for position servos, RMS position error [rad, m]."""
+        """Lowest validation loss: dimensionless `rollout_loss`; for position servos, RMS position error [rad, m]."""
         return self.checkpoint.best_loss
 
     @property

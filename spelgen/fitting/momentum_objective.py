@@ -75,7 +75,7 @@ class MomentumObjective(Objective):
         self.model.load_state_dict(self.best_weights)
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the momentum stage, unless it was completed before the run was resumed; return the status."""
+        """Run the momentum stage (`_momentum_stage`), unless a resumed run has completed it; return the status."""
         status: Status = "finished"
         if not self.momentum_done:
             self._start_clock()
@@ -126,7 +126,10 @@ class MomentumObjective(Objective):
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient. generator: gives the random order of batches."""
+        """Return a new optimizer, L-BFGS or AdamW with mini-batches, of the parameters that require a gradient.
+
+        generator: random generator for the order of the mini-batches; L-BFGS does not use it.
+        """
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
