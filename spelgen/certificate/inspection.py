@@ -91,12 +91,7 @@ class Inspection:
         }
 
     def text(self) -> str:
-        """Return the inspection as text for a terminal.
-
-        The text has tables of the joints and of the entries of M (zero, constant, or the joints on which the entry
-        depends), the functions and constants that a model needs, the facts with reasons (such as "V does not depend on
-        joint 1"), and remarks on the URDF.
-        """
+        """Return text for a terminal: tables of joints and entries of M, learned functions, facts on M, V, remarks."""
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
@@ -169,7 +164,11 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return a text that lists inputs of the model: torques with known or trained gears, servos, passive joints."""
+        """Return a text for users on the inputs that a model needs.
+
+        Example: "motor torques, gear known at joints 1-3, gear trained at joint 4, joint 5 without a drive". For
+        position servos, see `_servo_needs`.
+        """
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]

@@ -194,7 +194,7 @@ def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
 def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
     """Return the description of a term of M for a comment: the entries of M that contain it, and a unit.
 
-    The unit is the unit of the first entry. Other entries have another unit only if the term has a factor with a unit.
+    The unit is the unit of the first entry; other entries have another unit only if a factor of the term has a unit.
     """
     entries = [entry_name(row, column) for row, column, _ in term.basis]
     row, column, _ = term.basis[0]

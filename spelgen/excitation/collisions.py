@@ -251,11 +251,8 @@ class Collisions:
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
         """Remove pairs of objects that nearly always touch: their distances are not computed. Return their names.
 
-        The objects are shapes of links, the floor and boxes. Two links that overlap at nearly all positions
-        (neighbours, or meshes replaced by convex hulls) would exclude all motions. Positions are random and within the
-        bounds.
-
-        links: number of shapes of links; they are the first objects.
+        Objects are shapes of links, the floor and boxes. Shapes of links that always touch would exclude all motions.
+        The positions of the test are random and within the bounds. links: number of shapes of links, the first objects.
         """
         generator = np.random.default_rng(0)
         random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))

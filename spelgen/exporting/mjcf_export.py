@@ -108,11 +108,11 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         text: content of the MJCF file.
         arm: arm with n coordinates.
         q, qd: positions and velocities of the coordinates, (states, n) [rad, m] and [rad/s, m/s].
-        controls: inputs of the actuators, (states, n).
+        controls: inputs of the actuators, (states, n): torques [Nm, N] or, for position servos, commands [rad, m].
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Friction and limits of joint torques are switched off in MuJoCo, because the reference, the rigid bodies of the
-    # model in `check_mjcf`, has neither: friction in MuJoCo differs from friction in the model. Limits of servo torques
+    # Friction and limits of joint torques are switched off in MuJoCo, because the rigid bodies with which `check_mjcf`
+    # compares MuJoCo have neither. (Friction in MuJoCo differs from friction in the model.) The torque limits of servos
     # are compared.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0

@@ -79,7 +79,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Two sentences for the user on differences from the trained model: of M and gravity torque, and of friction."""
+        """Two sentences for the user on differences from the trained model: of the rigid bodies, and of friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"

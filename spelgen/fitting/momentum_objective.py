@@ -52,7 +52,7 @@ class MomentumObjective(Objective):
         self.allowed = math.inf if minutes is None else 60 * minutes  # time limit of the fit [s]
 
     def prepare(self) -> PreparedLogs:
-        """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""
+        """Check, split and filter the logs, cut windows, make the regularizer towards the URDF. Raises LogError."""
         self.data = prepare_data(self.request, self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
@@ -126,10 +126,7 @@ class MomentumObjective(Objective):
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return a new optimizer, L-BFGS or AdamW with mini-batches, of the parameters that require a gradient.
-
-        generator: random generator for the order of the mini-batches; L-BFGS does not use it.
-        """
+        """Return a new L-BFGS or AdamW optimizer of the trainable parameters; generator: order of AdamW's batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)
