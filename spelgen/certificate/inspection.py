@@ -164,11 +164,7 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return a text for users on the inputs that a model needs.
-
-        Example: "motor torques, gear known at joints 1-3, gear trained at joint 4, joint 5 without a drive". For
-        position servos, see `_servo_needs`.
-        """
+        """Return a text on the model's inputs: "motor torques, gear known at joints 1-3, gear trained at joint 4"."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]

@@ -145,8 +145,8 @@ class ArmInputs(ComparedArm):
         trajectories. Otherwise they are fold ``number`` of a cross-validation with random folds. The seed is fixed: all
         models are tested on the same trajectories.
         """
-        # The logs are read here, since this method runs in a worker process: a job has only the paths of the URDF and
-        # the logs.
+        # Arm and logs are loaded here and not by the caller: a worker process calls this method for a job, and a job
+        # has only the paths of the URDF and the logs.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []

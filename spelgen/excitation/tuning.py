@@ -16,7 +16,7 @@ class ExcitationTuning:
     min_harmonics: int = 5
     # [1] Number of steps from which L-BFGS approximates the curvature.
     history: int = 30
-    # [1] Samples per harmonic at which the criterion is evaluated.
+    # [1] Number of samples of a motion at which the criterion is evaluated, divided by the number of harmonics.
     samples_per_harmonic: int = 12
     # [1] Weight, in the criterion, of the squared excess of a torque over the fraction `effort` of its limit.
     penalty: float = 50.0

@@ -43,7 +43,7 @@ class Fit:
     Attributes:
         history: lines of metrics.jsonl, one per epoch.
         diagnostics: messages about the logs and the fit.
-        status: how the fit ended; None for a run that was loaded.
+        status: status with which the fit ended, such as "finished"; None for a run that was loaded.
         record: content of config.json.
         checkpoint: content of checkpoint.pt.
         baselines: content of least_squares.json, {} without baselines.
