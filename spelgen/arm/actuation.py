@@ -61,7 +61,8 @@ class Actuation:
     - Logs with motor torques: ``entries`` has the entries of all motors, joint torque per motor torque, and
       ``couplings`` is empty.
     - Logs with joint torques: ``entries`` has a 1 on the diagonal of G for each driven joint. ``couplings`` has the
-      joint torques per motor torque of coupled motors, which determine only the motor speeds (see `drives`).
+      joint torques per motor torque of coupled motors. The torques of the model do not depend on ``couplings``, but
+      `drives` computes the motor speeds from them.
 
     joints: number n of joints.
     """
@@ -86,9 +87,9 @@ class Actuation:
     def drives(self) -> Drives:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds need the
-        # couplings: in `torques`, a copy of G, the rows of coupled joints are replaced by the couplings (joint torques
-        # per motor torque).
+        # With logged joint torques, the input matrix G is the identity for coupled joints, but the motor speeds depend
+        # on the couplings (joint torques per motor torque). `torques` is therefore a copy of G in which the rows of
+        # coupled joints are replaced by the couplings. Its transpose gives the motor speeds (see `motor_speeds`).
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -186,7 +187,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
-    # An unknown gear ratio is trained: a ratio of 1 is not assumed.
+    # An unknown gear ratio is trained; 1 is only its initial value. A fixed ratio of 1 would be an assumption.
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)

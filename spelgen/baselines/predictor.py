@@ -90,11 +90,13 @@ def _stepper(
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`); step: (W, 1) [s].
+        """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`) in W windows.
 
-        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]]. D is the
-        derivative of friction with respect to qd. If friction has a state z, which depends on q, K is the derivative of
-        friction with respect to q; otherwise K = 0.
+        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]]. Friction
+        opposes the motion: M qdd contains -friction. D >= 0 is the derivative of friction with respect to qd. If
+        friction has a state z, which depends on q, K >= 0 is its derivative with respect to q; otherwise K = 0.
+
+        state: q, qd, (W, n), and z. tau: torques, (W, n) [Nm, N]. step: (W, 1) [s].
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -175,9 +177,9 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value, the integration error changes the reported errors by about 0.1 %.
     tolerance: float = 5e-2
-    # [1] Fraction of the RMS change of velocity in the windows, a lower bound of the RMS error in the criterion: the
-    # change must be below tolerance * max(RMS error, least_error * RMS change of velocity). Without the bound, an exact
-    # model, whose error is zero, would need the largest number of steps.
+    # [1] Bound for models with nearly no error: in the criterion of `tolerance`, the RMS error is at least this number
+    # times the RMS change of velocity in the windows. Without the bound, an exact model, whose RMS error is zero, would
+    # need the largest number of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16

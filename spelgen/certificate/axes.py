@@ -51,11 +51,13 @@ class Axes:
         # of a configuration. If it is not an identity, the random numbers of one configuration satisfy it by chance
         # with a probability of about d / 1e6.
         configurations = [_configuration(arm, generator) for _ in range(2)]
-        # Exact fractions: directions (2, n, 3) and twists (2, n, 6) of the axes of the n joints.
+        # Unit vectors (2, n, 3) and twists (2, n, 6) of the axes of the n joints at the two random configurations, as
+        # exact fractions.
         self._directions, self._twists = map(np.array, zip(*configurations, strict=True))
-        # The mass balance of the last body is tested if its joint is revolute and its inertials are known. In all other
-        # cases its ten inertial parameters are set to 1: since none of the ten is zero, all attributes about the last
-        # body are False.
+        # The four attributes of this class (`centred` to `without_inertia`) are tests of the inertial parameters of the
+        # last body. They are true only if certain parameters are zero or equal. If the joint is not revolute, or if the
+        # inertial parameters are unknown, all ten are set to 1: since none of them is zero, all four attributes are
+        # then False.
         last = arm.bodies[-1]
         inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
         if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
@@ -106,8 +108,9 @@ class Axes:
         ``slider`` is d sin(a). The entry (slider, hinge) of M is the sum of mass times d sin(a) over these points: it
         is constant if all d are constant, and zero for parallel axes.
         """
-        # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
-        # any plane that is fixed to the child link of `hinge`.
+        # The plane must be fixed to the child link of `hinge`. A revolute joint between `hinge` and `slider` can turn
+        # the axis of `slider`, and thereby the plane: for such an arm the relation is not tested, and the result is
+        # False.
         if not all(self.prismatic[hinge + 1 : slider]):
             return False
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]

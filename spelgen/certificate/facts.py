@@ -95,10 +95,9 @@ class _Sentences:
         # The entries of M whose value has no known geometric reason are listed last, after the explained ones.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # The text of a reason may have a placeholder for one joint of the entry (see `zero_reason`,
-                # `balance_reason`). It is replaced by the joint of the column if this joint is revolute. A prismatic
-                # joint of the column is named in the text itself: the placeholder is then replaced by the joint of the
-                # row.
+                # The text of a reason names one joint of the entry: a prismatic joint of the column, otherwise the
+                # joint of the row. The placeholder in the text is replaced by the other joint, the row's joint in the
+                # first case and the column's joint in the second case. (See `zero_reason` and `balance_reason`.)
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))

@@ -138,7 +138,7 @@ class Formulas:
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The formulas with an expression, of entries of M or of V; a formula with too many terms has no expression."""
+        """The formulas of entries of M and of V that have an expression: all except for those with too many terms."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
@@ -242,8 +242,9 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # Each base parameter contains an inertial parameter, its first one, that occurs in no other base parameter.
-            # The coefficient of this inertial parameter in M or V is the coefficient of the base parameter.
+            # The first inertial parameter in the definition of a base parameter (with the index `base.index`) occurs in
+            # no other base parameter. In M or V, the base parameter therefore has the same coefficient as this inertial
+            # parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":

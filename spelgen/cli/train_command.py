@@ -183,8 +183,9 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     progress = fit.checkpoint
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    # Only fits with the rollout objective have epochs, whose number is printed below. For other fits, the result is
-    # replaced by the summary of a servo fit or, without validation windows, by the number of steps.
+    # Only fits with the rollout objective have epochs; the sentence with their number is made below. For all other
+    # fits, the printed result is the summary of a fit of position servos, the number of steps if there are no
+    # validation windows, and otherwise `fit.result` (torque nMSE or validation loss).
     if not isinstance(config, Rollout):
         from spelgen.fitting.servo.report import servo_summary
 

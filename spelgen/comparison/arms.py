@@ -145,7 +145,8 @@ class ArmInputs(ComparedArm):
         trajectories. Otherwise they are fold ``number`` of a cross-validation with random folds. The seed is fixed: all
         models are tested on the same trajectories.
         """
-        # A job contains only the paths of the URDF and the logs: each worker process loads the files itself.
+        # Arm and logs are loaded here and not by the caller: a worker process calls this method for a job, and a job
+        # has only the paths of the URDF and the logs.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []

@@ -45,7 +45,9 @@ class BristleReach:
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
+    """Return the break-away displacements of K bristles for each of n joints, (n, K) [rad, m], with the matrix C.
+
+    The displacements are constants of the package per joint type (`BREAKAWAY`); they do not depend on C.
 
     kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C, (n, n): the velocities of the drives are
     C qd; None: each drive moves its own joint.

@@ -77,7 +77,7 @@ NamedTensors = Mapping[str, Tensor]
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of the parameters of residual terms that are zero for all q (idle terms).
+    """Return the names of the parameters of idle residual terms. A term is idle if its value is zero for all q.
 
     The list is empty for a model without residual terms.
     """
@@ -94,7 +94,7 @@ def idle_residuals(model: object) -> list[str]:
 
 
 def used_parameter_count(model: nn.Module) -> int:
-    """Return the number of parameters of a model, without parameters of residual terms that are zero for all q."""
+    """Return the number of parameters of a model, without the parameters of idle residual terms (zero for all q)."""
     idle = idle_residuals(model)
     return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 

@@ -134,10 +134,10 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the arguments z and direction of friction, which methods of `dynamics` have after (q, qd, ...).
+    """Return the friction arguments to pass to a method of `dynamics` after (q, qd, ...): (), (z,) or (z, direction).
 
-    Only `RigidBodyDynamics` has the argument ``direction``, and it can be passed only after z. The result is therefore
-    (z, direction), (z,) for other dynamics or without a direction, and () if z is None or friction has no state.
+    The result is () if z is None or friction has no state. It is (z, direction) only for a `RigidBodyDynamics` with a
+    known direction, since other dynamics do not have the argument ``direction``; otherwise it is (z,).
 
     Args:
         dynamics: dynamics whose method is called.
@@ -158,8 +158,8 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts also call `memory` and `memory_after`, the methods of the friction state, on the adapter. They are
-        # therefore copied from `dynamics`.
+        # Rollouts call `memory` and `memory_after`, which compute the friction state, on the adapter as on a trained
+        # model. The methods of `dynamics` become attributes of the adapter.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements
@@ -173,7 +173,7 @@ class VelocityState:
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return qd, (..., n), in place of momenta."""
+        """Return qd, (..., n), in place of momenta: the state of these dynamics is (q, qd), not (q, p)."""
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:

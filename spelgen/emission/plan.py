@@ -65,9 +65,9 @@ class ModelTuning:
     rise: float = 0.02
     # [Nm, N] Full effort of a servo without an effort limit, which determines the initial kp.
     servo_effort: float = 5.0
-    # [rad, m] Position error at which a servo with unknown kp initially has its full effort.
+    # [rad, m] A servo with unknown kp starts the fit with kp = full effort / this position error.
     full_effort_at: float = 0.5
-    # [s] Initial ratio kd / kp of a servo.
+    # [s] Ratio kd / kp with which each servo starts the fit.
     servo_lag: float = 0.05
     # [1] Armature of a drive with unknown rotor inertia and an unknown limit of effort or speed, divided by the joint's
     # diagonal entry of the nominal M.
@@ -141,9 +141,12 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` per learned function f of M: its joints, the matrix that f multiplies, mean and scale.
+    """Return an ``OutputSpec`` per learned function f_k of M = sum_k f_k(q) A_k + constant terms.
 
-    structure: terms of M. sizes: nominal means and standard deviations of the functions.
+    An ``OutputSpec`` has the joints on which f_k depends, the matrix A_k, and the nominal mean and scale of f_k.
+
+    structure: terms of M. sizes: nominal means and standard deviations of the functions. design: gives the encoding of
+    q: with "lie-group", each function depends on all joints.
     """
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
@@ -156,7 +159,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` per trained constant c of M: the matrix that c multiplies, initial value and scale.
+    """Return a ``ConstantSpec`` per trained constant c_k of M: the matrix that c_k multiplies, initial value and scale.
 
     structure: terms of M. sizes: nominal values of the constants.
     """

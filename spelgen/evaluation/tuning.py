@@ -10,16 +10,16 @@ class EvaluationTuning:
     # [s] Time that the momentum observer runs before a prediction; with 0.2 and 0.3 s, predictions of the UR10e of
     # `benchmarks/arms.py` are no better.
     observed_past: float = 0.1
-    # [s] Time constant 1 / K of the momentum observer with the gain K; prediction errors differ by 3 % for 0.02 to 0.1
-    # s on the UR10e of `benchmarks/arms.py`.
+    # [s] Time constant 1 / K of the momentum observer with the gain K. On the UR10e of `benchmarks/arms.py`, the errors
+    # of the predictions that use the observer vary by 3 % between time constants of 0.02 and 0.1 s.
     observer_time_constant: float = 0.05
     # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000
     # [1] Largest number of predicted steps per predictor and horizon. A horizon of k steps has this number / k windows,
     # but at least `fewest_windows`.
     most_predicted_steps: int = 10_000
-    # [1] Smallest number of windows of a horizon, reached at long horizons; there are fewer only if the logs are too
-    # short.
+    # [1] Smallest number of windows per horizon. The number of windows falls with the length of the horizon (see
+    # `most_predicted_steps`), but not below this value unless the logs are too short.
     fewest_windows: int = 100
     # [1] Number of test windows from which the number of integration steps of a model is chosen.
     probed_model_windows: int = 64

@@ -249,9 +249,10 @@ class Collisions:
         return weights
 
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
-        """Remove pairs that are too close at nearly all random positions within the bounds; return their names.
+        """Remove pairs of objects that nearly always touch: their distances are not computed. Return their names.
 
-        links: number of objects that are shapes of links; they are the first objects.
+        Objects are shapes of links, the floor and boxes. Shapes of links that always touch would exclude all motions.
+        The positions of the test are random and within the bounds. links: number of shapes of links, the first objects.
         """
         generator = np.random.default_rng(0)
         random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))
@@ -259,8 +260,9 @@ class Collisions:
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
-            # A pair of a link and the floor, or a box, is removed only if it is too close at all positions (a base on
-            # the floor). In all other cases, the motion must avoid the contact.
+            # `share` is the fraction of positions at which a pair is closer than the clearance. Two links are removed
+            # at a share of at least `TUNING.overlap`, 95 %. A link and the floor, or a link and a box, are removed only
+            # at 100 %, as for a base on the floor: at a smaller share, the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
                 names[" and ".join(self._names_of(pair))] = None
                 self._geometry.removeCollisionPair(objects)

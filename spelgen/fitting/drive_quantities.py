@@ -54,7 +54,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return armature, viscous and Coulomb friction, torque offset and, if trained, gain, (4, n) or (5, n)."""
+        """Return the rows armature, viscous, coulomb, offset and, if trained, gain, (4 or 5, n); see `TORQUE_UNITS`."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
