@@ -37,7 +37,10 @@ def places(thing: str) -> list[str]:
 
 
 def stands_in(thing: str, module) -> bool:
-    """Return True if docs/extending.md names, for the extension `thing`, the file of `module` and at most one more."""
+    """Return True if docs/extending.md names the file of `module`, and at most one other file, for an extension.
+
+    The page states that each extension is a change in one place or two. thing: name of the extension in the page.
+    """
     named = places(thing)
     return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
 

@@ -17,7 +17,10 @@ CENTER = np.array([0.05, 0.02, 0.15])
 
 
 def loaded(arm, log, mass):  # noqa: F811
-    """Return a recording of the arm with a point mass [kg] at `CENTER` [m] of its last link."""
+    """Return the log of the same motion with a load: a point mass `mass` [kg] at `CENTER` [m] of the last link.
+
+    log: log of the arm without a load; the torques of the load are added to its torques.
+    """
     qdd = np.gradient(log.qd, log.t, axis=0)
     inertia = mass * (CENTER @ CENTER * np.eye(3) - np.outer(CENTER, CENTER))
     load = np.concatenate([[mass], mass * CENTER, inertia[np.triu_indices(3)]])

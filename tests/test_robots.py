@@ -124,7 +124,10 @@ def test_no_file_but_the_urdf_is_needed(robot):
 
 
 def test_it_moves_according_to_its_dh_table(robot):
-    """The pose of the last DH frame relative to the last joint's frame is the same at all positions."""
+    """The URDF of a robot moves as the published DH table of the robot states.
+
+    The last frame of the DH table has the same pose relative to the URDF's last joint frame (by Pinocchio) at all q.
+    """
     model = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     data = model.createData()
     tools = []
