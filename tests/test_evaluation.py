@@ -285,7 +285,7 @@ def test_a_folder_that_is_no_run_is_refused(run, tmp_path):
 
 @pytest.mark.usefixtures("short_epochs")
 def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
-    """The URDF's dynamics made the logs, so the errors of the URDF baseline are zero, in torque and at the tip."""
+    """The logs are simulated with the URDF's dynamics, so the URDF baseline has no errors, in torque and at the tip."""
     module = cart.with_name("cart_model.py")
     module.write_text(generate(cart))
     names = load_module(module).joint_names

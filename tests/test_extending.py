@@ -30,7 +30,10 @@ JOINTS = ["joint1", "joint2"]
 
 
 def places(thing: str) -> list[str]:
-    """Return the files that docs/extending.md names for an extension; thing: its name there, such as "a baseline"."""
+    """Return the source files that docs/extending.md names for an extension.
+
+    thing: name of the extension in the first column of the page's table, such as "a baseline".
+    """
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith(f"| {thing} |"))
     return re.findall(r"`(spelgen/[\w/]+\.(?:py|yaml))`", row.split("|")[2])

@@ -64,7 +64,10 @@ def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_are_those_of_inspect(robots, robot):
-    """Base parameters of bodies have names, order, groups and values of `inspect`, and precede those for friction."""
+    """The first base parameters are of the bodies and equal the base parameters of `inspect` in name, order and value.
+
+    The base parameters of friction follow, without a parameter for the armature of joint 1.
+    """
     path = robots / f"{robot}.urdf"
     arm = load_arm(path).chain
     exact = exact_base_parameters(arm)

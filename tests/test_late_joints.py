@@ -211,7 +211,10 @@ def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa:
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize("motion", ["degrees", "motors"])
 def test_the_unit_of_positions_is_named_together_with_the_order_of_the_torques(arm, motion, tmp_path):  # noqa: F811
-    """One error has the lines of both faults: the unit or the gear ratios, and the columns of the torques."""
+    """If positions have a wrong unit and torque columns are exchanged, one error advises a correction of both.
+
+    motion: positions in degrees, which need a unit, or positions at the motors, which need gear ratios.
+    """
     log, order = recorded(arm, 17, noise=0.01), [2, 0, 3, 1]
     factors = np.full(4, 180 / np.pi) if motion == "degrees" else np.array([101.0, 50.0, 121.0, 80.0])
     wrong = replace(log, q=log.q * factors, qd=log.qd * factors, tau=log.tau[:, order])

@@ -175,7 +175,7 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # predictions of more than 0.3 s ahead do not include the disturbance
+    # predictions of more than 0.3 s ahead do not include the estimated disturbance torque
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
     # The first payload report comes after these 180 samples, so the predicted torque does not include the payload yet.
@@ -546,7 +546,7 @@ def test_thresholds_hold_in_a_log_that_differs(levels):
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
-    # at most one alarm in 50 s
+    # 100 windows are 50 s, in which the thresholds for one alarm per minute may cause one alarm
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3

@@ -66,7 +66,8 @@ def segments(files: list[Path], arm: Arm) -> Trajectory:
 def test_c_equals_python_along_recordings(name, tmp_path):
     """C and Python estimators give equal outputs along recordings, in conditions that use each part of the estimator.
 
-    The model is not fitted, the noise is as large as its residuals, and torques are delayed.
+    The model is not fitted to the recordings, so the noise levels are as large as its torque residuals. The noise
+    levels state that torques are delayed.
     """
     urdf = SHARED / ("arms/panda_erd.urdf" if name == "panda" else f"logs/{name}/{name}.urdf")
     files = sorted((SHARED / "logs" / name).glob("*.parquet"))

@@ -28,7 +28,7 @@ def loaded(arm, log, mass):  # noqa: F811
 
 
 def parts(log, count=4):
-    """Split a recording into `count` recordings, which have the same arm and different motions."""
+    """Split a recording into `count` consecutive recordings of equal length, and so of different motions."""
     size = len(log.t) // count
     return [replace(log[k * size : (k + 1) * size], name=f"part {k}") for k in range(count)]
 

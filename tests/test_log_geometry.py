@@ -337,9 +337,9 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
 
 
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
-    """In a log with too little motion, reversed joints are not searched: a remark states the small motion.
+    """A log with too little motion is not tested for faults such as a reversed joint: a remark states the small motion.
 
-    Friction before sliding determines such torques, and wrong hypotheses would explain them better.
+    Its torques are mostly friction before sliding, which a wrong hypothesis may explain better than the right one.
     """
     log = recorded(arm, 18)
     small = replace(log, q=log.q[0] + 0.002 * (log.q - log.q[0]), qd=0.002 * log.qd)

@@ -92,8 +92,8 @@ READ = {
 }
 
 
-# per file: numbers of joints, varying terms of M (outputs), constant terms of M, joints that V depends on, and base
-# parameters
+# Five numbers per file: joints, varying terms of M (outputs), constant terms of M, joints that V depends on, and base
+# parameters.
 FACTS = {
     "koch_limit_without_effort": (6, 18, 3, 5, 36),
     "so100_link_joint_same_name": (5, 12, 3, 4, 29),

@@ -48,7 +48,10 @@ from tests.test_closed_form import drawn
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
-    """Base parameters of fits have the same names and combinations as in `identify`: reports match them by name."""
+    """Base parameters of fits are the same combinations, under the same names, as in `identify`.
+
+    Reports compare the values of both by name.
+    """
     urdf = robots / f"{robot}.urdf"
     if robot in ("followed", "gantry"):
         urdf = tmp_path / f"{robot}.urdf"

@@ -90,7 +90,7 @@ class Facts:
 
 
 def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
-    """Return `Facts` on the structure of an arm, computed by Pinocchio at random configurations.
+    """Return the facts on the structure of an arm (see `Facts`) from M and V of Pinocchio at random configurations.
 
     inertials: True for the inertial values of the URDF, False for random values at each configuration.
     """

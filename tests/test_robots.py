@@ -166,7 +166,10 @@ def test_three_parallel_joints_save_outputs():
 
 @pytest.mark.parametrize(("robot", "other"), [("panda", "panda_erd"), ("ur10e", "ur10e_official")])
 def test_its_joints_are_where_the_manufacturers_file_has_them(robot, other, shared):
-    """All joints after the first are at the poses of the manufacturer's URDF, whose base link is rotated."""
+    """Each joint has the same pose relative to the preceding joint as in the manufacturer's URDF.
+
+    The first joint is not compared, since the base link of the manufacturer's URDF is rotated.
+    """
     ours = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     theirs = pin.buildModelFromUrdf(str(shared / "arms" / f"{other}.urdf"))
     for joint in range(2, ours.njoints):

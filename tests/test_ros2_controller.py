@@ -43,9 +43,10 @@ def started(arm, **parameters):
 
 
 def torques(model, q, qd, qdd, friction_of=None):
-    """Return the torques of the torch model; friction states result from sliding at ``friction_of``.
+    """Return the torques (n,) [Nm, N] of the inverse dynamics of the torch model at q, qd and qdd, (n,) each.
 
-    friction_of: velocities (n,); None: joints that have not moved.
+    friction_of: velocities (n,) at which the joints slid before, which determine the friction states; None: the joints
+    have not moved.
     """
     states = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
     moved_at = states[1] * 0 if friction_of is None else torch.as_tensor(friction_of)

@@ -358,9 +358,10 @@ def test_noise_is_estimated_per_joint():
 
 
 def test_noise_is_corrected_for_degrees_of_freedom():
-    """The noise is corrected for the degrees of freedom of the fit.
+    """The squared residual is divided by the degrees of freedom: independent errors minus parameters, at least 1.
 
-    With ten independent errors, the squared residual is divided by 6 for four parameters, by 1 for twenty parameters.
+    With 50 samples and a correlation length of 5 there are ten independent errors. The divisor is 10 without
+    parameters, 6 for four parameters, and 1 for twenty parameters.
     """
     estimator, squares = (
         torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
