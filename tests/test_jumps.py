@@ -395,7 +395,7 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
 
 @pytest.mark.parametrize("form", ["degrees", "two's complement", "sign and magnitude"])
 def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
-    """If the registers of positions q and commands u are not decoded, one advised line corrects all joints.
+    """Positions q and commands u that are logged as raw register values are one error with one line for all joints.
 
     form: encoding of negative values in the registers. The elbow stays near 0, so that only changes of sign show it.
     """

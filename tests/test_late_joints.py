@@ -197,10 +197,10 @@ def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
-    """Gear ratios of positions logged at the motors are found from the torques, unless these are of another motion.
+    """If positions are logged at the motors and torques are of another motion, the gear ratios cannot be found.
 
-    In that case, here for reversed times and exchanged torque columns, the error advises no unit such as degrees. It
-    asks for the encoder setting of the joints, counts_per_turn = 2 pi times the gear ratio.
+    Here the torques are reversed in time and their columns exchanged. The error advises no unit such as degrees, but
+    the setting counts_per_turn = 2 pi times the gear ratio of each joint, which the user knows.
     """
     log, gears = recorded(arm, 17, noise=0.01), np.array([101.0, 50.0, 121.0, 80.0])
     wrong = replace(log, q=log.q * gears, qd=log.qd * gears, tau=log.tau[::-1, [2, 0, 3, 1]])

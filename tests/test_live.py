@@ -348,8 +348,8 @@ def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
     """Samples with torques beyond the effort limit of the URDF are refused as saturated if the limit is plausible.
 
     A limit that logged torques exceed is wrong, and so unknown, as without a limit. Then four times the largest logged
-    torque is used; only ten times this torque is refused. effort: limit of the URDF, divided by the largest logged
-    torque. expected: result for four times this torque.
+    torque is used; only more than ten times this torque is refused. effort: limit of the URDF, divided by the largest
+    logged torque. expected: result for four times the largest logged torque.
     """
     model, log, _ = arm
     largest = np.abs(log.tau).max(axis=0)

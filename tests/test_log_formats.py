@@ -712,7 +712,7 @@ def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path, footer)
 def test_a_line_of_units_counts_at_each_place_beside_the_header(tmp_path, place):
     """A line of units above or below the header, or in a comment, is not ignored.
 
-    It states mNm for the torques here. Torques are expected in Nm, so the error asks to state `units: {tau: mNm}`.
+    It states mNm for the torques here. Torques are expected in Nm, so the error advises to state `units: {tau: mNm}`.
     """
     lines = text_log().splitlines()
     units = UNIT_LINE.replace("Nm", "mNm")

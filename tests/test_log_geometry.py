@@ -315,9 +315,9 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
-    """Torque columns that contain another signal give one finding, which asks the user to check the columns.
+    """Torque columns that contain another signal give one finding, which advises the user to check the columns.
 
-    It advises no settings line, since none would correct them. If it is an error, it names the option that accepts it.
+    It has no settings line, since none would correct them. A finding that is an error names the option to accept it.
     """
     log, rng = recorded(arm, 18), np.random.default_rng(18)
     other = log.tau.std(axis=0) * lfilter([0.2], [1, -0.98], rng.standard_normal(log.tau.shape), axis=0)

@@ -200,7 +200,7 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
     """`exact_rotation`, a rational approximation, keeps the zero entries of a rotation exactly.
 
-    Roll, pitch and yaw are multiples of 45 degrees. The cosine of an odd multiple, sqrt(1/2), is not rational.
+    Roll, pitch and yaw are multiples of 45 degrees. The cosine of 45 degrees, sqrt(1/2), is not rational.
     """
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])

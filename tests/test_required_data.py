@@ -24,7 +24,7 @@ DECORATION = """<gazebo reference="nobody"><sensor type="camera"><rate>abc</rate
 def odd(robots, tmp_path, monkeypatch):
     """Return a function that writes rpr.urdf and its settings file, and returns the path of the URDF.
 
-    Its arguments are `more`, XML that is added at the end of the URDF, such as unusual links, and `sidecar`, the text
+    Its arguments are `more`, XML that is added at the end of the URDF, such as further links, and `sidecar`, the text
     of the settings file.
     """
     monkeypatch.chdir(tmp_path)

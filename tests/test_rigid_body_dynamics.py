@@ -137,9 +137,9 @@ def test_a_negative_mass_is_refused():
         pinocchio_model(negative, Settings())
 
 
-# A lift with mimic joints. Stage 2 slides on stage 1, twice as far as stage 1. A pendulum of two rods hangs on stage 2:
-# rod 2 turns on rod 1, in the opposite direction to rod 1. Finger 2 mimics the joint `grip`, which is no coordinate of
-# the arm, so `grip` is locked at 0 and finger 2 at its offset.
+# A lift with mimic joints. Stage 2 slides on stage 1, twice as far as stage 1 on the base. A pendulum of two rods is on
+# stage 2: rod 2 rotates on rod 1, in the opposite direction to rod 1. Finger 2 mimics the joint `grip`, which is no
+# coordinate of the arm, so `grip` is locked at 0 and finger 2 at its offset.
 LIFT = """<robot name="lift"><link name="base"/>
   <joint name="low" type="prismatic"><parent link="base"/><child link="stage1"/><axis xyz="0 0 1"/>
     <limit lower="0" upper="1" effort="10" velocity="1"/><dynamics damping="2" friction="0.5"/></joint>

@@ -96,9 +96,10 @@ def test_hidden_units_are_shared_in_proportion_to_outputs():
 
 
 def entries(f1, f2, c1):
-    """Return M (..., 3, 3), as `mass_entries` of an emitted module does, with the lower triangle in the code below.
+    """Return M (..., 3, 3), like `mass_entries` of an emitted module.
 
-    f1, f2: values (...) of two functions of q at a batch of states. c1: constant.
+    M11 is f1, M21 f1 - 2 f2, M22 c1, M31 0, M32 f2 and M33 3 f2. f1, f2: values (...) of two functions of q at a batch
+    of states. c1: constant.
     """
     return symmetric([f1], [f1 - 2 * f2, c1], [0, f2, 3 * f2])
 
@@ -129,9 +130,9 @@ def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
     assert (pose.friction > 0).all()
 
     def added(at: Tensor) -> Tensor:
-        """Return the Lagrangian 1/2 qd^T R qd - V of the residual terms R of M and V, summed over the states.
+        """Return the Lagrangian 1/2 qd^T R qd - V of the residual terms, summed over 50 states.
 
-        at: positions q, (50, 3) [rad, m]; the velocities are the fixed qd.
+        R is the residual term of the mass matrix, V of the potential. at: positions q, (50, 3); qd is not varied.
         """
         mass = terms.at(at, weights).mass
         return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(terms.at(at, weights)).sum()
@@ -309,11 +310,11 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Return the log-Cholesky parameters with which today's bodies equal bodies of the first release.
+    """Return the log-Cholesky parameters with which the current bodies equal bodies of the first release.
 
     In the first release, the pseudo-inertia was L T T^T L^T with the lower triangular factor L of the nominal
     pseudo-inertia. All parameters are 0.01 here: the lower triangular T has exp(0.01) on the diagonal and 0.01 below
-    it. bodies: today's `InertialParameters`, which have upper triangular factors instead.
+    it. bodies: `InertialParameters`, which have upper triangular factors instead.
     """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
@@ -325,9 +326,9 @@ def weights_of_first_stage(bodies):
 def rotation_inputs(joint_types, axes):
     """Return (joint, index, sign, constant) for each input of the networks of the first release.
 
-    The input equals sign * (today's input `index`) + constant. joint: index of the position or velocity that it depends
-    on. The nine entries of the rotation matrix of each revolute joint were inputs; today cos q and sin q are. axes:
-    number of velocity inputs per joint (0: none), of which only the last one is not zero.
+    The input equals sign * (current input `index`) + constant. joint: index of the position (0 to n - 1) or of the
+    velocity (from 2 n) that it depends on. Inputs of a revolute joint were the nine entries of its rotation matrix, now
+    cos q and sin q. axes: number of velocity inputs per joint (0: none), of which only the last one is not zero.
     """
     n, inputs = len(joint_types), []
     for joint, kind in enumerate(joint_types):
