@@ -30,7 +30,10 @@ from spelgen.settings.fits import GaussianPrior
 
 
 class Unabsorbed:
-    """Projection of a model whose rigid bodies and friction can absorb no added torque."""
+    """Stub for the projection of joint torques: `orthogonalize` returns an added torque unchanged.
+
+    A real projection subtracts the part of the torque that the rigid-body and friction parameters would absorb.
+    """
 
     @staticmethod
     def orthogonalize(joint, torque):
@@ -196,7 +199,10 @@ def test_spring_extrapolates_to_positions_without_samples(hybrid):
 
 
 def test_slow_passes_are_few_errors(hybrid):
-    """If a joint passes its range once, its samples count as only 1 + range / knot spacing independent errors."""
+    """If a joint moves through its range once, its samples count as only 1 + range / spacing independent errors.
+
+    spacing: distance of the knots of the position-dependent functions of the joint [rad], here for a range of 2 rad.
+    """
     from spelgen.fitting.torque.joint_functions import joint_functions
 
     lengths = []

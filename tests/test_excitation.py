@@ -76,7 +76,10 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
 
 
 def test_a_random_motion_beyond_effort_limits_is_called_so(found):
-    """The text marks the condition number of the first random motion if this motion exceeds effort limits."""
+    """If the torques of the first random motion exceed effort limits, `Excitation.text` says so.
+
+    "beyond effort limits" follows the condition number of this motion, `first`. found: result of `excite`.
+    """
     assert not found.first_overruns
     assert "beyond effort limits" not in found.text()
     assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
@@ -219,8 +222,8 @@ def test_the_command(robots, tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert "of the first motion at random" in shown.stdout
-    # 13 = 6 base parameters + 4 per joint (friction, armature) - 1 that depends on the others. The text names these
-    # groups, since `inspect` states only the 6 base parameters.
+    # For two joints, 13 = 6 base parameters + 2 x 4 for friction and armature - 1, the armature of joint 1, which acts
+    # like the inertia of link 1. The command prints these groups, since `inspect` states only the 6 base parameters.
     assert "of the regressor of 13 parameters: base parameters, friction and armature" in shown.stdout
     with open("x.csv", newline="") as file:
         head, *rows = csv.reader(file)

@@ -151,9 +151,10 @@ ROUNDED = """<robot name="rounded"><link name="base"/>
 
 
 def test_all_targets_agree_on_the_tip(tmp_path):
-    """Each export places the tip where Pinocchio does, to 1e-12, although the URDF's angles have only five digits.
+    """Each export places the tip where Pinocchio places it for the same URDF, within 1e-12.
 
-    The model replaces such angles by exact multiples of pi/2.
+    The URDF has rounded angles such as 1.5708. The dynamics of the model use pi/2 instead, but the pose of the tip
+    uses the angles of the URDF, as Pinocchio does.
     """
     pin = pytest.importorskip("pinocchio")
     (tmp_path / "arm.urdf").write_text(ROUNDED.format("", "", ""))

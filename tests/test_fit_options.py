@@ -196,8 +196,8 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
     """Logs, which may take long to read, are read only if the choice of the objective depends on their sample rates.
 
-    They are not read if the model or the options determine the objective, nor before the error about an option of
-    another objective.
+    They are not read if the model or the options determine the objective. An option that belongs to another objective
+    is an error, which is raised without reading the logs.
     """
 
     def unread():

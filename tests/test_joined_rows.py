@@ -60,7 +60,7 @@ def write_bag(folder, messages):
 def test_joints_in_two_messages_are_joined(joints, topics, clocks, tmp_path):
     rng = np.random.default_rng(sum(map(ord, clocks + topics[0])) + len(joints))
     signals = motion(int(rng.integers(1000)), len(joints))
-    # [ms] time between the messages of both topics
+    # [ms] period of the messages of the first and of the second topic
     steps = {"equal": (10, 10), "shifted": (10, 10), "of different rates": (4, 10)}[clocks]
     shift = 0 if clocks == "equal" else 3
     messages = []

@@ -97,9 +97,9 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 
 
 def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
-    """Wrapped positions in degrees are one error, and the log has no error with the settings line that it advises.
+    """Positions in degrees that wrap around at 360 give one error, which names the unit and advises a settings line.
 
-    The joints are with and without position limits.
+    With this line, the log has no errors. The joints with wrapped positions have no limits; the others have limits.
     """
     text = (robots / "six_dof.urdf").read_text()
     joints = load_arm(robots / "six_dof.urdf").chain.joint_names
@@ -147,7 +147,8 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
         "unsigned": values % size,
         "turn": values % size,
     }[form]
-    # the register overflows when its value reaches plus or minus half of its range, here in the middle of the motion
+    # A register with `size` values wraps around at -size/2 and size/2. Here its zero is such that it wraps at the mean
+    # position of the motion.
     if form == "overflow":
         words = (values - values.mean() + size) % size - size / 2
         values = values - values.mean() + size / 2
@@ -394,7 +395,10 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
 
 @pytest.mark.parametrize("form", ["degrees", "two's complement", "sign and magnitude"])
 def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
-    """One advised settings line decodes the positions and commands of all joints, also of a joint that stays near 0."""
+    """Positions q and commands u that are logged as raw register values are one error with one line for all joints.
+
+    form: encoding of negative values in the registers. The elbow stays near 0, so that only changes of sign show it.
+    """
     arm = load_arm(write_servo_arm(tmp_path))
     t, rng = 0.02 * np.arange(1500), np.random.default_rng(0)
     motion = {"shoulder": 0.9 * np.sin(t), "elbow": -0.004 * (t > 15) + 0.003 * rng.standard_normal(len(t))}

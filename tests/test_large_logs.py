@@ -148,9 +148,10 @@ def test_windows_of_reduced_logs_cross_no_gap(tmp_path, bound):
 
 
 def test_a_fit_of_reduced_logs_is_one_of_its_samples(robots, tmp_path, bound):
-    """A fit to logs beyond the bound equals a fit to the kept samples in memory: weights, split and digest.
+    """A fit to logs that exceed the memory bound (here 1600 rows) equals a fit to the kept samples in memory.
 
-    A resumed run uses the same samples.
+    Equal are the weights, the digest of the data and the split into training and validation. A resumed run uses the
+    same samples, and refuses changed logs.
     """
     module = tmp_path / "arm.py"
     module.write_text(generate(robots / "two_link.urdf", preset="spel", width=4))

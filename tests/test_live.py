@@ -97,9 +97,10 @@ def coupled(folder):
 
 @pytest.mark.parametrize("robot", ["six_dof", "rpr", "coupled"])
 def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
-    """dp/dt of the momentum balance equals torque minus friction along any motion.
+    """Along any motion, `balance` satisfies dp/dt = torque - friction at all driven joints, with p = M qd.
 
-    This holds for mimic joints, prismatic joints and coupled motors as well.
+    Its `torque` is G tau + dL/dq of the Lagrangian L, and so includes gravity and velocity-dependent terms. The arms
+    have mimic joints, prismatic joints and coupled motors as well.
     """
     urdf = coupled(tmp_path) if robot == "coupled" else ROBOTS / f"{robot}.urdf"
     model = build(urdf, "hybrid").double()
@@ -174,11 +175,11 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # predictions of more than 0.3 s ahead do not include the disturbance
+    # predictions of more than 0.3 s ahead do not include the estimated disturbance torque
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
-    # Before the first payload report, no load is known. `compensate_external` adds the external torque to the predicted
-    # torque, and thereby the weight of the payload.
+    # The first payload report comes after these 180 samples, so the predicted torque does not include the payload yet.
+    # With `compensate_external`, it includes the estimated external torque, and thereby the weight of the payload.
     part, k = dataclasses.replace(log, tau=tau)[:180], 179
     for compensated in (False, True):
         early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
@@ -344,11 +345,11 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
 
 @pytest.mark.parametrize(("effort", "expected"), [(np.inf, "used"), (1.0, "saturated"), (0.6, "used")])
 def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
-    """Torques of four times the largest logged torque are refused as saturated only if the URDF has such a limit.
+    """Samples with torques beyond the effort limit of the URDF are refused as saturated if the limit is plausible.
 
-    A limit of the URDF that logged torques exceed is wrong, so the limit is unknown then.
-
-    effort: torque limit of the URDF, divided by the largest logged torque. expected: result for these torques.
+    A limit that logged torques exceed is wrong, and so unknown, as without a limit. Then four times the largest logged
+    torque is used; only more than ten times this torque is refused. effort: limit of the URDF, divided by the largest
+    logged torque. expected: result for four times the largest logged torque.
     """
     model, log, _ = arm
     largest = np.abs(log.tau).max(axis=0)
@@ -504,8 +505,9 @@ def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
         # expected alarms per minute: probability that a peak exceeds its threshold, times peaks per minute
         alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
     assert np.mean(alarms) < 1.0
-    # Thresholds are not arbitrarily high. The known distribution would give log(720) + 1 = 7.6: peaks exceed x with
-    # probability exp(1 - x), and six joints have 720 peaks per minute, of which one may exceed the threshold.
+    # The thresholds of the last arm are not arbitrarily high. Peaks exceed x with probability exp(1 - x). Six joints
+    # have 720 peaks per minute, of which one may exceed its threshold: the ideal threshold is log(720) + 1 = 7.6.
+    # Thresholds from short logs have a margin, since the distribution of the peaks is only estimated.
     assert np.median(thresholds) < 25.0
 
 
@@ -544,17 +546,17 @@ def test_thresholds_hold_in_a_log_that_differs(levels):
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
-    # at most one alarm in 50 s
+    # 100 windows are 50 s, in which the thresholds for one alarm per minute may cause one alarm
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3
 
 
 def test_noise_levels_are_found_with_one_thread(arm, run, monkeypatch):
-    """The fits of the noise levels use one thread of torch, like the fit of the run.
+    """The fits that estimate the noise levels use one thread of torch, like the fit of the run.
 
-    With torch 2.13 and two threads, `train` of a 6-joint arm did not end: the number of threads had been raised from
-    one, after which the factorisation of a batch of matrices of order 150 does not end.
+    Reason: if the number of threads is raised from one to two after the fit, torch 2.13 does not end the factorisation
+    of a batch of matrices of order 150, and `train` of a 6-joint arm hangs.
     """
     threads = []
 
@@ -613,7 +615,8 @@ def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
     payload = json.loads(result.stdout)["payload"]
     assert payload["status"] == "payload"
     assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
-    # the run folder keeps its noise levels, which an estimator of the arm with the load needs
+    # `train --from` copies the noise levels (estimator.json) of the source run into the new run. A live estimator
+    # of the new model, the arm with its load, needs them.
     assert (tmp_path / "run" / "estimator.json").exists()
 
 

@@ -17,7 +17,10 @@ CENTER = np.array([0.05, 0.02, 0.15])
 
 
 def loaded(arm, log, mass):  # noqa: F811
-    """Return a recording of the arm with a point mass [kg] at `CENTER` [m] of its last link."""
+    """Return the log of the same motion with a load: a point mass `mass` [kg] at `CENTER` [m] of the last link.
+
+    log: log of the arm without a load; the torques of the load are added to its torques.
+    """
     qdd = np.gradient(log.qd, log.t, axis=0)
     inertia = mass * (CENTER @ CENTER * np.eye(3) - np.outer(CENTER, CENTER))
     load = np.concatenate([[mass], mass * CENTER, inertia[np.triu_indices(3)]])
@@ -25,7 +28,7 @@ def loaded(arm, log, mass):  # noqa: F811
 
 
 def parts(log, count=4):
-    """Split a recording into `count` recordings, which have the same arm and different motions."""
+    """Split a recording into `count` consecutive recordings of equal length, and so of different motions."""
     size = len(log.t) // count
     return [replace(log[k * size : (k + 1) * size], name=f"part {k}") for k in range(count)]
 

@@ -110,9 +110,9 @@ def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
         read_logs([path], ("a",))
     (found,) = read_logs([path], ("a",), mapping=LogMapping(velocity="differentiated"))
     inner = [k for k in range(100) if k % 50 not in (0, 49)]
-    # error of central differences, dt^2 / 6
+    # error of central differences: dt^2 |d^3 q / dt^3| / 6 = 1.7e-5 rad/s
     np.testing.assert_allclose(found.qd[inner, 0], np.cos(t[inner]), atol=2e-5)
-    # error of one-sided differences at the ends of segments, dt / 2
+    # error of one-sided differences at the ends of segments: dt |qdd| / 2 = 0.005 rad/s for dt = 0.01 s, |qdd| <= 1
     assert np.abs(found.qd[[0, 49, 50, 99], 0] - np.cos(t[[0, 49, 50, 99]])).max() < 0.006
     assert found.qd[100] == 0.0
 
@@ -710,7 +710,10 @@ def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path, footer)
 
 @pytest.mark.parametrize("place", ["above", "below", "comment"])
 def test_a_line_of_units_counts_at_each_place_beside_the_header(tmp_path, place):
-    """A unit that a line above or below the header states is never read as an SI unit."""
+    """A line of units above or below the header, or in a comment, is not ignored.
+
+    It states mNm for the torques here. Torques are expected in Nm, so the error advises to state `units: {tau: mNm}`.
+    """
     lines = text_log().splitlines()
     units = UNIT_LINE.replace("Nm", "mNm")
     head = {"above": [units, lines[0]], "below": [lines[0], units, "measured" + ",measured" * 6]}
@@ -909,7 +912,8 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # A message that is received twice, here the first one, is no repeated header: a header would begin a new recording.
+    # In files with a header, a repeated first line begins a new recording. The output of this command has no header:
+    # its first line is a message, which may be received twice. The file is still one recording.
     lines = joint_states()
     (tmp_path / "log.csv").write_text("\n".join([lines[0], *lines]) + "\n")
     assert len(read_logs([tmp_path / "log.csv"], ("a", "b"))) == 1

@@ -201,8 +201,8 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
-    # For rpr on a ceiling, the error may first advise a joint of opposite sense, which explains the torques equally
-    # well.
+    # The error may list several corrections. Only its directions of gravity are tested: for rpr on a ceiling, it may
+    # first advise a joint of opposite sense, which explains the torques equally well.
     assert lines, error
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
@@ -315,7 +315,10 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
-    """Torque columns that contain another signal are one finding without a line of advice, since none would help."""
+    """Torque columns that contain another signal give one finding, which advises the user to check the columns.
+
+    It has no settings line, since none would correct them. A finding that is an error names the option to accept it.
+    """
     log, rng = recorded(arm, 18), np.random.default_rng(18)
     other = log.tau.std(axis=0) * lfilter([0.2], [1, -0.98], rng.standard_normal(log.tau.shape), axis=0)
     tau = {
@@ -334,9 +337,9 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
 
 
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
-    """In a log with too little motion, reversed joints are not searched: a remark states the small motion.
+    """A log with too little motion is not tested for faults such as a reversed joint: a remark states the small motion.
 
-    Friction before sliding determines such torques, and wrong hypotheses would explain them better.
+    Its torques are mostly friction before sliding, which a wrong hypothesis may explain better than the right one.
     """
     log = recorded(arm, 18)
     small = replace(log, q=log.q[0] + 0.002 * (log.q - log.q[0]), qd=0.002 * log.qd)
@@ -453,9 +456,9 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
 
 
 def test_gravity_along_all_axes_is_called_compensated(tmp_path):
-    """Without gravity torques in a log, compensated gravity is reported, not a direction of gravity.
+    """A log without gravity torques is reported as compensated gravity, not as gravity along the joint axes.
 
-    The axes of both joints are parallel: gravity along the axes would cause no torques, as compensated gravity does.
+    Both explain the log: the axes of both joints are parallel, and gravity along them would cause no torques.
     """
     rows = (
         ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
@@ -476,14 +479,14 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
     assert "--accept torque-unit" in error
     # the ratio of both gains is determined by the coupling of the joints
     assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)
-    # the common factor is determined by the masses of the URDF
+    # the common factor of both gains follows only from the URDF's masses, so it is right only within a factor of 2
     np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))
 
 
 def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
-    """If the magnitude of one torque is logged, the error names it, instead of gains of all joints.
+    """If the torque of one joint is logged without its sign, the error names this joint and advises no gains.
 
-    Such gains would lower the residual a little.
+    Gains of all joints would lower the torque residual a little, but they are not the cause.
     """
     arm = load_arm(shared / "logs" / "airbot" / "airbot.urdf")
     (log,) = read_logs(shared / "logs" / "airbot" / "ga_N12T25.parquet", arm)
@@ -608,7 +611,10 @@ def lifted(arm):
 
 
 def test_a_lift_whose_position_runs_the_other_way_is_named(lift):
-    """A vertical slide of opposite sense is found by its limits and friction, as its gravity torque is the same."""
+    """A vertical prismatic joint with the opposite sign of its position is found by its position limits and friction.
+
+    Its gravity force does not depend on the position, and so does not show the sign.
+    """
     log = lifted(lift)
     assert check_logs([log], lift).errors == ()
     assert "'joints: {slide: {sign: -1, gain: -1}}'" in told(lift, flipped(log, 0, True, False))

@@ -283,9 +283,10 @@ def test_degrees_are_refused(case):
 
 
 def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
-    """Encoder counts and speeds in units of 0.229 rpm match no common unit by chance, and no slow clock is reported.
+    """Encoder counts and speeds in units of 0.229 rpm (0.024 rad/s) are reported as numbers of an unknown unit.
 
-    With the mapping that states these units, the log is read in rad and rad/s.
+    They match no common unit, and the ratio 0.024 of dq/dt to qd is not reported as a slow clock. The log is
+    read correctly with a mapping that states the counts, and replaces qd by dq/dt (`velocity: differentiated`).
     """
     log = swing()
     registers = replace(

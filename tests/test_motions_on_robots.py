@@ -68,7 +68,10 @@ def to_floor(centre):
 
 
 def to_wall(centre):
-    """Return the distance of spheres from the face of the wall, which is the only side within reach."""
+    """Return the distance [m] of the surfaces of spheres from the front of the wall, the plane x = 1 m.
+
+    centre: centres of the spheres in the vertical plane, (..., 2) [m]. The arm reaches no other side of the wall.
+    """
     return 1.0 - centre[..., 0] - RADIUS
 
 

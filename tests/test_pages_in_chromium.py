@@ -65,7 +65,10 @@ def test_pages_have_no_console_messages_requests_or_overflow(browser, pages, wid
 
 
 def test_titles_and_numbers_of_tables_are_not_broken_on_a_phone(browser, pages):
-    """A title of a list is as wide as the list, and a number is on one line, whatever the length of its label."""
+    """On a narrow screen, a table is shown as a list of labels and numbers. Its title is as wide as the table.
+
+    A number stays on one line, also with a long label (the name of its column).
+    """
     browser.open(pages[0], width=400)
     cells = "[...document.querySelectorAll('td.n[data-head]')]"
     browser.run(f"{cells}.forEach(x => (x.dataset.head = 'least squares with memory + observer'))")

@@ -1,6 +1,7 @@
-"""Posterior intervals of torque fits contain the parameters of simulated arms.
+"""Posterior intervals of torque fits contain the true parameters of simulated arms.
 
-Standard deviations equal the spread of models with sampled parameters.
+Posterior standard deviations, such as of M and of torques, equal the spread over models with parameters that are
+sampled from the posterior.
 """
 
 import json
@@ -47,7 +48,10 @@ from tests.test_closed_form import drawn
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
-    """Base parameters of fits have the same names and combinations as in `identify`: reports match them by name."""
+    """Base parameters of fits are the same combinations, under the same names, as in `identify`.
+
+    Reports compare the values of both by name.
+    """
     urdf = robots / f"{robot}.urdf"
     if robot in ("followed", "gantry"):
         urdf = tmp_path / f"{robot}.urdf"
@@ -141,7 +145,8 @@ def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fi
             for interval, value in zip(intervals, base_values(true), strict=True):
                 result.append(abs(interval.value - value) / interval.half)
     print(np.quantile(ratios, (0.9, 0.95, 1)), np.quantile(ratios_by_posterior, (0.9, 0.95, 1)))
-    # intervals are wide enough, and not much too wide
+    # Reported intervals contain at least 95 % of the true values (ratio below 1) and are not much too wide (above 0.4).
+    # All errors are below 1 / 0.9 half widths. At least one interval from the posterior covariance is too narrow.
     assert 0.4 < np.quantile(ratios, 0.95) < 1.0
     assert np.max(ratios_by_posterior) > 1.0 > 0.9 * np.max(ratios)
 
@@ -164,7 +169,7 @@ def test_least_squares_counts_friction_that_changes_during_a_log(robots):
     assert interval.low < 1.0 < interval.high
     assert interval.std == pytest.approx(
         of_ten, rel=0.4
-    )  # `of_ten` is 0.044; under the assumption of constant friction, interval.std would be 0.018
+    )  # 0.044 Nm; if friction were assumed to be constant, interval.std would be 0.018 Nm
 
 
 @pytest.fixture(scope="module")
@@ -179,9 +184,10 @@ def fitted(robots):
 
 
 def test_standard_deviations_agree_with_sampled_parameters(fitted):
-    """Standard deviations of M, g, torques and drives equal their spread over models with sampled parameters.
+    """The stated standard deviations of M, g, torques and armatures equal their spread over 300 sampled models.
 
-    Both use 1e-6 times the posterior covariance, so that these quantities are linear in the parameters of all samples.
+    The parameters of these models are sampled from the posterior. Here its covariance is multiplied by 1e-6, so that
+    all quantities are linear in the parameters, as the stated standard deviations assume.
     """
     result, _ = fitted
     posterior, shrink = result.posterior, 1e-3

@@ -75,11 +75,11 @@ class Reading:
 
 @dataclass(frozen=True)
 class Facts:
-    """Facts on the structure of an arm, by spelgen or by Pinocchio.
+    """Facts on the structure of an arm with n joints: derived by spelgen, or measured with Pinocchio.
 
-    entries: (zero, constant or varying, its joints) for each entry of M. potential: joints that V depends on.
-    outputs_from: numbers of varying terms of M that do not depend on the first 0, 1, ... joints. constants: number of
-    constant terms.
+    entries: per entry of M, "zero", "constant" or "varying", and the joints that it depends on. potential: joints that
+    V depends on. outputs_from: (n,); item k is the number of varying terms of M that depend on none of the first k
+    joints. constants: number of constant terms.
     """
 
     entries: tuple[tuple[str, tuple[int, ...]], ...]
@@ -90,7 +90,7 @@ class Facts:
 
 
 def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
-    """Return `Facts` on the structure of an arm, computed by Pinocchio at random configurations.
+    """Return the facts on the structure of an arm (see `Facts`) from M and V of Pinocchio at random configurations.
 
     inertials: True for the inertial values of the URDF, False for random values at each configuration.
     """
@@ -149,7 +149,7 @@ def _count(sizes: np.ndarray) -> int:
 
 
 def told(structure: Structure) -> Facts:
-    """Return the `Facts` of a structure that spelgen derived."""
+    """Return the facts that spelgen derived (see `Facts`), for the comparison with the result of `measured`."""
     n = len(structure.joints)
     return Facts(
         entries=tuple((entry.kind, entry.joints) for entry in structure.entries),
@@ -198,7 +198,10 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 
 
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
-    """Rotations by multiples of 45 degrees, which have no rational cosine, keep their zero entries exactly."""
+    """`exact_rotation`, a rational approximation, keeps the zero entries of a rotation exactly.
+
+    Roll, pitch and yaw are multiples of 45 degrees. The cosine of 45 degrees, sqrt(1/2), is not rational.
+    """
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
         found = exact_rotation(rotation)

@@ -43,9 +43,10 @@ def started(arm, **parameters):
 
 
 def torques(model, q, qd, qdd, friction_of=None):
-    """Return the torques of the torch model; friction states result from sliding at ``friction_of``.
+    """Return the torques (n,) [Nm, N] of the inverse dynamics of the torch model at q, qd and qdd, (n,) each.
 
-    friction_of: velocities (n,); None: joints that have not moved.
+    friction_of: velocities (n,) at which the joints slid before, which determine the friction states; None: the joints
+    have not moved.
     """
     states = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
     moved_at = states[1] * 0 if friction_of is None else torch.as_tensor(friction_of)
@@ -53,7 +54,10 @@ def torques(model, q, qd, qdd, friction_of=None):
 
 
 def circle(t, start=START):
-    """Return a smooth reference motion at time t [s]: position, velocity and acceleration, (2,) each."""
+    """Return a sinusoidal reference motion of the two joints at time t [s]: q [rad], qd and qdd, (2,) each.
+
+    start: positions of the joints at t = 0, (2,) [rad], at which the motion starts from rest.
+    """
     sign, w = np.array([1.0, -1.0]), 2.0
     return (
         start + 0.4 * sign * (1 - np.cos(w * t)),
@@ -147,7 +151,8 @@ def test_a_preceding_controller_is_tracked(arm):
     assert controller.text("state") == "damping: no reference within reference_timeout"
     assert np.abs(qd[0]).max() > 0.3
     assert np.abs(qd[-1]).max() < 1e-3
-    # only positions are written; references on the topic are ignored
+    # The preceding controller may write only positions: velocities and accelerations are NaN here. The reference on the
+    # topic, 1 rad away, is ignored in chained mode. It counts after this mode, and is too far away.
     controller.reference(simulated.q + 1.0)
     controller.write(simulated.q, [np.nan] * 4)
     controller.update(simulated.q, simulated.qd)

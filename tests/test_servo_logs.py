@@ -176,7 +176,8 @@ def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, 
     warning = f"positions within -100..100: right as deg, {UNLESS_NORMALISED}"
     accepted = changed(wrong, accepted=lambda x: ("normalised",), repairs=lambda x: (warning,))
     report = spelgen.check_logs(accepted, arm)
-    # if the error is accepted, the warning of the file's reader is reported in its place
+    # With 'accept: [normalised]' in the settings there is no error. The warning of the file reader, that the positions
+    # may be normalised, is then reported; otherwise the error replaces it.
     assert not report.errors and any(warning in x.message for x in report.findings)
 
 
@@ -219,7 +220,10 @@ def test_a_unit_of_servos_that_is_stated_wrongly_is_named_with_the_line(arm, log
 
 
 def only_rows(x, column, rows, value):
-    """Return a log without velocities, with the position of one joint replaced in some rows."""
+    """Return a copy of the log `x` in which `value` replaces the positions q[rows, column] of joint `column`.
+
+    value: position [rad], or a function that returns it from all positions (T,) of the joint. The velocities are dq/dt.
+    """
     q = x.q.copy()
     q[rows, column] = value(q[:, column]) if callable(value) else value
     return replace(x, q=q, qd=np.gradient(q, x.t, axis=0), mapping=LogMapping(input="position"))
@@ -281,7 +285,10 @@ def opposite(log, k):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_position_errors_show_senses_and_order_of_servos(arm, seed):
-    """Position errors u - q of servos are proportional to torques: their gravity part shows wrong senses and order."""
+    """Joints with the opposite sign, or in the wrong order, are found in logs of servos without torques.
+
+    The position error u - q of a servo is proportional to its torque, and its gravity part shows both faults.
+    """
     logs = [replace(x, mapping=LogMapping(input="position")) for x in servo_logs(1, 20.0, seed=seed)]
     assert not spelgen.check_logs(logs, arm).errors
     (error,) = map(str, spelgen.check_logs([opposite(x, 1) for x in logs], arm).errors)
