@@ -141,7 +141,10 @@ def splits(folder: Path) -> Iterator[Split]:
 
 
 def real(folder: Path) -> Iterator[Case]:
-    """Yield a case per documented split of the recordings: models of both presets, and the filtered torque samples."""
+    """Yield a case per documented split of recordings: models of `PRESETS`, and filtered training and test samples.
+
+    The splits into training and test recordings are described in docs/real_logs.md. Only test samples include pauses.
+    """
     for name, urdf, training, tests in splits(folder):
         fits, models = {}, {}
         for preset in PRESETS:
@@ -153,7 +156,10 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def simulated() -> Iterator[Case]:
-    """Yield a case per effect, and one with all effects, of a simulated UR10e that differs from its URDF."""
+    """Yield a case per effect of `EFFECTS`, and one with all effects, added to a simulated UR10e.
+
+    The rigid bodies and friction of the simulated arm also differ from its URDF.
+    """
     for name, logs, test in with_effects():
         models = {}
         for preset in PRESETS:

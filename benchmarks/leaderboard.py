@@ -101,9 +101,10 @@ class Fold:
 
 
 class Problem:
-    """Training samples of a fold's first seconds, and its test samples, equal for all methods.
+    """Training and test samples of a fold, filtered with one torque delay, so that all methods have the same samples.
 
-    Raises LogError if nothing moves.
+    The training samples are from the first `seconds` seconds of the fold's training recordings, in total. Raises
+    LogError if no joint moves in them.
     """
 
     def __init__(self, fold: Fold, seconds: float) -> None:
@@ -241,7 +242,11 @@ METHODS: dict[str, Method] = {
 
 
 def folds(folder: Path) -> Iterator[Fold]:
-    """Yield all folds of the folder of recordings: the documented splits first, then single motions."""
+    """Yield all folds (training and test recordings) of the arms in a folder of recordings.
+
+    The documented splits (docs/real_logs.md) are first, each split of a single recording with its reversal. Folds that
+    are trained on one motion are last.
+    """
     motions: list[Fold] = []
     for name in ("ur10e", "airbot", "shanghai"):
         urdf = folder / name / f"{name}.urdf"
@@ -259,7 +264,10 @@ def folds(folder: Path) -> Iterator[Fold]:
 
 
 def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
-    """Return all recordings in the folder of an arm, by the name of their file."""
+    """Return {file name without suffix: recording} of all Parquet files in a folder of recordings of one arm.
+
+    urdf: URDF of the arm, whose joints determine the columns of the recordings.
+    """
     arm = load_arm(urdf)
     return {path.stem: spelgen.read_logs([path], arm)[0] for path in sorted(folder.glob("*.parquet"))}
 
@@ -294,12 +302,15 @@ def motion_folds(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Itera
 
 
 def motion_of(recording: str) -> str:
-    """Return the name of a recording's motion: a second recording of the same motion has the suffix `_again`."""
+    """Return the name of a recording's motion: the recording's name without the suffix `_again` of a repetition."""
     return recording.removesuffix("_again")
 
 
 def measured(fold: Fold, seconds: float, methods: Iterable[str]) -> Iterator[Row]:
-    """Yield a row of results per method, fitted to the first seconds of a fold; a failed fit's row has its error."""
+    """Fit methods to the first `seconds` seconds of a fold's training; yield a row of results per method.
+
+    The row of a failed fit has the text of the error. A method whose package is not installed has no row.
+    """
     common: Row = {"fold": fold.name, "seconds": duration_name(seconds)}
     try:
         problem = Problem(fold, seconds)
@@ -370,7 +381,11 @@ def main() -> None:
 
 
 def by_rivals(options: argparse.Namespace) -> list[Row]:
-    """Run the methods of `rivals.py` in their own environment, which appends to the results; return all results."""
+    """Run this script for the methods of `rivals.py` with the Python `options.rivals`; return all results.
+
+    The Python belongs to an environment in which these methods are installed. Its process appends its results to the
+    file `options.out`. The methods are added to `options.methods`.
+    """
     command = [
         options.rivals,
         __file__,

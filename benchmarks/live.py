@@ -179,10 +179,11 @@ def synthetic_loads(case: Case) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return the estimates that were known `ahead` seconds before each sample of a log, (2, T, n).
+    """Return predictions from the estimates known `ahead` [s] before each sample of a log, (2, T, n).
 
-    They are the friction scale minus one [1], and the disturbance torque [Nm, N]. The disturbance decays during `ahead`
-    with the time constant of the noise levels. If `ahead` exceeds 0.3 s, it is zero, as in the estimator's predictions.
+    The first is the relative change of friction [1], the second the disturbance torque [Nm, N]. The disturbance decays
+    during `ahead` with the time constant in `case.levels`. As in the estimator, it is predicted as zero if `ahead`
+    exceeds 0.3 s. columns: outputs of the estimator along the log, a row per sample.
     """
     k = np.maximum(np.searchsorted(log.t, log.t - ahead, side="right") - 1, 0)
     scale, disturbance = columns.friction_scale[k] - 1, columns.disturbance[k]
@@ -230,8 +231,9 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
     """Return the time of each filtered sample of a log, (T,) [s].
 
-    The filter removes and resamples rows. The time is therefore filtered in place of the torque. pauses: True if
-    ``samples`` have pauses.
+    Filtered samples (`case.samples`) have no times, and other rows than the log. A copy of the log that has the time as
+    torque is therefore filtered in the same way: the filtered torque is then the time. pauses: True if ``samples``
+    include samples at standstill.
     """
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)

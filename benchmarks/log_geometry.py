@@ -3,8 +3,9 @@
     python benchmarks/log_geometry.py [--arms rpr,ur10e] [--folder ../shared/arms] [--draws 3] [--faults 12] [--first 0]
                                       [--out runs/log_geometry.jsonl]
 
-Every log has 20 s of excitation or pick-and-place, torque noise of 0.5 to 5 %, and friction of one of five kinds. The
-inertials in the given URDF have errors of 30 %. The log is checked without a fault, and with one random fault each:
+--draws logs per arm are simulated, with the seeds --first, --first + 1, ... Every log has 20 s of excitation or
+pick-and-place, torque noise of 0.5 to 5 %, and friction of one of five kinds. The inertials in the given URDF have
+errors of 30 %. Each log is checked without a fault, and then --faults times, each time with one random fault:
 
 - the sign of a joint's position, of its torque, or of both is reversed;
 - all columns are permuted, or only the torques, or two torques are exchanged;
@@ -66,7 +67,11 @@ RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
 def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, list[Trajectory]]:
-    """Return a random case of an arm, the arm with wrong inertials, the true arm, and the logs of the true arm."""
+    """Return the random conditions of logs, the arm with wrong inertials, the true arm, and the logs of the true arm.
+
+    urdf: file of the true arm. number: seed of all random values, such as friction, motion and noise. folder: the URDF
+    with wrong inertials and a copy of the settings are written to it.
+    """
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
         number=number,
@@ -176,9 +181,10 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right: Hypothesis) -> str:
-    """Return the result of `spelgen logs`, one of `RESULTS`, for a fault that the hypothesis `right` corrects.
+    """Apply a fault to logs, and return the result of `spelgen logs` for them: one of `RESULTS` (see the module).
 
-    arm: given arm, with wrong inertials. true: arm of the logs. logs: without the fault. kind: kind of the fault.
+    arm: given arm, with wrong inertials. true: arm of the logs. logs: logs without the fault. kind: kind of the fault,
+    of `KINDS`. right: hypothesis that corrects the fault; the fault is the inverse of this correction.
     """
     drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
     if kind == "gravity":  # the fault is in the settings, which state another gravity; the log is right
@@ -194,7 +200,9 @@ def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right:
     if named:
         return "wrong"
     visible = unchanged.cost - mended.cost > GEOMETRY.needed
-    if kind.startswith("zero"):  # visible only if other inertials do not explain the offset as well
+    # Other inertials may explain the torques of an offset zero, which costs only prior probability. The zero is visible
+    # only if the right hypothesis also lowers the misfit (contribution of the torque residual to the cost) enough.
+    if kind.startswith("zero"):
         visible &= unchanged.misfit - mended.misfit > GEOMETRY.needed / 2
     return "missed" if visible else "invisible"
 

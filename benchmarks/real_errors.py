@@ -19,7 +19,8 @@ RIPPLE_PERIODS = (
     100,
     160,
 )  # periods of torque ripple per revolution of a joint: eccentric bearings, gear teeth, motors
-CABLE_BREAKAWAY = (0.05, 0.5)  # [rad, m] displacement at which the hysteresis of a cable saturates
+# [rad, m] lowest and highest displacement at which the hysteresis of a cable saturates; each joint has a random value
+CABLE_BREAKAWAY = (0.05, 0.5)
 CURRENT_CORRELATION = 0.01  # [s] correlation time of the noise of the motor current
 BACKLASH_TORQUE = (
     0.05  # [1] torque at which gears change the tooth flank, relative to the torque's standard deviation
@@ -41,7 +42,8 @@ class RealErrors:
     encoder_step: float = 0.0  # [rad, m] resolution of positions
     sensor_cutoff: float = np.inf  # [Hz] cutoff of the first-order low-pass of the torque signal
     current_noise: float = 0.0  # [1] noise of the motor current, relative to the torque's standard deviation
-    slow_noise: float = 0.0  # [1] other, slow torque errors, relative to the torque's standard deviation
+    # [1] torque noise with the correlation time `slow_correlation`, relative to the torque's standard deviation
+    slow_noise: float = 0.0
     slow_correlation: float = 0.0  # [s] correlation time of `slow_noise`
     gain: float = 0.0  # [1] standard deviation of log(logged torque / true torque), one factor per joint
     zero: float = 0.0  # [rad, m] standard deviation of the zero offset of logged positions, per joint

@@ -127,10 +127,11 @@ def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
-    """Print torque errors of the trained model, and of models adapted to each test, on tests of other days.
+    """Print torque errors of the trained model, and of models adapted to each test recording, made on other days.
 
-    The first 10 s of a test are used to refit friction and torque offsets ("friction"), or all parameters ("another
-    unit"). The errors are measured on the remainder of the test.
+    The first 10 s of a recording are used to refit friction and torque offsets (column "friction"), or all parameters,
+    as for another robot of the same type (column "another unit"). All errors are nMSE on the remainder of the
+    recording. logs: {name: recording}.
     """
     print(
         "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
@@ -147,7 +148,10 @@ def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
-    """Return the fit with parameters refitted to a log, as by `spelgen train --from`; adapt: option of `TorqueFit`."""
+    """Return a fit whose model is a copy of `fit.model`, adapted to a log, as by `spelgen train --from`.
+
+    adapt: parameters to refit: "load" (the last body), "friction" (friction and torque offsets) or "unit" (all).
+    """
     return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
 
 

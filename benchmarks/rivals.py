@@ -110,7 +110,10 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     parameters.add(sysid.Parameter("offset", 0 * scale, -10 * scale, 10 * scale))
 
     def torque(x: DynamicsSamples, values: Any) -> np.ndarray:
-        """Return MuJoCo's inverse dynamics of samples with parameters `values`, plus the offset, (T, n) [Nm]."""
+        """Return the torque by MuJoCo's inverse dynamics plus the torque offset of each joint, (T, n) [Nm].
+
+        x: samples. values: `ParameterDict` of inertias, drive constants and offsets.
+        """
         changed = sysid.apply_param_modifiers(values, spec.copy())
         data, rows = mujoco.MjData(changed), []
         for q, qd, qdd in zip(x.q, x.qd, x.qdd, strict=True):
@@ -120,10 +123,11 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         return np.array(rows) + values["offset"].value
 
     def residual(x: np.ndarray, values: Any) -> tuple[list[np.ndarray], None, None]:
-        """Return [residuals], None, None, the result that `sysid.optimize` needs, for k parameter vectors.
+        """Return [residuals], None, None for k parameter vectors; `sysid.optimize` needs a result of this form.
 
-        x: (P, k), the parameter vectors are its columns; or (P,). residuals: (S n, k) or (S n,), torque residuals of S
-        samples and n joints, divided by `scale`.
+        x: (P, k), a parameter vector per column; or (P,). values: `ParameterDict` of `sysid`, overwritten with each
+        vector. residuals: (S n, k) or (S n,) [1], torque residuals of S samples and n joints, divided by `scale`, the
+        standard deviation of each joint's torque.
         """
         columns = []
         for vector in x.reshape(len(x), -1).T:
@@ -163,17 +167,21 @@ class InverseDynamicsKernel(nn.Module):
         n = len(revolute)
         self.revolute, self.joint = revolute, joint
         self.motion = nn.Parameter(torch.zeros(1 + n + n * (n + 1) // 2).double())
-        # Logarithms of the weights of 1, cos q and sin q. The initial weights of cos q and sin q are small: otherwise
-        # the highest powers would dominate the product of the kernels over all joints, which has degree 2 n.
+        # (2, n, 3) logarithms of the weights of 1, cos q and sin q. The kernel k2 of degree two is the product of two
+        # kernels of degree one, each with its own weights per joint. The product of k2 over n joints has degree 2 n:
+        # the initial weights of cos q and sin q are small, since otherwise the highest powers would dominate.
         self.position = nn.Parameter(torch.tensor([0.0, -3.0, -3.0]).double().repeat(2, n, 1))
         self.friction = nn.Parameter(torch.full((3,), -2.0).double())
         self.noise = nn.Parameter(torch.tensor(-4.0).double())
 
     def features(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the features a (T, A), c (T, n, 3) and f (T, 3) of the kernels along a motion, (T, n) each.
+        """Return the features a (T, A), c (T, n, 3) and f (T, 3) of the kernel k (see the class) along a motion.
 
-        a: 1, the accelerations, and products of two velocities. c: 1, cos q and sin q of each joint; 1, q and 0 of a
-        sliding joint. f: 1, qd and tanh(qd / `SMOOTHING`) of the joint whose torque is modelled.
+        - a = (1, qdd, qd_i qd_j for i <= j), of all joints.
+        - c = (1, cos q, sin q) per turning joint, (1, q, 0) per sliding joint.
+        - f = (1, qd, tanh(qd / `SMOOTHING`)) of the joint whose torque is modelled.
+
+        q, qd, qdd: (T, n) each.
         """
         row, column = torch.triu_indices(q.shape[1], q.shape[1])
         one = torch.ones_like(q[:, :1])
@@ -204,9 +212,14 @@ def gaussian_process(problem: Problem) -> Prediction:
     mean, scale = training.tau.mean(axis=0), np.maximum(training.tau.std(axis=0), 1e-9)
 
     def inputs(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
-        """Return q, qd and qdd of samples, (T, n) each; qd and qdd are divided by their largest standard deviation."""
+        """Return q, qd / s_v and qdd / s_a of samples, (T, n) each.
+
+        s_v and s_a are the standard deviations of velocity and acceleration in the training, each of the joint with the
+        largest one.
+        """
         q, qd, qdd = tensors(x)
-        # one scale of velocities and one of accelerations for all joints, as products of velocities mix joints
+        # The scales are common to all joints: the kernel has products of the velocities of two joints (Coriolis terms),
+        # whose relative magnitudes a scale per joint would change.
         return q, qd / float(deviation[0].max()), qdd / float(deviation[1].max())
 
     processes: list[tuple[InverseDynamicsKernel, tuple[Tensor, ...], Tensor, Tensor]] = []
@@ -262,7 +275,7 @@ def _moments(process: tuple[Any, ...], inputs: tuple[Tensor, Tensor, Tensor]) ->
 
     Args:
         process: kernel, training features, Cholesky factor of the training covariance, and weights of the mean.
-        inputs: q, qd and qdd, (T, n) each; qd and qdd divided by their standard deviations.
+        inputs: q, qd and qdd, (T, n) each; qd and qdd divided by their scales (see `gaussian_process`).
     """
     kernel, many, factor, weights = process
     with torch.no_grad():
@@ -329,7 +342,10 @@ class DeepLagrangian(nn.Module):
         return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
 
     def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the torque along q, qd, qdd (..., n), standardized to mean zero and variance one in the training."""
+        """Return the standardized torque along q, qd, qdd, (..., n) each: (torque - mean) / standard deviation.
+
+        Mean and standard deviation are of each joint's torque in the training samples (see `best_of`).
+        """
 
         def lagrangian(x: Tensor) -> Tensor:
             """Return the Lagrangian T - V at positions x (..., n) and at qd of `forward`, summed over the batch."""

@@ -44,7 +44,8 @@ STEP = 5e-4  # [s] integration step of the simulated robot
 HARD = [2e-3, 1.0]
 # joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
 SHARE, DAMPING = 0.02, 2e-4
-# [s] largest integration step of fitted actuators; the time constant of frictionloss is twice this step
+# [s] Largest integration step of fitted actuators. MuJoCo limits the stiffness of frictionloss: the time constant of
+# this constraint is at least twice the integration step, here 10 ms.
 FIT_STEP = 5e-3
 # number of windows and of solver steps of the fit of actuators, which takes half a minute
 WINDOWS, ITERATIONS = 60, 8
@@ -126,8 +127,10 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
 class PositionActuators:
     """Predictor of positions from commands: MuJoCo's position actuators on an arm with n joints and n bodies.
 
-    untrained: model with the URDF's inertias. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the
-    command of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+    The actuators get the command of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+
+    untrained: unfitted spelgen model, for the inertias of the URDF and the torque limits. drives: (4, n), the rows are
+    kp [Nm/rad, N/m], kv [Nm s/rad, N s/m], armature [kg m^2, kg] and frictionloss [Nm, N].
     """
 
     arm: Chain
@@ -137,10 +140,10 @@ class PositionActuators:
     delay: float
 
     def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions (T, n) [rad, m] after the first row of each part of a log.
+        """Return the predicted positions (T, n) [rad, m] of each segment, without its first row.
 
         Args:
-            segments: logs and the rows of each to predict, from their commands.
+            segments: pairs of a log and the rows of it to predict; the log has the commands.
             q: (segments, n) initial positions [rad, m].
             qd: (segments, n) initial velocities [rad/s, m/s].
         """
@@ -221,7 +224,8 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     if len(arm.chain.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
-    # kv includes the joint's viscous friction: separately they would differ only while the torque is limited
+    # kv is kd of the servo plus viscous friction of the joint. Only their sum affects the motion unless the actuator is
+    # at its torque limit, which applies to kd but not to viscous friction.
     rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
@@ -242,7 +246,10 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        """Return the position errors of S samples, (S n,), after the burn-in of each window, for unknowns x."""
+        """Return predicted minus measured positions of S samples, (S n,) [rad, m], for unknowns x (see `actuators`).
+
+        The first samples of each window, its burn-in, are omitted.
+        """
         candidate = actuators(x)
         model = candidate.model()
         model.opt.timestep = 1 / windows.rate / steps
@@ -257,8 +264,9 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """Return the derivative of the position errors of S samples with respect to x, (S n, 5 n + 1).
 
-        The differences are finite. Each of the five parameters per joint, such as kp, is changed at all joints at once.
-        The effect of a joint's parameter on other joints is small and neglected.
+        It is computed by finite differences. Each of the five parameters per joint, such as log(kp), is changed at all
+        joints at once: the effect of a joint's parameter on other joints is small and neglected. The last column is for
+        the delay. residuals: (S n, 1), errors at x. x: (5 n + 1, 1) unknowns (see `actuators`).
         """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):

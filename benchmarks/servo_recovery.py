@@ -45,8 +45,11 @@ def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor) -> torch.Tensor:
     """Simulate an arm with servos from rest at the first command; return its positions, (B, T, n) [rad].
 
+    The gains kp and kd, armature, dry friction and delay of the servos are the constants of this file.
+
     Args:
-        model: model of the arm, of which M without armature and the bias torques are used.
+        model: model of the arm; only its bias torques and its M are used, M with the armatures of the true servos in
+            place of its own.
         u: (B, T, n) commands [rad] of B motions.
         dead_zone: position error below which servos give no torque [rad].
         limit: (n,) largest torque [Nm].
@@ -75,7 +78,10 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
 
 
 def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
-    """Yield per seed the logs of the simulated arm: commands, and positions rounded to encoder steps."""
+    """Yield, for each seed, `RECORDINGS` logs of the simulated arm: commands, and positions rounded to encoder steps.
+
+    The velocities are differences of these positions. asked: options of the command line.
+    """
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, asked.seconds, 1 / RATE)
     limit = torch.tensor([x.effort or float("inf") for x in arm.chain.coordinates]).double()
@@ -102,7 +108,7 @@ def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Tra
 def in_mujoco(
     urdf: Path, arm: spelgen.Arm, u: list[np.ndarray], limit: np.ndarray, backlash: float
 ) -> np.ndarray:
-    """Simulate the same servos in MuJoCo, with backlash of the gears; return positions, (B, T, n) [rad].
+    """Simulate the servos of `simulated` in MuJoCo, with backlash of the gears; return positions, (B, T, n) [rad].
 
     Args:
         urdf: file of the arm.

@@ -19,11 +19,13 @@ The errors are measured along a test motion without noise. A star marks a true v
 - friction f: rms(f - f*) / rms(f*), after the mean of each joint (the offset) is subtracted from f and f*;
 - torque: nMSE (mean squared error / variance of the torque, mean over joints), unfiltered and low-passed at 8 Hz.
 
-True values are the output of sensors without noise. If torque units and zero positions of the sensors are wrong, M*, g*
-and torques have the wrong units, at the logged positions. The true base parameters are then the least-squares solution
-for the rigid torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1,
-1982). Its regressor has the motion of the links plus the zero offsets, not the motion of the motors: motors with
-backlash have peaks of acceleration, and a regression on these peaks has a bias that no fit to filtered logs has.
+True values are values that sensors without noise would log. The sensors of some cases have wrong torque units (logged
+torque = gain * torque) and wrong zero positions (logged q = q + zero): M*, g* and torques are then gain * M(q - zero),
+and so on, at the logged q. No base parameters reproduce such torques exactly. The true base parameters are therefore
+the least-squares solution for the logged rigid torque of the test motion (the pseudo-true parameters of a misspecified
+model; White, Econometrica 50:1, 1982). Their regressor has the motion of the links plus the zero offsets. It does not
+have the motion of the motors, although encoders measure it: backlash causes peaks in the acceleration of motors, and a
+regression on these peaks has a bias that fits to filtered logs do not have.
 
 Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
 the residuals of recordings if their folder is given.
@@ -165,7 +167,10 @@ class Truth:
         return self.bodies.mass_matrix(q).detach().numpy() - np.diag(self.nominal)
 
     def _rigid_torque(self, motion: Motion) -> np.ndarray:
-        """Return the inverse dynamics of the rigid bodies along a motion of the links, (T, n) [Nm, N]."""
+        """Return the torque of inertia, Coriolis and gravity of the rigid bodies without armatures, (T, n) [Nm, N].
+
+        motion: q, qd and qdd of the links, (T, n) each, on the link's side of elastic joints and gears.
+        """
         q, qd, qdd = motion
         with torch.no_grad():
             bias = self.bodies.nonlinear_effects(torch.from_numpy(q), torch.from_numpy(qd)).numpy()
@@ -180,7 +185,11 @@ class Truth:
         return self.process.gain[:, None] * mass
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque of gravity and springs at logged positions q, times `gain` as in logs, (T, n) [Nm, N]."""
+        """Return the torque of gravity and springs as a sensor would log it, (T, n) [Nm, N].
+
+        It is the true torque times `process.gain`, the factor from true to logged torques. q: (T, n) logged positions
+        [rad, m], including zero offsets.
+        """
         return self.process.gain * self._gravity(q - self.process.zero)
 
     def _gravity(self, q: np.ndarray) -> np.ndarray:
@@ -188,13 +197,19 @@ class Truth:
         return own + self.spring * np.sin(q)
 
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Return the friction torque along a motion of the motors, (T, n) at the rate `FINE`."""
+        """Return the true friction torque along a motion of the motors, (T, n) [Nm, N].
+
+        q, qd: (T, n) true positions and velocities at the rate `FINE`. Friction of bristles depends on past positions.
+        """
         if self.case.friction == "bristles":
             return self._friction(q, qd, play(q, BRISTLES))
         return self._friction(q, qd, np.tanh(qd / 1e-3))
 
     def _friction(self, q: np.ndarray, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return viscous plus dry friction at positions and velocities, (T, n); direction: of dry friction, -1..1."""
+        """Return viscous plus dry friction at true positions and velocities, (T, n) [Nm, N].
+
+        direction: (T, n), dry friction relative to its magnitude while sliding, -1..1; fractions during a reversal.
+        """
         dry = self.coulomb * direction * self.process.friction_factor(q)
         if self.case.friction == "stribeck":
             dry = dry * (1 + 0.6 * np.exp(-((qd / 0.1) ** 2)))
@@ -203,7 +218,11 @@ class Truth:
         return self.viscous * qd + dry * (1 + self.asymmetry * direction)
 
     def sliding_friction(self, sliding: SteadySliding) -> np.ndarray:
-        """Return the friction of steady sliding, times `gain` as in logs, (speeds, n) [Nm, N]: see `SteadySliding`."""
+        """Return the friction of steady sliding as a sensor would log it, (speeds, n) [Nm, N].
+
+        It is the true friction times `process.gain`, the factor from true to logged torques. sliding: speeds, and
+        logged positions over which friction is averaged.
+        """
         q = sliding.q - self.process.zero
         rows = []
         for speed in sliding.speeds:
@@ -250,13 +269,16 @@ class Truth:
         return base.combination[inertial, :count], columns[:, :, base.columns[inertial]]
 
     def base_parameters(self, motion: Motion, combination: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the true base parameters (r,), or pseudo-true ones (see the module) if the case has `errors`.
+        """Return the true base parameters, (r,).
+
+        If the case has `errors`, logged torques have wrong units and logged positions have zero offsets. The result is
+        then the least-squares solution for logged torques and positions (see the module).
 
         Args:
-            motion: motion of the links without zero offsets, for the true torque.
-            combination: (r, K) matrix from K inertial parameters and armatures to base parameters.
-            columns: (T, n, r) regressor of the base parameters, along the motion with zero offsets added to q. Both
-                arrays are results of `inertial_columns`.
+            motion: test motion of the links, with true positions; logged positions are these plus the zero offsets.
+            combination: (r, K) matrix from K inertial parameters and armatures to base parameters, the first result of
+                `inertial_columns`.
+            columns: (T, n, r) regressor of the base parameters at the logged positions, its second result.
         """
         bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
         exact = combination @ np.concatenate([bodies, self.armature])
@@ -426,7 +448,11 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
-    """Return the errors of fitted dynamics along a test motion of the links, by name; see the module."""
+    """Return {name: error} of fitted dynamics along a test motion of the links; errors are relative (see the module).
+
+    Names: "mass" (M), "diagonal" (mean of each M_jj), "base" (base parameters), "gravity", "friction", "nmse" and
+    "nmse_filtered" (torque), and "intervals" (`interval_ratios`) if the fit has a posterior.
+    """
     every, dynamics = round(FINE / 100.0), fitted.dynamics
     sensed, true_tau, true_friction = truth.sensed(motion)
     q, qd, qdd = (np.ascontiguousarray(x[::every]) for x in sensed)
@@ -473,10 +499,11 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Dynamics that a method has fitted, and their parameters.
+    """Dynamics that one of `METHODS` has fitted, and their parameters.
 
-    bodies: inertial parameters, (B, 10), in the frames of the joints. armature: (n,). posterior: of the default preset.
-    residual: statistics of the torque residual (`residual_of`), of least squares with bristle states.
+    bodies: inertial parameters, (B, 10), in the frames of the joints. armature: (n,) [kg m^2, kg]. posterior: only for
+    the method "hybrid". residual: statistics of the torque residual in the training logs (`residual_of`), only for the
+    method "identify --memory".
     """
 
     dynamics: Any
@@ -508,9 +535,10 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
 
 
 def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) -> list[float] | None:
-    """Return statistics of the torque residual of an identification on its own logs; None without bristle states.
+    """Return `ResidualStatistics.columns` (level, correlation, spectrum) of the torque residual of an identification.
 
-    They are `ResidualStatistics.columns`.
+    The residual is on the logs of the identification. Return None if the identified friction has no bristle states, or
+    if all logs are shorter than 4 s.
     """
     if not result.method.friction.memory:
         return None
@@ -526,7 +554,7 @@ def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) 
 
 
 def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Identify the arm with figaroh, from samples shifted by the delay that `identify` finds."""
+    """Identify the arm with figaroh, from samples without the torque delay, which `spelgen.identify` estimates."""
     loaded = spelgen.load_arm(urdf)
     delay = spelgen.identify(loaded, logs).torque_delay.delay
     samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))

@@ -1,4 +1,4 @@
-"""A mapping that is suggested from column names reads the log with its original values."""
+"""A log that is read with the mapping suggested from its column names has the values that were written, in SI units."""
 
 import csv
 import subprocess
@@ -48,7 +48,7 @@ def written(path, head, rows):
 def require_same(found, rtol=1e-9, qd=QD):
     for values, expected in ((found.q, Q), (found.qd, qd), (found.tau, TAU)):
         np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9)
-    # the tolerance is the resolution of a double at 1.7e9 s
+    # some logs have times of about 1.7e9 s, where doubles have a spacing of 2.4e-7 s; the tolerance is four times this
     np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)
 
 
@@ -164,10 +164,10 @@ def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
 
 
 def test_times_that_fall_are_called_so(scara, tmp_path):
-    """If times fall from row to row, such as remaining times, the error states this and advises `sample_rate`.
+    """If times decrease from row to row, such as remaining times, the error states this and advises `sample_rate`.
 
-    Times that fall only at some rows are start times of recordings, which the error advises to number; here each row
-    would be a recording.
+    If times decrease at a few rows only, a recording starts at each of them, and another error advises a column with
+    the number of the recording. This advice would be wrong here: each row would be a recording.
     """
     head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in scara.chain.joint_names)]
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
@@ -222,7 +222,8 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
         LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"
     ):
         suggest_mapping(path, scara.chain.joint_names)
-    with pytest.raises(LogError, match="or write their names under 'logs'"):  # not to rename effort to q
+    # the error must not advise to rename the columns of effort to q
+    with pytest.raises(LogError, match="or write their names under 'logs'"):
         read_logs(path, scara)
 
 
@@ -263,9 +264,10 @@ PUBLIC = {
 
 @pytest.mark.parametrize("source", PUBLIC)
 def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_taken(scara, tmp_path, source):
-    """If a log has several signals of a quantity, the mapping takes the measured one of the joints.
+    """If a log has several signals of a quantity, the suggested mapping selects the measured signal of the joints.
 
-    Column names are from public recordings; set points, tool forces and estimates have similar names.
+    The other signals are set points, tool forces and estimates, with similar names. The column names are from public
+    recordings.
     """
     clock, *measured, others = PUBLIC[source]
     names = [*measured, *others.split()]
@@ -377,7 +379,7 @@ def test_units_are_found_anywhere_in_a_name(scara, tmp_path, form):
     [("kgf.cm", 0.0980665), ("kg·cm", 0.0980665), ("N cm", 0.01), ("N·m", 1.0), ("mN-m", 1e-3)],
 )
 def test_units_of_torques_are_products(scara, tmp_path, unit, factor):
-    """Units of torques are recognised with any sign between their factors."""
+    """Units of torques are read with a dot, a hyphen, a space or a centred dot between force and length."""
     (tmp_path / "arm.urdf").write_text(
         scara.robot.path.read_text().replace('type="prismatic"', 'type="revolute"')
     )
@@ -469,7 +471,7 @@ def test_the_command_writes_the_mapping_and_uses_it(robots, tmp_path):
 
 
 def test_words_for_commands_in_names_of_joints_are_not_commands(scara, tmp_path):
-    """A servo's measured positions are found if its joints are named by words for commands."""
+    """Measured positions of a servo (q_target) are not confused with commands if a joint is named "target" or "set"."""
     text = (scara.robot.path).read_text()
     names = ["d", "target", "e", "set"]
     for k, name in enumerate(names):
@@ -509,7 +511,7 @@ NAMES = {
 
 @pytest.mark.parametrize("form", NAMES)
 def test_joints_are_found_by_the_distinct_parts_of_their_names(scara, tmp_path, form):
-    """Columns with a joint's name, or with the part that distinguishes it, belong to the joint in any order."""
+    """Columns are assigned to joints by name, not by order: by the joint's name or the part that distinguishes it."""
     names, *patterns = NAMES[form]
     text = scara.robot.path.read_text()
     for k, name in enumerate(names):
@@ -529,7 +531,10 @@ def test_joints_are_found_by_the_distinct_parts_of_their_names(scara, tmp_path, 
 
 @pytest.mark.parametrize("place", ["names", "line below the header"])
 def test_units_may_differ_between_joints(scara, tmp_path, place):
-    """Units in names, or in a line below the header, are drafted for each joint: a SCARA has degrees and mm."""
+    """The suggested mapping has units per joint, from column names or from a line below the header.
+
+    For example, the positions of a SCARA are in degrees at turning joints and in mm at the sliding joint.
+    """
     types = scara.chain.joint_types
     factors = np.array([180 / np.pi if kind == "revolute" else 1e3 for kind in types])
     units = [("deg", "deg/s", "Nm") if kind == "revolute" else ("mm", "mm/s", "N") for kind in types]
@@ -720,7 +725,10 @@ def test_exponents_of_fortran_are_read(scara, tmp_path):
 
 @pytest.mark.parametrize("text", ["missing", "#DIV/0!", "nan(ind)", "1.#INF"])
 def test_texts_for_no_value_are_gaps(scara, tmp_path, text):
-    """A text for a missing value is an error, which states the setting that omits such rows."""
+    """A cell with a text such as "#DIV/0!" for an absent value is an error that states the setting `dropouts: dropped`.
+
+    With this setting such rows are omitted.
+    """
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU]).tolist()
     rows[5][3] = text

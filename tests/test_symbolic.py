@@ -1,4 +1,4 @@
-"""Exact polynomials of M and V prove the derived structure and equal Pinocchio."""
+"""Exact polynomials of M(q) and of the potential energy V(q) confirm the structure that spelgen derives for an arm."""
 
 import numpy as np
 import pytest
@@ -15,9 +15,10 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """Numbers of varying terms (outputs) and constant terms of M equal ranks of the exact polynomials' coefficients.
+    """The derived structure agrees with exact polynomials of M(q) and of the potential energy V(q).
 
-    The zero entries of M, and the joints that each entry, each output and V depend on, are also equal.
+    M = sum_j f_j(q) B_j + sum_k c_k A_k has as many functions f_j (outputs) and constants c_k as the rank of the
+    polynomials' coefficients. The zero entries of M, and the joints that each entry, each f_j and V depend on, agree.
     """
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
@@ -48,7 +49,11 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
 
 
 def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
-    """Return {(joints, exponents of a monomial): {index of an entry of M: coefficient of the monomial}}."""
+    """Return the coefficients of all monomials of M: {(joints, exponents): {index of an entry of M: coefficient}}.
+
+    exponents: of all variables of `poly`. joints: tuple of the coordinates, 0..n-1, whose cosine, sine or distance is
+    in the monomial. index: of the entry in the lower triangle of M, row after row.
+    """
     vectors: dict = {}
     for index, key in enumerate(triangle(n)):
         for exponents, coefficient in poly.mass[key].terms():

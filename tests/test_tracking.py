@@ -35,9 +35,10 @@ def changed(settings, tracking=None, **protocol):
 
 @pytest.fixture(scope="module")
 def recordings(loaded):
-    """Return settings, simulated motions and logs under the softest and the hardest controller, over whole periods.
+    """Return settings, motions and logs of an arm that tracks sines under the softest and the hardest controller.
 
-    The motions are pairs of the desired path and the true states.
+    The motions are a list of (desired path, recording with the true states), the softest controller first, over one
+    period of the sines (8 s). The logs are the result of `track`, divided into training and test. loaded: the arm.
     """
     ends = min(loaded.settings.tracking.bandwidths), max(loaded.settings.tracking.bandwidths)
     settings = changed(loaded.settings, {"bandwidths": ends}, trajectories=2)
@@ -203,7 +204,10 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
-    """Without gains and without a sine, the controller's initial torque keeps the arm at rest under gravity."""
+    """The controller's initial torque balances gravity: without feedback, an arm at its desired position stays at rest.
+
+    The amplitude of the desired sines and the feedback gains are zero.
+    """
     friction = make_friction(loaded.chain, loaded.settings)
     engine = arm_dynamics(loaded.chain, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)

@@ -33,7 +33,7 @@ def wrong(text: str) -> list[str]:
 
 
 def documented(tree: ast.Module) -> set[ast.AST]:
-    """Return the constants of a syntax tree that are docstrings, of modules, classes, functions and names."""
+    """Return all constants of a syntax tree that are statements: docstrings, including strings after assignments."""
     return {x.value for x in ast.walk(tree) if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant)}
 
 
