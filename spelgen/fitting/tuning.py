@@ -15,7 +15,8 @@ class FittingTuning:
     # [1] Smallest damping: steps with a smaller damping equal Gauss-Newton steps to nine digits.
     min_damping: float = 1e-9
     # [1] After a step that decreases the cost, the damping is divided by this number; after any other step, it is
-    # multiplied by it (Marquardt: 10). The fits of single servos have few steps and multiply by half of this number, 5.
+    # multiplied by it (Marquardt: 10). The fits of single servo joints, of at most six steps, multiply by only half of
+    # this number, 5: with a damping that is too large, the remaining steps would be too short.
     damping_factor: float = 10.0
     # [1] Largest number of dampings tried for one step. If the first is the smallest damping, the last is 1e5, with
     # which steps are negligible.

@@ -30,7 +30,8 @@ class WrongOrder(Fault):
         """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
-        # exchanged columns of only the motion, or only the torques, are less frequent than exchanged whole joints
+        # the columns of whole joints are exchanged more often than only the motions or only the torques, whose
+        # hypotheses therefore have a penalty of 2 on the cost
         self.rarity = 0 if len(rows) == 2 else 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
@@ -59,7 +60,7 @@ class WrongOrder(Fault):
         # their names.
         starts = [present, present[::-1], np.argsort(np.argsort(joints))]
         starts += [rng.permutation(len(joints)) for _ in range(6)]
-        # fits are cached, since searches from several starts visit the same orders
+        # fits are cached, since searches from several starts reach the same permutations of the columns
         known: dict[bytes, HypothesisFit] = {}
 
         def fitted(hypothesis: Hypothesis) -> HypothesisFit:
@@ -120,7 +121,10 @@ class WrongScale(Fault):
         """
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques, with the scales in `base` multiplied by each of `factors`."""
+        """Yield least-squares fits of the log's torques, one or two for each candidate in `factors`.
+
+        The correction factors of a candidate multiply the scales of motion and torques in the hypothesis of `base`.
+        """
         return self._scaled_by(self.factors, problem, base)
 
     def _scaled_by(
@@ -128,9 +132,9 @@ class WrongScale(Fault):
     ) -> Iterator[HypothesisFit]:
         """Yield least-squares fits of the log's torques with signals that are scaled by each array of `factors`.
 
-        An array (2, n) has the factors on the motion, then the factors on the torques of n joints. They multiply the
-        scales in the hypothesis of the fit `base`. If an array reverses a joint that has a zero offset, two fits are
-        yielded, with either sign of this offset.
+        An array (2, n) has the factors on the motion, then the factors on the torques of n joints. The scales in the
+        hypothesis of the fit `base` are multiplied by these factors. If the motion of a joint with a zero offset has a
+        negative factor, two fits are yielded, with either sign of the offset: its sign after the reversal is unknown.
         """
         reading = base.hypothesis
         for factor in factors:
@@ -186,14 +190,17 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense: its correction factor is negative.
+        """Return the mask (n,) of the joints whose motion is reversed: its correction factor is negative.
 
-        motion, torque: (n,) correction factors of the joints.
+        motion, torque: (n,) correction factors of the joints' motion and torques; the torques may be reversed or not.
         """
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about joints whose motion is opposite to the URDF's sense, and the sense of their torques."""
+        """Return the text about joints whose positive direction of motion is opposite to the URDF's.
+
+        The text also states whether the torques of these joints are reversed: all, none or some.
+        """
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():

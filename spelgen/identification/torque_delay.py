@@ -29,8 +29,9 @@ class TorqueDelay:
     Attributes:
         delay: delay [s], positive if torques are logged later than positions; 0 if no delay is significant.
         interval: half the width of the delay's 99 % interval [s].
-        coupling: coupling of motors, and the squared torque residual with it divided by the residual without it, see
-            `find_coupling`. If a coupling is found, no delay is estimated, since the estimate would be biased.
+        coupling: (coupling, ratio) if two motors are coupled, otherwise None. The ratio is the squared torque residual
+            with the coupling divided by the squared residual without it (`find_coupling`). If a coupling is found, no
+            delay is estimated, since the estimate would be biased.
     """
 
     delay: float = 0.0
