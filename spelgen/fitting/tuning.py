@@ -21,8 +21,8 @@ class FittingTuning:
     # [1] Largest number of dampings tried for one step. If the first is the smallest damping, the last is 1e5, with
     # which steps are negligible.
     max_trials: int = 15
-    # [1] After a rejected step, a step is tried only if a component differs by more than this fraction of the largest
-    # component: otherwise both steps are nearly equal.
+    # [1] After a rejected step, the step with a larger damping is tried only if a component differs from the rejected
+    # step by more than this fraction of the largest component: otherwise both steps are nearly equal.
     same_step: float = 1e-3
     # [1] Smallest predicted decrease of the cost for which a step is tried, as a fraction of the cost. Smaller
     # decreases are within rounding errors.

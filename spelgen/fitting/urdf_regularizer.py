@@ -29,7 +29,8 @@ class UrdfRegularizer(NamedTuple):
         variation: (S, n, n), dimensionless, W (M - mean M) W^T with the mass matrix M of the URDF and the mean of M
             over the S positions.
         gravity: (S, n), gravity torque of the URDF [Nm, N].
-        gravity_scale: (n,), root mean square of `gravity` with a lower bound, the divisor of its errors [Nm, N].
+        gravity_scale: (n,), root mean square of `gravity` with a lower bound, by which errors of the gravity torque are
+            divided [Nm, N].
     """
 
     q: Tensor

@@ -26,7 +26,7 @@ class WrongOrder(Fault):
             code: code of the finding.
             description: text about the exchanged columns.
             rows: rows of `Hypothesis.source` that are permuted, 0 for the motion and 1 for the torques.
-            starts: number of orders from which the search for the best order starts, at most 9.
+            starts: number of initial orders of the joints, at most 9, from which the best order is searched.
         """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
@@ -110,7 +110,7 @@ class WrongScale(Fault):
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
-        """Define the candidates for factors on the motion and torque of n joints, (2, n) each."""
+        """Define the candidates for the correction factors of n joints, (2, n) each: on the motion, on the torque."""
         self.factors = factors
 
     @abstractmethod
@@ -181,7 +181,10 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault of a log: a joint's positions and velocities, and perhaps its torques, have the opposite sense."""
+    """Kind of fault of a log: the positive direction of a joint's positions and velocities is opposite to the URDF's.
+
+    The torques of the joint may have the opposite sign, too.
+    """
 
     code = "joint-sense"
 

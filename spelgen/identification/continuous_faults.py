@@ -99,7 +99,7 @@ class ZeroOffset(Fault):
     def minor_code(self, correction: Correction) -> str:
         """Return `code`, the code of a warning, if all zero offsets are small; otherwise "", and the fault is an error.
 
-        Offsets below `GEOMETRY.serious_angle` [rad] or `serious_shift` [m] are within the usual errors of a URDF.
+        Offsets below `GEOMETRY.serious_angle` [rad] or `serious_shift` [m] are within the typical errors of a URDF.
         """
         shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
         is_revolute = np.array(correction.arm.joint_types) == "revolute"
@@ -212,7 +212,7 @@ class Gravity(Compensation):
     def minor_code(self, correction: Correction) -> str:
         """Return `code`, the code of a warning, if gravity is tilted slightly; otherwise "", and the fault is an error.
 
-        Tilts below `GEOMETRY.serious_angle` [rad] are within the usual errors of the mounting.
+        Tilts below `GEOMETRY.serious_angle` [rad] are within the typical errors of the mounting.
         """
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)

@@ -217,9 +217,10 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
     if best.cost > unchanged.cost - GEOMETRY.needed:
         return ()
     likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=RANK)
-    # Errors of the friction model may be explained by exchanged columns, so that exchanged columns are first although
-    # only the sense of one joint is wrong, which is the more frequent fault. If the rank of the best such sense is less
-    # than `needed` above theirs, and its cost is clearly below the cost of the unchanged log, it becomes the first.
+    # Exchanged columns may explain errors of the friction model, and then have a lower cost than the right hypothesis,
+    # the reversed sign of a single joint, which is the more frequent fault. The best hypothesis of one reversed joint
+    # is therefore moved to the front if its rank exceeds the rank of the exchanged columns by less than `needed`, and
+    # is below the cost of the unchanged log by more than `ambiguous`.
     if isinstance(likely[0].hypothesis.faults[0], WrongOrder):
         bound = min(likely[0].rank + GEOMETRY.needed, unchanged.cost - GEOMETRY.ambiguous)
         senses = [fit for fit in fits if fit.rank < bound and _is_one_sense(fit.hypothesis)]

@@ -18,7 +18,7 @@ from spelgen.identification.tuning import GEOMETRY
 TOGETHER = 20
 """Number of recordings that are compared at a time. It bounds the number of columns of the least-squares problem."""
 SAMPLES = 1200
-"""Largest number of samples of these recordings."""
+"""Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
 Candidate = tuple[float, int, float, int | None]

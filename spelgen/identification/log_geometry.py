@@ -243,7 +243,10 @@ class GeometryProblem:
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def misfit(self, errors: np.ndarray) -> float:
-        """Return the negative log likelihood for relative squared residuals `errors` (n,) of the joints."""
+        """Return the negative log likelihood of the torques, up to a constant.
+
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
+        """
         return 0.5 * self.count * float(np.log(errors + GEOMETRY.error_floor).sum())
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:

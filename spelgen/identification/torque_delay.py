@@ -82,7 +82,8 @@ def find_torque_delay(
         joint_types: "revolute" or "prismatic" for each joint.
         drives: input matrix, and matrix from joint speeds to motor speeds.
         chain: chain of the arm's bodies.
-        preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
+        preprocessing: filter, and shortest gap [s] at which recordings are split. Its torque delay is ignored, since
+            the delay is estimated here.
     """
     collected = DriveLog(joint_types, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:

@@ -91,7 +91,8 @@ class LogGeometryTuning:
     # to 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
     # [1] If the rigid-body and friction model is fitted to the log without corrections, and the residual variance /
-    # variance of the torque is above this value, the logged columns are probably no joint torques.
+    # variance of the torque is above this value in the mean of the joints or at a loaded joint, the logged columns are
+    # probably no joint torques.
     no_torque: float = 0.6
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.

@@ -18,7 +18,8 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
     The K parameters are the parameters of a `ParameterVector`. The fit estimates k parameters (`ServoParameters`):
     joint parameters, coordinates of the bodies, and the delay. Their covariance (k, k) is converted by the derivatives
     of the K parameters with respect to the k parameters. It is scaled such that 1.96 standard deviations are half the
-    width of the 95 % interval of Student's t distribution. The fit underestimates three variances; these are increased:
+    width of the 95 % interval of Student's t distribution. Three variances are increased, since the fit underestimates
+    them:
 
     - kd, armature and friction: the variance due to errors of the friction model is added
       (`ServoTuning.model_deviation`).

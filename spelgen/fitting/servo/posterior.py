@@ -100,7 +100,7 @@ class ServoPosterior(Posterior):
         def ratios(model: ArmModel) -> Tensor:
             """Return the eight quantities of n joints, (8, n), in the order and the units of `SERVO_UNITS`.
 
-            These are kp, kd/kp, lag, armature/kp, coulomb/kp, dead zone, static error and offset/kp.
+            The quantities are kp, kd/kp, lag, armature/kp, coulomb/kp, dead zone, static error and offset/kp.
             """
             servo, kp = model.servo, model.servo.kp()
             damping, dry = servo.kd() / kp, line(model)[1] / kp
@@ -128,7 +128,11 @@ class ServoPosterior(Posterior):
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return r ratios, base parameter / kp of a joint, (r,), with a square root (r, k) of their covariance."""
+        """Return r ratios (base parameter / kp of a joint), (r,), and a square root (r, k) of their covariance.
+
+        joint: index of the joint. The unit of a ratio is the unit of the base parameter divided by the unit of kp. k is
+        the rank of the covariance of the fitted parameters (see `Propagated`).
+        """
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

@@ -254,9 +254,10 @@ def _compared_fit(
 def _unfitted(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, blocks: Sequence[TorqueSamples]
 ) -> _StagedFit:
-    """Return the model before a fit, as a result to which fits are compared; the covariance is the prior's.
+    """Return the model before a fit, in the form of a fit result, for comparison with fits.
 
-    blocks: contiguous blocks of `samples`, for which the squared errors are computed.
+    The covariance is the covariance of the prior. blocks: contiguous blocks of `samples`, for which the squared errors
+    are computed.
     """
     problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
     state, free = initial_state(problem, problem.prior.mean), problem.free

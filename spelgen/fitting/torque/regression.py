@@ -103,7 +103,7 @@ def _regression(
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # weights of the unscaled columns, without the last entry -1
+    parameters = (solution(total, penalty) / scale)[:-1]  # weights of unscaled columns, without the last -1
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 
