@@ -17,7 +17,7 @@ UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
 class WrongOrder(Fault):
-    """Kind of fault of a log: the columns of the joints are in another order."""
+    """Kind of fault of a log: the columns of some joints contain the signals of other joints."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
         """Define the columns of a log (motion, torques or both) that may belong to other joints.
@@ -100,7 +100,7 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Base class of faults that are corrected by factors: motion or torques of the opposite sense or in another unit.
+    """Base class of faults that are corrected by factors: motion or torques of another sign or in another unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
@@ -145,9 +145,9 @@ class WrongScale(Fault):
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings that correct the scale of a joint's signals; unchanged settings are omitted.
+        """Return the settings that correct the scale or the sign of a joint's signals; unchanged settings are omitted.
 
-        These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
+        The settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
         """
         if not self.has(*correction.factors)[joint]:
             return {}

@@ -215,7 +215,8 @@ def _change(
     best = min(refits, key=lambda x: x.misfit)
     factor, offset = 1.0, float(best.quantities[0, 0])
     if best is refits[0]:
-        # `torque` is a compromise of both parts: the refitted parameters give the torque before the change.
+        # `torque` was fitted to the samples before and after the change together. The parameters that were refitted
+        # with the change give the torque before it.
         scaled, before = columns[0][..., 0], rows @ best.parameters
         factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * before).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)

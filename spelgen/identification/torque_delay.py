@@ -93,10 +93,11 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques in a `DriveProblem`; if motors are coupled, only `coupling` of the result is set.
+    """Return the delay of the torques in the samples of `problem`, or only a coupling of motors, if one is detected.
 
     A delay and a coupling are both detected by a decrease of the least-squares torque residual. The delay is estimated
-    first. Then the torques are shifted by the delay, and a coupling is searched.
+    first. Then the torques are shifted by the delay, and a coupling is searched. If a coupling is found, the delay is
+    discarded.
     """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:

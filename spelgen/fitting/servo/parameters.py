@@ -108,7 +108,7 @@ class ParameterMap:
         A tensor is (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint. In rollouts, the axis of length
         1 is broadcast over the windows.
         """
-        # columns: per parameter name, a tensor (P, 1, n, K) for P sets of parameters with K values per joint
+        # `columns` has a tensor (P, 1, n, K) for each parameter name: P sets, n joints, K values per joint
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):

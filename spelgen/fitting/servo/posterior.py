@@ -124,7 +124,7 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance."""
+        """kp of all n servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance (see `Propagated`)."""
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:

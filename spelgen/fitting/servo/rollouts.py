@@ -48,7 +48,7 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts from the measured states of `windows`.
+        """Return the rollouts that start at the first measured positions and velocities of each window.
 
         The parameters x0, for which the load is computed (see the class), are the current parameters of the model.
         """

@@ -204,8 +204,8 @@ def _compared_fit(
     torque_std = joint_torque(model, samples.columns).std(dim=0)
     regression = best_regression(model, blocks, torque_std.numpy())
     squares = torch.from_numpy(regression.held_out)
-    # The squared lower bound of the noise is added to the held-out errors of the fit and of the regression, so that
-    # smaller differences are not significant.
+    # The held-out errors of the fit and of the regression are both increased by the squared lower bound of the noise,
+    # so that differences below this bound are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
     other = squares.sum(dim=1) + negligible
 
