@@ -108,6 +108,7 @@ def robot_of(
 
     The URDF is `urdf` or, if `urdf` is None, the file named in `spec` in the folder of `module`. It must be the URDF
     from which the module was built:
+
     - If `urdf` is given, ModuleError is raised for another URDF, and RunError if there is no such file.
     - If the file in the folder of `module` is absent or changed, the path is None, and a warning is returned.
     - If `urdf` and `module` are None, the path is None, without a warning.

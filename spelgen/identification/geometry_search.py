@@ -61,6 +61,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
     faults: kinds of faults, corrected singly and combined. There are three cases:
+
     - Hypotheses have significantly lower costs: the best is first, and the costs of the others are within
       `GEOMETRY.ambiguous` of its cost.
     - No decrease is significant, but a fault with `needed` = 0 lowers the cost at all: the best correction of such a

@@ -141,7 +141,7 @@ class _Equations:
         return regressor(self.arm, block.q, block.qd, block.qdd)
 
     def _rows(self, friction: FrictionModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield the regressor (T, n, K) and the joint torques (T, n) [Nm, N] of each block of samples."""
+        """Yield the regressor (T, n, K) of K parameters and the torques (T, n) [Nm, N] of each block of T samples."""
         reach = reach_of(self.arm.joint_types).values
         regressors = self._regressors or map(self._regressor, self._blocks)
         for block, bodies in zip(self._blocks, regressors, strict=True):
