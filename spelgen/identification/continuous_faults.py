@@ -73,7 +73,10 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets, with the largest offset. Reversed joints have a text of their own."""
+        """Return the text about zero offsets, with the largest offset of the joints whose motion is not reversed.
+
+        The zero offset of a reversed joint is a part of another correction (`JointSense`), which has its own text.
+        """
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -94,7 +97,10 @@ class ZeroOffset(Fault):
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all zero offsets are as small as errors of a URDF; else "", for an error."""
+        """Return `code`, the code of a warning, if all zero offsets are small; otherwise "", and the fault is an error.
+
+        Offsets below `GEOMETRY.serious_angle` [rad] or `serious_shift` [m] are within the typical errors of a URDF.
+        """
         shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
         is_revolute = np.array(correction.arm.joint_types) == "revolute"
         bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
@@ -123,8 +129,8 @@ class Compensation(Fault):
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
-        # The remaining fraction of gravity is between -0.5 and 0.5: if more than half of gravity remains in all joints,
-        # the masses of the URDF are probably wrong.
+        # The logged torques contain the fraction -0.5 to 0.5 of the gravity torque: if they contained more than half of
+        # it in all joints, wrong masses of the URDF would be a more likely reason than a compensation of gravity.
         fraction, _ = problem.descend(
             reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
         )
@@ -138,7 +144,7 @@ class Compensation(Fault):
         return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the setting `gravity` of the robot: the vector of gravity that the hypothesis assumes [m/s^2]."""
+        """Return the setting `gravity` [m/s^2]: the vector of gravity in the hypothesis of `correction`."""
         return {"gravity": [plain_number(x) for x in correction.hypothesis.gravity]}
 
 
@@ -194,14 +200,20 @@ class Gravity(Compensation):
             yield axis if is_axis else problem.fit(turned(new.round(3)))
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the orientation of the arm: the angle between gravity in settings and hypothesis."""
+        """Return the text about the orientation of the arm, with the angle between two directions of gravity [degrees].
+
+        One is the direction in the settings, the other is the direction in the hypothesis of `correction`.
+        """
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if gravity is tilted no more than by mounting errors; else "", for an error."""
+        """Return `code`, the code of a warning, if gravity is tilted slightly; otherwise "", and the fault is an error.
+
+        Tilts below `GEOMETRY.serious_angle` [rad] are within the typical errors of the mounting.
+        """
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

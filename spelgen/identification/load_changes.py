@@ -18,7 +18,7 @@ from spelgen.identification.tuning import GEOMETRY
 TOGETHER = 20
 """Number of recordings that are compared at a time. It bounds the number of columns of the least-squares problem."""
 SAMPLES = 1200
-"""Largest number of samples of these recordings."""
+"""Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
 Candidate = tuple[float, int, float, int | None]
@@ -57,8 +57,9 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
         for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
-            # Each group of at most `TOGETHER` recordings is compared together with the recording known[0]. This
-            # recording may have a change in several groups; the change of the first group is kept.
+            # known[0], the first recording, is compared with every group of at most `TOGETHER` other recordings. A
+            # change of its own load may therefore be found in several groups; only the change of the first group is
+            # kept.
             changes.setdefault(change.recording, change)
     return list(changes.values())
 
@@ -172,9 +173,10 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
     total = np.sum(products, axis=1)[:, None]
 
     def explained(sums: np.ndarray) -> np.ndarray:
-        """Return the part of the sum of squared residuals that a regression on torque and 1 explains, (C, n).
+        """Return the decrease of the sum of squared residuals by a regression on the torque and on 1, (C, n).
 
-        sums: (5, C, n), sums over the samples of a part of torque^2, torque, 1, torque * residual and residual.
+        sums: (5, C, n), sums over the samples before or after each of C times. The five summands are torque^2, torque,
+        1, torque * residual and residual.
         """
         squares, torques, count, products, residuals = sums
         slope = products - torques * residuals / count
@@ -193,11 +195,12 @@ def _change(
     time: float,
     joint: int | None,
 ) -> tuple[float, TorqueChange]:
-    """Return a change of the torques from `time` on, and its evidence compared with another load or other friction.
+    """Return the evidence for a change of the logged torques from `time` on, and the change: another factor or offset.
 
-    The evidence is returned first. It is the negative log likelihood of the better of the two other hypotheses (see
-    `torque_change`) minus the negative log likelihood of the change; 0 if the change does not explain the torques.
-    torque: torques of the model of `fit`, (S, n) [Nm, N]. recording, time, joint: see `TorqueChange`.
+    Two other hypotheses are another load, or other friction with drifting offsets, from `time` on. The evidence is the
+    negative log likelihood of the better of these two minus the negative log likelihood of the change; 0 if the change
+    does not explain the torques. fit: fit of `problem` without a change. torque: torques of the model of `fit`, (S, n)
+    [Nm, N]. recording, time, joint: see `TorqueChange`.
     """
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
@@ -212,7 +215,8 @@ def _change(
     best = min(refits, key=lambda x: x.misfit)
     factor, offset = 1.0, float(best.quantities[0, 0])
     if best is refits[0]:
-        # `torque` is a compromise of both parts: the refitted parameters give the torque before the change.
+        # `torque` was fitted to the samples before and after the change together. The parameters that were refitted
+        # with the change give the torque before it.
         scaled, unchanged = columns[0][..., 0], rows @ best.parameters
         factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * unchanged).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
@@ -264,8 +268,8 @@ def _refit(
     count, size = len(fit.parameters), columns.shape[2]
     joined = np.concatenate([columns * part[:, None, None] for part in parts], axis=2)
     variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
-    # The weight of a joint depends on its residual, which becomes smaller with the additional quantities. The fit is
-    # therefore repeated with the new weights.
+    # The weight of a joint depends on its torque residual, which is smaller after the fit of the D additional
+    # quantities, such as loads or torque offsets. The fit is therefore repeated with the new weights.
     for _ in range(3):
         change, covariance = problem.estimate(fit, joined)
         parameters = fit.parameters + change[:count]

@@ -84,13 +84,15 @@ class LogGeometryTuning:
     # [1] A recording has a fault of its own if its squared torque residual is larger than this multiple of the squared
     # residual of the other recordings, to which the model is fitted.
     deviation: float = 5.0
-    # [1] A hypothesis does not explain the torques if the relative residual variance is above this value at a joint,
-    # and also in the mean of the joints, weighted by the changes of their residual variance under the hypothesis. With
-    # the right correction, logs of recorded arms have at most 0.07 in the mean of all joints, although up to 0.27 at a
-    # joint whose torque is mostly friction.
+    # [1] A hypothesis does not explain the torques if the relative residual variance (residual variance / variance of
+    # the torque) is above this value at a joint, and also in a weighted mean of the joints. The weight of a joint is
+    # the change of its relative residual variance by the hypothesis: joints that the hypothesis does not affect do not
+    # count. With the right correction, logs of recorded arms have at most 0.07 in the mean of all joints, although up
+    # to 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
-    # [1] If the relative residual variance of the unchanged log is above this value, its torques are probably no joint
-    # torques.
+    # [1] If the rigid-body and friction model is fitted to the log without corrections, and the residual variance /
+    # variance of the torque is above this value in the mean of the joints or at a loaded joint, the logged columns are
+    # probably no joint torques.
     no_torque: float = 0.6
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.

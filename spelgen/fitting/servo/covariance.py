@@ -18,15 +18,17 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
     The K parameters are the parameters of a `ParameterVector`. The fit estimates k parameters (`ServoParameters`):
     joint parameters, coordinates of the bodies, and the delay. Their covariance (k, k) is converted by the derivatives
     of the K parameters with respect to the k parameters. It is scaled such that 1.96 standard deviations are half the
-    width of the 95 % interval of Student's t distribution. The fit underestimates three variances, which are increased:
+    width of the 95 % interval of Student's t distribution. Three variances are increased, since the fit underestimates
+    them:
 
     - kd, armature and friction: the variance due to errors of the friction model is added
       (`ServoTuning.model_deviation`).
     - bodies: the prior covariance is added for directions orthogonal to `ParameterMap.directions`, which are not
       fitted.
-    - common factor of gains, masses, friction and offsets, if no kp is known: positions depend on this factor only by
-      effort limits, which are often wrong in URDFs. The variance of its logarithm is raised to at least the prior
-      variance of the logarithm of a mass.
+    - common factor of gains, masses, friction and offsets, if no kp is known: only effort limits [Nm, N] determine this
+      factor, and the limits in URDFs are often wrong. The variance of the logarithm of the factor is therefore
+      increased until the mean variance of log kp is at least `ServoTuning.bodies`^2, the prior variance of the
+      logarithm of a mass.
     """
     parameters, model = problem.parameters, problem.rollouts.model
     vector, directions = ParameterVector(model), parameters.directions
@@ -60,7 +62,7 @@ def _common_factor(vector: ParameterVector) -> Tensor:
     """
     logarithms = vector.mask("stiffness", "damping", "armature", "sizes", "effects").double()
     derivatives = vector.unflatten(logarithms)
-    derivatives[vector.bodies][:, -1] = 1.0  # the last parameter of a body is log(mass): derivative 1
+    derivatives[vector.bodies][:, -1] = 1.0  # log(mass), with derivative 1 by log(factor)
     for name in vector.names("offset"):
         derivatives[name].copy_(vector.initial[name])
     return logarithms

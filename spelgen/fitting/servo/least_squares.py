@@ -76,7 +76,7 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
             joint's own acceleration (`BodyLoad.bias`), and 1.
         errors: (W, K, n), command errors u - q [rad, m] at the same samples.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5), joint first
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5): per joint, 5 regressors at W K samples
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution

@@ -103,11 +103,12 @@ class ParameterMap:
         return self.names.index(name)
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:
-        """Return {name: tensor} for P sets of joint parameters (P, p, n).
+        """Return {name: tensor} for P sets of joint parameters (P, p, n): p parameters for each of n joints.
 
-        The tensors are (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint.
+        A tensor is (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint. In rollouts, the axis of length
+        1 is broadcast over the windows.
         """
-        # columns: per parameter name, a tensor (P, 1, n, K) for P sets of parameters with K values per joint
+        # `columns` has a tensor (P, 1, n, K) for each parameter name: P sets, n joints, K values per joint
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):

@@ -103,9 +103,10 @@ class ServoProblem:
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
-        """Return the problem with other integration steps and other finite-difference steps.
+        """Return the same problem with shorter or longer integration steps and another step of the finite differences.
 
-        steps: number of integration steps per sample interval. difference_step: step of the finite differences.
+        steps: number of integration steps per sample interval. difference_step: step of each parameter in the finite
+        differences [1].
         """
         windows = replace(self.rollouts.windows, steps=steps)
         return replace(
@@ -118,7 +119,10 @@ class ServoProblem:
         return self.rollouts.parameters
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions for parameters x, (W, K', n) [rad, m].
+
+        Each of the W windows has K' samples after the burn-in.
+        """
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:

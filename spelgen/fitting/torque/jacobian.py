@@ -132,7 +132,8 @@ class TorqueJacobian:
         parameters: {name: values} of one set of parameters, or of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
-        # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
+        # The parameter x is the logarithm of a motor gain (joint torque / logged torque). Initial / current gain is
+        # therefore exp(x_initial - x) = exp(-change).
         for name in self.rigid.names("gains"):
             change = parameters[name] - self.rigid.initial[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self._gain_rows, (-change).exp())
@@ -322,15 +323,15 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
+        """Return the torque residual at the initial motor gains, and its negated Jacobian, compressed by graph colours.
 
-        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. One
-        reverse pass differentiates the sum of the torques of several joints, which have the same colour (graph
-        colouring: Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974). No common drive acts on joints of one
-        colour. A parameter of a drive, or the gravity torque on the drive, then affects the torque of at most one joint
-        of a colour, and the derivative of the sum is the derivative of this torque. Most arms have one colour, so one
-        pass replaces n passes. Each sample has its own copy of the parameters, so that a pass gives the derivatives of
-        all samples.
+        The residual is measured minus modelled joint torque, multiplied by initial / current motor gain
+        (`logged_scale`; 1 for fixed gains). The negated Jacobian has the sign of the modelled torque. One reverse pass
+        differentiates the sum of the torques of several joints, which have the same colour (graph colouring: Curtis,
+        Powell and Reid, J. Inst. Maths Applics 13:117, 1974). No common drive acts on joints of one colour. A parameter
+        of a drive, or the gravity torque on the drive, then affects the torque of at most one joint of a colour, and
+        the derivative of the sum is the derivative of this torque. Most arms have one colour, so one pass replaces n
+        passes. Each sample has its own copy of the parameters, so that a pass gives the derivatives of all samples.
 
         Args:
             parameters: {name: values}, the parameters at which the derivatives are computed.

@@ -95,12 +95,15 @@ def _regression(
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the squared residual / `torque_std`^2 of each block, (blocks, n), after a ridge fit to the others."""
+        """Return the sums of (residual / `torque_std`)^2 over each block, (blocks, n), after a ridge fit to the others.
+
+        penalty: factor of |w|^2 in the cost, with the weights w of columns of unit length.
+        """
         weights = solution(total - grams.sum(axis=1), penalty)[:, None, :, None]
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # parameters: weights of the unscaled columns
+    parameters = (solution(total, penalty) / scale)[:-1]  # weights of unscaled columns, without the last -1
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 

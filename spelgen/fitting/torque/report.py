@@ -104,6 +104,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     over such times. The nMSE is multiplied by (degrees of freedom) / (median of this distribution).
     """
     seconds = samples.count * samples.interval / TUNING.segment
+    # The number of seconds is the number of degrees of freedom of the chi-squared distribution, `median` is its median.
     # The nMSE is multiplied by seconds / median: by 1.27 for three seconds of motion and by 1.06 for twelve, so that
     # the correction is important only for short logs.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))

@@ -169,9 +169,11 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     of a joint for its effects is therefore 2 log(likelihood ratio) minus 2, Akaike's penalty for one parameter.
 
     - Saturation is tested first, and removed at all joints if the sum of their evidence is negative. The evidence of
-      each joint is limited to +-`TUNING.strong_evidence`, so that no single joint decides: at this joint, saturation
-      may explain another error of the model, and would then be wrong at other speeds.
-    - Then all effects of a joint are tested together, and removed at the joints that `_rejected` returns.
+      each joint is limited to +-`TUNING.strong_evidence`, so that no single joint decides: at a joint with very strong
+      evidence, saturation may explain another error of the model, and would then be wrong at other speeds.
+    - Then all effects of a joint are tested together. If the sum of the evidence over the joints is positive, they are
+      removed only at joints with strong evidence against them; otherwise at all joints without strong evidence for them
+      (`_rejected`).
     """
     # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     penalty, limit = 2.0, TUNING.strong_evidence
