@@ -404,7 +404,7 @@ class TorqueLogs:
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
         """Add a warning to `summary` if the torques show a coupling of two motors; otherwise notes on delayed torques.
 
-        moving: samples of joints in motion. Delays are not reported with a coupling, which has a similar effect on the
+        moving: samples of joints in motion. If a coupling is found, no delay is reported.
         fit.
         """
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
