@@ -12,10 +12,10 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
-# Matches places between words at which names of rows may be wrapped, but not the place before "s)", as in "[Nm s]".
+# Matches places between words at which names of rows may be wrapped, but not before the last s of a unit, as in [Nm s].
 BLANK = re.compile(r"(?<= )(?!s[)\]])")
-# Matches also places within words: after "_", "-", "/" and ".", but not after the point of a number, such as 1.5, and
-# not between "/" and "s)", as in "[rad/s]".
+# Matches also places within words: after "_", "-", "/" and ".", but not after the point of a number, as in 1.5, and not
+# before the last s of a unit, as in [rad/s].
 SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")
 
 

@@ -42,9 +42,8 @@ class TorqueUnit(WrongScale):
         """Define the candidates for factors that correct the unit of the torques.
 
         factors: candidates, (n,) each: one factor per joint, by which its torques are multiplied. is_open: (n,) True
-        for joints whose torque may have another unit, because the column mapping states no unit for it, or mNm: numbers
-        declared as mNm are often in Nm. is_milli: (n,) True for the joints with mNm in the mapping, a subset of
-        `is_open`.
+        for joints whose torque may have another unit: the column mapping states no unit for it, or mNm, although the
+        numbers may be in Nm. is_milli: (n,) True for the joints with mNm in the mapping, a subset of `is_open`.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
@@ -213,7 +212,7 @@ class PositionUnit(WrongScale):
             factors: candidates, (2, n) each: factors on the motion (first row) and on the torques (second row).
             groups: lists of joint indices. The factors on the positions of the joints in a list are optimised together.
             open_fault: the fault "positions in an unknown unit", which has no setting to write. It is reported instead
-            of this fault if the optimised factors are uncertain. None: this object is itself the fault "unknown unit".
+                of this fault if the optimised factors are uncertain. None: this object itself is that fault.
         """
         super().__init__(factors)
         self._groups, self._open_fault = groups, open_fault

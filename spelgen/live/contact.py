@@ -41,17 +41,18 @@ class ContactObserver:
             p of the arm; 5 to 14: regressor of the payload. Row 4 is filtered at twice the bandwidth of the observer,
             all other rows at this bandwidth.
         baseline: Low-pass filtered disturbance d of the drift filter, which is subtracted from the external torque,
-        (n,) [Nm, N].
+            (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
-        the change of dp/dt, (n,) [Nm^2, N^2].
+            the change of dp/dt, (n,) [Nm^2, N^2].
         level: Mean of the squared `normalised` torque residual (see below, but without division by the level) over
-        about the last half second, (n,) [1]. The contact threshold is multiplied by sqrt(level) if the level is above
-        1: residuals are larger in some motions, for example if the arm vibrates. The level contains no samples of the
-        last two blocks (see `Block`), so that a contact does not raise the threshold before it is detected. The squares
-        are limited to `TUNING.level_limit` = 4, so that slow contacts raise the threshold by a factor of at most two.
+            about the last half second, (n,) [1]. The contact threshold is multiplied by sqrt(level) if the level is
+            above 1: residuals are larger in some motions, for example if the arm vibrates. The level contains no
+            samples of the last two blocks (see `Block`), so that a contact does not raise the threshold before it is
+            detected. The squares are limited to `TUNING.level_limit` = 4, so that slow contacts raise the threshold by
+            a factor of at most two.
         normalised: Excess of the external torque's magnitude over `NoiseLevels.resting_torque`, divided by the standard
-                deviation of the torque residual and by sqrt(level), (n,) [1]. A joint is in contact above
-                `NoiseLevels.thresholds`.
+            deviation of the torque residual and by sqrt(level), (n,) [1]. A joint is in contact above
+            `NoiseLevels.thresholds`.
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:

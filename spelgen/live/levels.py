@@ -169,8 +169,8 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     for samples in tested:
         blocks = [x.block for x in samples if x.block is not None]
         segments.append(blocks)
-        # The payload filter uses blocks of twice the length, joined from two blocks of the drift filter: it has more
-        # states, and so needs only half as many updates per second.
+        # A block of the payload filter is joined from two blocks of the drift filter. This halves the number of updates
+        # of the payload filter, which take longer since it has 10 + 3 n states.
         pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)

@@ -62,20 +62,20 @@ class NoiseLevels(BaseModel):
         load: Noise of block means for the payload filter, whose blocks have 0.2 s.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
         resting: Torque that is added to the contact threshold of a joint at rest, (n,) [Nm, N]: three standard
-        deviations of the noise that exists at rest in addition to `observer`. At a velocity qd it is multiplied by
-        exp(-|qd| / resting_speed).
+            deviations of the noise that exists at rest in addition to `observer`. At a velocity qd it is multiplied by
+            exp(-|qd| / resting_speed).
         resting_speed: Velocity at which the added torque has decreased to 1/e, (n,) [rad/s, m/s].
         peak_start: Peak at which the exponential distribution begins, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
         peak_count: Effective number of peaks from which the scale of a joint is estimated.
         load_variance: Factor by which the covariance of an estimated payload is multiplied, because the payload filter
-        neglects errors of the model.
+            neglects errors of the model.
         load_freedom: Degrees of freedom of the estimate of `load_variance`.
         speed: Largest speed of the training logs, (n,) [rad/s, m/s].
         encoder: Encoder step, (n,) [rad, m].
         effort: Torque limit, (n,) [Nm, N]; for an unknown limit a multiple of the largest logged torque.
         saturation: Smallest torque that counts as saturated, divided by `effort`: 1 for a known limit, more for a
-        guess, (n,) or (1,) [1].
+            guess, (n,) or (1,) [1].
         minutes: Duration of the training logs [min].
         point: Position of the tip in the frame of the last body, (3,) [m].
         delay: Delay of measured torques relative to positions, as found by the fit [s].

@@ -138,8 +138,8 @@ class Following(NamedTuple):
         offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a smaller
             mean may be due to a changing load.
         joints: tracking errors and lag of each joint.
-            saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its
-                limit; infinity if it is unknown.
+        saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
+            infinity if it is unknown.
     """
 
     moves: np.ndarray

@@ -366,9 +366,9 @@ class TorqueLogs:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
         Candidates for the unit of torques are derived from the ratio of gravity in the logged torques to the URDF's. A
-        unit in the mapping is assumed to be right, except mNm: its numbers are often in Nm. evidence: joints with their
-        fits of gravity. problem: least-squares problem of the logs, from which ranges of positions and gravity torques
-        are computed.
+        unit in the mapping is assumed to be right, except mNm: numbers declared as mNm may be in Nm. evidence: joints
+        with their fits of gravity. problem: least-squares problem of the logs, from which ranges of positions and
+        gravity torques are computed.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -405,7 +405,6 @@ class TorqueLogs:
         """Add a warning to `summary` if the torques show a coupling of two motors; otherwise notes on delayed torques.
 
         moving: samples of joints in motion. If a coupling is found, no delay is reported.
-        fit.
         """
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:

@@ -97,7 +97,7 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[str, ...]]:
-    """Return the table of a CSV file, the number of lines before the values, and a remark on lines below the last row.
+    """Return the table of a CSV file, the number of lines before the values, and a remark on omitted last lines.
 
     content: content of the file, or a part that begins with a header, in UTF-8; b"": the file is read.
 

@@ -38,8 +38,8 @@ class Layout:
     Attributes:
         file: path of the log; errors and trajectories contain it.
         columns: names of the columns of t, of q of all joints, of qd of all joints, and of tau of all joints; without
-        qd if velocities are differentiated, and with u (commanded positions of servos) instead of qd and tau for logs
-        of commands.
+            qd if velocities are differentiated, and with u (commanded positions of servos) instead of qd and tau for
+            logs of commands.
         labels: column with the names of recordings; None if the table has none.
         joints: names of the joints in the URDF.
         mapping: mapping of the columns, with units, signs and offsets.

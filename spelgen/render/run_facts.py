@@ -83,8 +83,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record) -> list[str]:
     """
     # Options of `spelgen build` with default values are omitted, to keep the command short.
     options = asdict(spec.options)
-    # A design is a preset of the user, in a YAML file. The run folder has no copy of this file, so the printed `spelgen
-    # build` command names it as `--preset NAME.yaml`.
+    # A design is a preset of the user, in a YAML file. The run folder has no copy of this file, so the printed command,
+    # `spelgen build`, names it as `--preset NAME.yaml`.
     if spec.options.design is not None:
         options["preset"] += ".yaml"
     # The command names the URDF without its folder, as it may be a folder of another machine.

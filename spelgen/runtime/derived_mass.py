@@ -162,7 +162,7 @@ class DerivedMass(LinearMass):
         return self.entries(*functions.unbind(), *constants.unbind())
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: network layers whose outputs are the n^2 entries of M, row by row.
+        """Return the parameter cache: network layers whose outputs are the n^2 entries of M."""
         rows = self._by_outputs()
         # The linear map from the learned functions to the entries of M is multiplied into the weights of the
         # last layer, which saves an operation per evaluation.
@@ -279,8 +279,9 @@ class DenseMass(nn.Module):
         # Indices of the entries below the diagonal of the lower triangular factor U (see the class), in
         # row-major order.
         self.below = nn.Buffer(row * self.size + column)
-        # Initial outputs of the network, for which U and diag(e) of the class are identities and M is the
-        # nominal M: zeros below the diagonal of U, and log(exp(1) - 1), of which softplus is 1, for e.
+        # `initial` is added to the outputs of the network. At zero outputs, U of the class is the
+        # identity and each entry of e is softplus(log(exp(1) - 1)) = 1: M is then the nominal mass
+        # matrix.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
         self.initial = nn.Buffer(initial)
         self.network = network
