@@ -39,27 +39,28 @@ class TorqueUnit(WrongScale):
     evidence = "by the URDF's gravity"
 
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
-        """Define the candidates for corrections of the torques' unit.
+        """Define the candidates for factors that correct the unit of the torques.
 
-        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
-        may have another unit, since the column mapping states mNm or no unit of it. is_milli: (n,) True for joints
-        whose torque has the unit mNm in the mapping.
+        factors: candidates, (n,) each: one factor per joint, by which its torques are multiplied. is_open: (n,) True
+        for joints whose torque may have another unit: the column mapping states no unit for it, or mNm, although the
+        numbers may be in Nm. is_milli: (n,) True for the joints with mNm in the mapping, a subset of `is_open`.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
+        """Yield the least-squares fits of the log with corrected units of the torques: one fit per candidate.
 
-        If the hypothesis of `base` does not correct the unit of torques yet, also yield fits with separate factors on
-        the torques of some joints, and of all joints. The other corrections in `base` remain.
+        A candidate has one factor per joint, (n,), by which its torques are multiplied. If the hypothesis of `base`
+        does not correct the unit of torques yet, also yield fits in which each torque that may have another unit gets
+        its own factor (see `_separate`). The other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
         if is_open.all():
-            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
-            # torque to the URDF's. The torque factor is therefore computed again from this ratio; this also corrects an
-            # earlier factor with a wrong sense.
+            # The ratio of the fitted gravity torque to the URDF's depends on the other corrections of `base`, such as
+            # reversed or exchanged joints. The factor 1 / ratio is therefore computed for each `base`. If `base` has a
+            # torque factor already, a negative ratio shows that the sign of this factor is wrong.
             fitted, of_urdf = problem.gravity_torques(base)
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
@@ -80,16 +81,20 @@ class TorqueUnit(WrongScale):
     def _separate(
         self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit, has_gravity: bool
     ) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
+        """Yield the least-squares fits in which joints have different factors on their torques.
 
-        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
-        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
-        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
-        significantly below the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that
-        the torques do not determine is 1. The factors of all joints are tried only if several have another unit.
+        The first fit has factors only on the joints whose gain differs much from the median gain. The second fit has
+        factors on all joints whose unit is open; it is tried only if several joints, or all, have another unit.
+
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and the
+        masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. A fit is therefore yielded only if (1) its cost, plus a penalty for each factor, is significantly below
+        the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that the torques do not
+        determine is 1.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
-        factors. has_gravity: True if the gravity in the logged torques gave at least one candidate.
+        factors. has_gravity: True if the gravity in the logged torques gave at least one candidate. If it is False, and
+        no gain differs much from the median gain, the factors are unknown and nothing is yielded.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau
@@ -113,8 +118,9 @@ class TorqueUnit(WrongScale):
         for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
             factors = np.where(changed, factors, 1.0)
             fit = fitted(factors)
-            # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
-            # masses may change it by less than this factor. Other factors become 1.
+            # The factor of a joint is determined if the cost rises both when the factor is multiplied by `other_unit`
+            # and when it is divided by `other_unit`. Smaller changes of the factor are no test, since errors of the
+            # masses cause them, too. Factors that are not determined become 1.
             for joint in np.flatnonzero(changed):
                 steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
                 changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
@@ -149,9 +155,10 @@ class TorqueUnit(WrongScale):
         return f"torques of another unit{sense}, {times}"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all factors on the torques are between 0.1 and 10; else "", for an error.
+        """Return "torque-scale", the code of a warning, if all factors on the torques are between 0.1 and 10; else "".
 
-        Masses of a URDF may be wrong by such a factor, but never by a factor of ten.
+        Such factors may be due to masses of the URDF, which are never wrong by a factor of ten. With the result "", the
+        caller reports the fault as an error. correction: its `factors` are factors on motion and torques, (2, n).
         """
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
@@ -204,18 +211,19 @@ class PositionUnit(WrongScale):
         Args:
             factors: candidates, (2, n) each: factors on the motion (first row) and on the torques (second row).
             groups: lists of joint indices. The factors on the positions of the joints in a list are optimised together.
-            open_fault: kind of fault that replaces this object in hypotheses whose optimised factors are uncertain. It
-                is reported as an unknown unit, without a value to write. None: this object is such a kind of fault.
+            open_fault: the fault "positions in an unknown unit", which has no setting to write. It is reported instead
+                of this fault if the optimised factors are uncertain. None: this object itself is that fault.
         """
         super().__init__(factors)
         self._groups, self._open_fault = groups, open_fault
         self.advice = "" if open_fault else GIVE_GEAR
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with each of the candidates, and with the best factors of each group of joints.
+        """Yield the least-squares fits with other units of the positions: of the candidates, then of groups of joints.
 
-        A group is omitted if the hypothesis of `base` already changes the unit of one of its joints. All groups are
-        omitted if `base` explains the torques.
+        A candidate has given factors on the positions, such as pi / 180. The joints of a group, such as all revolute
+        joints, get the factors of lowest cost. A group is omitted if the hypothesis of `base` already changes the unit
+        of one of its joints. All groups are omitted if `base` or a candidate explains the torques.
         """
         units = list(super().fits(problem, base))
         yield from units
@@ -229,11 +237,12 @@ class PositionUnit(WrongScale):
                 yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
-        """Return the least-squares fit with the best factors on the positions of a group of m joints.
+        """Return the least-squares fit with the best factors on the positions of a group of m joints, one per joint.
 
-        Factors of units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
+        A factor near the factor of a unit in `UNITS` is replaced by it if the cost is about equal. Other factors are
+        rounded to three digits.
 
-        joints: indices of the joints of the group.
+        base: fit whose hypothesis gets the factors. joints: indices of the m joints of the group.
         """
         scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
         span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
@@ -243,10 +252,11 @@ class PositionUnit(WrongScale):
             factors[:, joints] = sense * np.exp(exponents), torque_sense * np.exp(-power * exponents)
             return base.hypothesis.changed(fault, scale=scale * factors)
 
-        # A form is (sign of the positions, sign of the torques, power). If the positions get the factor x, the torques
-        # get the factor x^-power. Power 0: the torques are the joint's; if the positions are reversed, the torques may
-        # be reversed or not. Power 1: the torques are the motor's, which the gear ratio 1 / x multiplies; they always
-        # have the sign of the positions.
+        # A form is (sign of the positions, sign of the torques, power). Positions are multiplied by sign * x and
+        # torques by sign * x^-power, with a factor x per joint. Power 0: only the positions are in another unit; if
+        # they are reversed, the torques may be reversed or not. Power 1: positions and torques were measured at the
+        # motor of a gear with the ratio 1 / x, so that the joint's torque is 1 / x times the motor's. Both have the
+        # same sign.
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
         # For several joints, only the two forms without reversal are tried here; `_descended` then reverses joints.
@@ -263,8 +273,8 @@ class PositionUnit(WrongScale):
             for k in lowest.argsort()[: 1 if len(ones) == 1 else 2].tolist()),
             key=lambda x: x[0].cost,
         )  # fmt: skip
-        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well,
-        # or, for a single joint, if another form does.
+        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well.
+        # For a single joint, they are also undetermined if the best factor in another form (other signs or power) does.
         steps = 0.1 * np.concatenate([np.eye(len(joints)), -np.eye(len(joints))])
         sides = [problem.fit(scaled(exponents + x, form)).cost for x in steps]
         if len(joints) == 1:
@@ -274,7 +284,8 @@ class PositionUnit(WrongScale):
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
         is_unit = np.abs(nearest - exponents) < 0.1
-        # The largest fitted gear ratio, of the factors that are no units, must be below LARGEST_GEAR.
+        # A factor that is not near a unit's is the inverse of a gear ratio. The result is certain only if the largest
+        # gear ratio is plausible, below LARGEST_GEAR.
         largest_gear = np.where(is_unit, 0.0, np.exp(-exponents)).max()
         is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
         fault = self if is_sure else self._open_fault or self
@@ -291,9 +302,12 @@ class PositionUnit(WrongScale):
     ) -> tuple[HypothesisFit, np.ndarray, Form]:
         """Return the fit of lowest cost near initial factors on the positions of m joints, its exponents, and its form.
 
-        Exponents (m,) are the logarithms of the factors, and `start` has their initial values. A form has the signs of
-        positions and torques (see `_free`); scaled(exponents, form) returns the hypothesis. As long as the torques of
-        several joints are not explained, one joint more is reversed if this lowers the cost enough.
+        The exponents (m,) are the logarithms of the factors by which the positions of the joints are multiplied;
+        `start` has their initial values, (m,). A form has the signs of positions and torques (see `_free`).
+        scaled(exponents, form) returns the hypothesis.
+
+        If m > 1, joints are reversed one after the other: while the relative residual of a joint is above
+        `GEOMETRY.explained`, the joint whose reversal lowers the cost most is reversed, if the decrease is significant.
         """
 
         def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
@@ -329,7 +343,7 @@ class PositionUnit(WrongScale):
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name, or with the factor of a gear.
+        """Return the text about positions in another unit: the name of the unit, or the gear ratio if no unit fits.
 
         The text also states an opposite sense, unless the hypothesis contains `JointSense`, whose text states it.
         """
@@ -354,8 +368,8 @@ class PositionUnit(WrongScale):
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
     """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
 
-    There is one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have
-    the factor 1.
+    The first row of a candidate has factors on the positions and velocities, the second row factors on the torques,
+    which are 1. There is one candidate per joint type and unit that differs from the unit in the mapping.
 
     scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
     `sign: -1`.

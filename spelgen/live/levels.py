@@ -152,10 +152,11 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
-    # them. A torque limit in the URDF is unknown if logged torques exceed it by more than noise. Instead of an unknown
-    # limit, `limit` is a guess: torques above it (for example under a payload) do not count as saturated up to
-    # `TUNING.jump` times it.
+    # At first `levels` contains only the limits by which samples are accepted; the noise is then estimated from the
+    # accepted samples. `limit` is the torque limit of the URDF, but at least 1.2 times the largest logged torque. If
+    # the URDF has no limit, or logged torques exceed it by more than 20 %, `limit` is a guess: 2.5 times the largest
+    # logged torque. A payload may need more torque than the guess, so a torque counts as saturated only if it is at
+    # least `TUNING.jump` times the guess.
     is_known = (effort < np.inf) & (1.2 * effort >= largest)
     limit = np.where(is_known, np.maximum(effort, 1.2 * largest), 2.5 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
@@ -168,7 +169,8 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     for samples in tested:
         blocks = [x.block for x in samples if x.block is not None]
         segments.append(blocks)
-        # A block of the payload filter has twice the length of a block of the drift filter.
+        # A block of the payload filter is joined from two blocks of the drift filter. This halves the number of updates
+        # of the payload filter, which take longer since it has 10 + 3 n states.
         pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
@@ -247,8 +249,9 @@ def _likelihood(
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    # `prior`: prior standard deviations of friction change a, offset b and disturbance d, (G, n, 3). The offset b is
-    # assumed to be at most a few standard deviations of the white noise.
+    # `prior`, (G, n, 3): prior standard deviations of the friction change a [1], the offset b [Nm, N] and the
+    # disturbance d [Nm, N] for each of the G noise models. The prior of the offset is 4 standard deviations of the
+    # white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
         # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is

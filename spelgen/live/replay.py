@@ -190,11 +190,10 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
 
 
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
-    """Return the indices of the samples at which the load changes.
+    """Return the indices of the samples at which the payload changes.
 
-    Samples with `load_changed` are returned, except for changes without a payload on either side: no payload was
-    reported before the change, and the status after it is "no payload". Such a change is within the errors of the
-    model, and is omitted.
+    They are the samples at which the estimator detected a change (`load_changed`). A change is omitted if no payload
+    was reported before it and the last status after it is "no payload": it is due to errors of the model.
 
     states: estimates after each sample of a log.
     """

@@ -138,7 +138,8 @@ class Following(NamedTuple):
         offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a smaller
             mean may be due to a changing load.
         joints: tracking errors and lag of each joint.
-        saturation: (n,) [rad, m] see `measure_following`.
+        saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
+            infinity if it is unknown.
     """
 
     moves: np.ndarray
@@ -410,9 +411,9 @@ class ServoLogs:
 def _command_faults(
     following: Following, log: Trajectory, joints: Sequence[str], *, is_only: bool
 ) -> dict[int, CommandFault]:
-    """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
+    """Return {index of a joint: finding} for joints whose logged commands cannot be the commands of their servo.
 
-    The commands may belong to other joints, be in another unit or sense than the positions, or be increments of the
+    The commands may belong to other joints, have another unit or sense than the positions, or be increments of the
     position.
 
     Args:

@@ -55,8 +55,9 @@ if TYPE_CHECKING:
 COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-changed"
-# Codes of warnings after which couplings of motors and delays of torques are not tested: the motion is too small, the
-# logged columns may not be the torques of the joints, or scale, zeros or gravity probably differ from the URDF.
+# Codes of warnings after which couplings of motors and delays of torques are not tested. SMALL_MOTION: the motion is
+# too small. UNEXPLAINED: the logged columns may not be the torques of the joints. WARNINGS: the scale or the zeros of
+# torques, or their gravity, probably differ from the URDF.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -109,8 +110,9 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints. Errors about a guessed unit of
-        # positions are an exception: an error that states the unit by the torques replaces them.
+        # The model is fitted only to logs without errors: after an error, a hypothesis about the log may be wrong. An
+        # exception are the errors of earlier checks that guess the unit of positions from their range: if the torques
+        # determine the unit, they are replaced by an error that states this unit.
         self._guessed = summary.guessed
         guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
         is_sound = bool(guesses) or not summary.errors
@@ -363,8 +365,10 @@ class TorqueLogs:
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
-        The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
-        unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
+        Candidates for the unit of torques are derived from the ratio of gravity in the logged torques to the URDF's. A
+        unit in the mapping is assumed to be right, except mNm: numbers declared as mNm may be in Nm. evidence: joints
+        with their fits of gravity. problem: least-squares problem of the logs, from which ranges of positions and
+        gravity torques are computed.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -398,7 +402,10 @@ class TorqueLogs:
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
 
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
-        """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
+        """Add a warning to `summary` if the torques show a coupling of two motors; otherwise notes on delayed torques.
+
+        moving: samples of joints in motion. If a coupling is found, no delay is reported.
+        """
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
@@ -422,9 +429,10 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     problem = problem.thinned(GEOMETRY.confirming_samples)
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
-        # A joint is reported without a comparison of costs if the model with gravity does not fit its torque: the
-        # residual is above 10 % of the torque's variance. At other joints, the cost without gravity must be lower by
-        # at least the penalty of a rare fault, `rarity`: a wrong centre of mass of the last link has a similar effect.
+        # The torque of a joint is reported to have no gravity in two cases: (1) the model with gravity does not fit its
+        # torque, with a residual above 10 % of the torque's variance, or (2) the cost without gravity at this joint is
+        # lower by more than `rarity`, the penalty of a rare fault. The penalty is needed since a wrong centre of mass
+        # of the last link also lowers the gravity torque.
         without = problem.without_gravity(k).fit(problem.unchanged).cost
         if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
             message = (

@@ -109,14 +109,15 @@ def find_unexplained(
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
     """Return the mask (n,) of the joints whose torque the model does not explain, and a relative residual, see below.
 
-    unchanged: fit of the model to the log without corrections. The relative residual of a joint is its squared torque
-    residual divided by the variance of its torque. `no_torque`, and `no_advice` below it, are thresholds in `GEOMETRY`.
+    The relative residual of a joint is its squared torque residual divided by the variance of its torque. unchanged:
+    fit of the model to the log without corrections. The thresholds in `GEOMETRY` are `no_torque` = 0.6 and `no_advice`
+    = 0.2.
 
-    1. If the mean residual of all joints is above `no_torque`, the mask contains the joints with a residual above
-       `no_advice`; the second result is the mean. It is weighted with the variances of the torques, since the torque of
-       a joint at rest may be only noise.
-    2. Otherwise the mask contains the joints that move, have a residual above `no_torque`, and have a load: the torque
-       predicted with the URDF's parameters has more than half the standard deviation of the logged torque. The second
+    1. If the mean residual of all joints is above 0.6, the mask contains the joints with a residual above 0.2, and the
+       second result is the mean. The mean is weighted with the variances of the torques, since the torque of a joint at
+       rest may be only noise.
+    2. Otherwise the mask contains the joints that move, have a residual above 0.6, and have a load: the standard
+       deviation of the torque predicted with the URDF's parameters exceeds half of the logged torque's. The second
        result is the largest residual of these joints.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors

@@ -41,7 +41,10 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat bottoms and tops of positions q and torques tau of one trajectory, (T, n) each."""
+        """Return the flat bottoms and tops of positions q and torques tau of one trajectory, (T, n) each.
+
+        A flat top is a highest value at which a signal stays, as if it were clipped (see `flat_tops`).
+        """
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
@@ -143,9 +146,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # Torques are clipped at a flat top if the model's torque exceeds the logged torque by more than `sure`. This
-        # bound is at least the joint's friction, since friction estimated from few samples may be wrong by its own
-        # magnitude.
+        # `excess` is the median, over the samples at a flat top (or bottom), by which the model's torque exceeds the
+        # logged torque. The torques are clipped there if it is above `sure`, which is at least the joint's friction: in
+        # few samples, the estimated friction may be wrong by 100 %.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():

@@ -48,7 +48,7 @@ class Statistics(NamedTuple):
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
-    """Return the statistics of one trajectory: its sample times, and the range, noise and steps of its signals."""
+    """Return statistics of one trajectory: sample times, and range, noise and quantisation step of each signal."""
     # Noise is estimated only for dense samples: at low sample rates the third differences also contain the motion.
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     signals = {}

@@ -201,8 +201,8 @@ REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None
 # This check compares a trajectory with earlier ones: `LogChecks` computes its message.
 REPEATED: Check[Trajectory] = Check("repeated-samples", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals. If a signal consists of raw register words, qd and dq/dt differ, and the
-    # check "frozen" would report a frozen signal.
+    # Register words (raw integers that overflow, or have a sign bit) are searched first. The jumps of such a signal
+    # make dq/dt differ from qd, which the check "frozen" would otherwise report as a frozen signal.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -275,8 +275,8 @@ class LogChecks:
     def add(self, trajectory: Trajectory) -> Trajectory:
         """Apply all checks that need no robot to a trajectory, and collect the findings.
 
-        The result is the trajectory with dq/dt in place of velocities that are wrong for an unknown reason, for checks
-        with a model of the robot.
+        Return the trajectory for the later checks, which use a model of the robot. In it, velocities that are wrong for
+        an unknown reason are replaced by dq/dt.
         """
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
@@ -332,7 +332,8 @@ class LogChecks:
             if advice.is_guess:
                 summary.guessed.update(names)
                 if 2 * len(names) <= len(self._limited(names[0])):
-                    # The unit, after the colon of the message, is not certain.
+                    # All joints of a type normally have one unit. If at most half of them have the fault, the guessed
+                    # unit is uncertain: it is removed from the message (the text after the colon).
                     message, _, _ = message.partition(": ")
                     entries = {}
             if len(occurrences) > 1:

@@ -86,9 +86,10 @@ def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> N
     """
     signals = complete_signals(columns, joints)
     best = min(signals, key=_rank, default=frozenset[str]())
-    # `arms`: words of the best signal, and of signals that differ from it only in words that do not describe a signal,
-    # such as "left" and "right". Arms whose names differ only in a number (q0 to q13) have the same words: their
-    # columns are one signal, with more columns than joints.
+    # `best` is the set of words in the names of the preferred signal. `arms` contains `best` and the sets that differ
+    # from it only in unknown words (not in `KNOWN`), such as "left" and "right": these may name arms. The names of two
+    # arms may also differ only in numbers, such as q0 to q13. Numbers are no words, so these columns are one signal,
+    # with more columns than joints.
     arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
     of_joint: dict[str, list[str]] = {}
     for column in chain.from_iterable(signals[x] for x in arms):
@@ -120,9 +121,9 @@ def columns_by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names. If `order` contains
-    all joints, a column belongs to the joint with its number in `order`. Otherwise the columns, sorted by their
-    numbers, belong to the `joints` in the given order. order: {joint: number}, the result of `_order_in_cells`.
+    If no column name contains a joint name, columns are assigned by the last number in their names. `order` may state
+    the number of each joint, such as {"elbow": 2} for the column `q2` (see `_order_in_cells`). If it lacks a joint, the
+    columns, sorted by their numbers, belong to the `joints` in the given order.
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}

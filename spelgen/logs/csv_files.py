@@ -63,13 +63,14 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a CSV file; lines below the last row are omitted, with a remark.
+    """Return the tables of a CSV file: one table, or one per recording if the header is repeated between the rows.
 
-    If the header is repeated between the rows, one table per recording is returned: a new recording begins at a header
-    after which the times do not increase.
+    A new recording begins at a repeated header after which the times do not increase. Incomplete lines and lines
+    without values after the last row of numbers are omitted, which a remark of the table states.
     """
     content = _in_utf8(file.read_bytes())
-    # A line begins after the end of another one, or after the byte order mark of an appended file.
+    # Repetitions of the header are searched. A repetition begins at the start of a line, or after the byte order mark
+    # of a file that was appended.
     header = re.escape(_beginning(content).header.encode())
     starts = [x.start() for x in re.finditer(header + rb"(?=[\r\n])", content)] if header else []
     starts = [0, *[x for x in starts if content[max(x - 1, 0) : x] in (b"", b"\n", b"\r", b"\xbf")][1:]]
@@ -96,7 +97,7 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[str, ...]]:
-    """Return the table of a CSV file, the number of lines before the values, and a remark on lines below the last row.
+    """Return the table of a CSV file, the number of lines before the values, and a remark on omitted last lines.
 
     content: content of the file, or a part that begins with a header, in UTF-8; b"": the file is read.
 
@@ -134,8 +135,8 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
     )
-    # Only lines below the last row may be incomplete, as after a power failure of the recorder, or have no values. Any
-    # other incomplete line is an error.
+    # Incomplete lines are permitted only after the last complete row of the table, as after a power failure of the
+    # recorder. An incomplete line between complete rows is an error.
     for row in wrong:
         if not len(table) or row.number <= text.lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
@@ -228,10 +229,13 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
 
 
 def _column_names(rows: Sequence[list[str]]) -> list[str]:
-    """Return the names of the columns of a CSV file from the cells of its header, and of the lines below it.
+    """Return the names of the columns of a CSV file from the cells of its header (rows[0]) and of the next lines.
 
-    Names may be in two lines: the first line has the quantities, each repeated for all joints or only above its first
-    joint; the second line has the joints.
+    The next lines are used only if several columns have the same name in the header. The header then has the
+    quantities, each repeated for all joints or only above its first joint, and the next line has the joints: "q" above
+    "elbow" gives the name "q_elbow".
+
+    rows: cells of the header and of the lines between the header and the values, without lines of units.
     """
     names = rows[0]
     if len(rows) == 1 or len(set(names)) >= len(names) - 1:
@@ -246,8 +250,8 @@ def _column_names(rows: Sequence[list[str]]) -> list[str]:
 def _is_text(line: str, header: str, cells: Sequence[str]) -> bool:
     """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    Names and units may have digits, such as "joint1" and "m/s2". A value is a cell that is a number, or has a number or
-    a time in its text, such as "[0.1, 0.2]" and "10:00:00".
+    A line has values if one of its cells is a number, or contains a point, comma or colon between two digits, such as
+    "[0.1, 0.2]" and "10:00:00". Names and units with digits, such as "joint1" and "m/s2", are no values.
     """
     has_values = any(map(is_number, cells)) or re.search(r"\d[.,:]\d", line)
     return bool(line) and (line == header or not has_values)

@@ -13,7 +13,8 @@ import numpy as np
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import Decoding
 
-# Smallest step of register words, as a fraction of the signal's range: words have at most 18 bits, and 2^-18 is 4e-6.
+# Register words of drives have at most 18 bits, so their step is at least 2^-18 = 4e-6 of their range. Smaller steps of
+# a signal are rounding errors.
 FINEST_WORD = 4e-6
 
 
@@ -49,7 +50,8 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
 def decoded(words: np.ndarray, key: Decoding, size: float) -> np.ndarray:
     """Return the numbers (T,) that register words (T,) represent.
 
-    key: "sign_bit" or "period", the type of the words. size: sign bit or period, in the unit of the words.
+    key "sign_bit": a word w >= size represents size - w. key "period": words wrap at the period `size`; the wraps are
+    removed, and the median of the signal is shifted to within half a period of 0. Size and words have the same unit.
     """
     return signed(words, size) if key == "sign_bit" else centred(unwrapped(words, size), size)
 
@@ -241,8 +243,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    # A signal in which more than half of the samples jump does not consist of register words: even noise about 0
-    # changes a sign bit at half of the steps at most.
+    # A change of the sign bit, or an overflow, is a jump. In register words at most half of the steps are jumps: even
+    # the sign of noise about 0 changes only at half of the steps. A signal with more jumps has another fault.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, typical = float(np.median(np.abs(steps[rows]))), _typical_step(np.abs(steps))
@@ -281,10 +283,11 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit of register words (see `Word`): 2^k revolutions or 2^k steps.
+    """Return candidates for the size of register words, the value at which they overflow or of their sign bit.
 
-    The steps are the quantisation steps of ``values``, the signal (T,) in the unit of the log. turn: one revolution in
-    this unit; None if the joint does not rotate.
+    Drives have words of 2^k steps (k = 10 to 17) or of 2^k revolutions (k = 0 to 8). A step is the quantisation step of
+    ``values``, the signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not
+    rotate.
     """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)

@@ -203,9 +203,10 @@ def _remove_delays(rows: Rows) -> None:
 def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them. Genuine commands may jump, or be 0 in
-    successive samples. Commands are therefore removed from the mask if they are 0 next to another 0, or if they are
-    close to the position: at most twice as far as the farthest command that is no outlier.
+    A lost sample is a 0 between values far from 0. Velocities of exactly 0 are no lost samples: a joint at rest has
+    them. Genuine commands may jump, or be 0 in successive samples. Commands are therefore removed from the mask if they
+    are 0 next to another 0, or if their distance from the position is at most twice the largest such distance of the
+    commands outside the mask.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
@@ -235,7 +236,8 @@ def stale_rows(
         qd: (T,) velocities of the joint [rad/s, m/s]; empty if they were not logged.
         u: (T,) commanded positions of the joint [rad, m]; empty for joints without position servo.
     """
-    # Stale blocks have more than 20 samples (see `is_stale`). Data sets may have thousands of shorter recordings.
+    # Stale blocks have more than 20 samples (see `is_stale`), so shorter recordings have none. Returning here saves
+    # time in data sets of thousands of short recordings.
     if len(t) <= 20:
         return np.zeros(len(t), bool)
     if u.size:
@@ -282,9 +284,9 @@ def _order_in_time(rows: Rows) -> None:
         # restart, the clock was set back, or its counter overflowed. If the motion does not continue, the file has
         # several recordings, which sorting would interleave.
         if 2 * late > len(rows.t):
-            # Most times are before the time of the row above. If the rows are in reverse order, the logged velocities
-            # agree with dq/dt of the sorted rows. If the clock shows the remaining time, they are opposite to it, and
-            # sorting would reverse the motion.
+            # Most times are before the time of the row above. Either the rows are in reverse order, or the clock counts
+            # down (remaining time). The logged velocities decide: in the first case they agree with dq/dt of the sorted
+            # rows. In the second case they have the opposite sign of dq/dt, and sorting would reverse the motion.
             joints, quantities = len(rows.layout.joints), rows.layout.mapping.quantities
             velocities = (
                 rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros((2, 1))
@@ -436,10 +438,10 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return a signal (T, ...) without its delay [s]: its result at the time t is the value logged at t + delay.
+    """Return a logged signal without its delay, (T, ...): the returned value at time t was logged at t + delay.
 
-    A positive delay means that the signal was logged later than it occurred. Near the ends of a gap-free piece, where
-    t + delay is outside the piece, the first or last value of the piece is returned.
+    A positive delay [s] means that the signal was logged later than it occurred. Near the ends of a gap-free piece,
+    where t + delay is outside the piece, the first or last value of the piece is returned.
 
     t: times of the samples (T,) [s]. values: logged signal (T, ...).
     """

@@ -34,11 +34,11 @@ def are_names(values: pa.DataType) -> bool:
 
 
 def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> RowsByNames:
-    """Return the lists of joint names that occur in the rows of a table; {} for a table with at most one such list.
+    """Return {list of joint names: mask of the rows with this list}; {} if all rows of a table have the same list.
 
-    The first list is the first one in the table that contains all joints of the arm; without such a list it is the list
-    of the first row, unless another list with enough names has none of its names: then a LogError is raised, since
-    the rows are of several arms. names: {joint: its name in the log}.
+    The first list is the first one in the table that contains all joints of the arm, or else the list of the first row.
+    A LogError is raised if the rows are of several arms: no list contains all joints of the arm, and some list with at
+    least as many names shares no name with the list of the first row. names: {joint: its name in the log}.
     """
     for column in table.columns:
         if are_names(column.type):

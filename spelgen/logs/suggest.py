@@ -214,9 +214,11 @@ def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) ->
 
 
 def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table) -> tuple[float, float]:
-    """Return the correlation of columns x with the derivatives of columns q, and the distance std(x - q) / std(q).
+    """Return two similarities of columns x, of an unknown quantity, to columns q of positions.
 
-    Both are medians over the pairs (q, x) in which both columns change; NaN if there is no such pair.
+    The first is the correlation of x with the derivative of q: it is near 1 if x is a velocity. The second is the
+    distance std(x - q) / std(q): it is small if x is a commanded position. Both are medians over the pairs (q, x) in
+    which both columns change; NaN if there is no such pair.
     """
     values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
     moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
@@ -229,7 +231,8 @@ def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table)
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
     """Return the columns, with quantities for ambiguous names such as `t0`, `v0` and `u0`, derived from their values.
 
-    Only columns with the number of a position column get a quantity that no other column has:
+    A name has a letter and a number. Its values are compared with the position column of the same number; without such
+    a column it gets no quantity. A quantity that other columns already have is not assigned. Letters mean:
 
     - `t`: torque.
     - `v`: velocity if its correlation with the derivative of the position is above 0.9; otherwise none.
@@ -256,9 +259,11 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
 
 
 def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
-    """Raise LogError if one of the columns `names` states the joint or the signal of each row (see `_names_signals`).
+    """Raise LogError for a log in long format: a row per time and joint, or per time and signal, not a row per time.
 
-    joints: number of joints. file: path of the log, for the error.
+    In such a log one of the columns `names` states the joint or the signal of each row. Its values repeat in cycles,
+    with at least as many different values as there are `joints` (see `_names_signals`). file: path of the log, for the
+    error.
     """
     for name in names:
         if name in table.column_names and _names_signals(table[name].to_pylist(), joints):
@@ -281,9 +286,9 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     Without candidates, a column whose values rise by regular steps is returned. If the column contains whole seconds,
     and another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
-    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the column whose name has the fewest words is used. Of several columns with equally
-    # few words, the column with the most regular time steps is used.
+    # Of several columns of times, the best is searched in this order: (1) the stamp in a message header, since other
+    # times may be times of receipt and not of measurement, (2) the column whose name has the fewest words, (3) the
+    # column with the most regular time steps.
     nanoseconds = [x for x in columns if re.search(r"n(?:anos|(?:ano)?sec(?:ond)?s?)$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
@@ -322,7 +327,10 @@ def _is_rising(values: np.ndarray) -> bool:
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
-    """Return the numbers of a column, or of an element of lists, without nulls; an empty array for other values."""
+    """Return the numbers of the column `name`, such as "q", "q[2]" (item 2 of lists) or "sec + nsec", without nulls.
+
+    The result is empty if the table has no such column, or its values are no numbers.
+    """
     is_stored = name and stored_names(name, table.column_names)
     values = logged_column(table, name).drop_null() if is_stored else pa.chunked_array([[]])
     is_numeric = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
@@ -366,7 +374,12 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
+    """Return {joint: {quantity: unit}} from the stated units of columns; joints without a known unit have {}.
+
+    A column states its unit in its name or in a line below the header. If it does not, velocities have the unit of the
+    positions per second, and torques whose column name has a word for currents have the unit A. by_joint: {quantity:
+    {joint: column}}.
+    """
     units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():
         for joint, column in named.items():

@@ -36,14 +36,15 @@ class Layout:
     """Layout of a log table: the columns that contain the quantities of an arm, and the mapping with their units.
 
     Attributes:
-        file: path of the log, for errors and trajectories.
+        file: path of the log; errors and trajectories contain it.
         columns: names of the columns of t, of q of all joints, of qd of all joints, and of tau of all joints; without
-            qd if velocities are differentiated, and with u instead of qd and tau for logs of commands.
+            qd if velocities are differentiated, and with u (commanded positions of servos) instead of qd and tau for
+            logs of commands.
         labels: column with the names of recordings; None if the table has none.
         joints: names of the joints in the URDF.
         mapping: mapping of the columns, with units, signs and offsets.
-        accepted: codes of checks that are omitted.
-        recording: name of the recording, if the table contains a single one of several in the file.
+        accepted: codes of checks whose findings the user has accepted; they are not run.
+        recording: name of the recording if the file has several and the table contains only one; otherwise None.
         remarks: messages about properties of the file.
         header: number of lines before the values; None if the file does not consist of lines.
     """
@@ -254,7 +255,8 @@ def _naming(unused: Collection[str]) -> str:
 def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
     """Return {joint: pattern that finds its name as a separate word}: the joint 1 is found in `q_1`, but not in `q_12`.
 
-    A name has three forms, of which the first is used in which all joints are found in `names`, the column names:
+    Three forms of the joint names are searched in `names`, the column names. The first form that finds all joints is
+    used:
 
     1. The full name.
     2. The name without the words that all joints share: `shoulder_pan` for shoulder_pan_joint.

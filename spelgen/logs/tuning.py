@@ -21,8 +21,8 @@ class LogTuning:
     # [s] Largest time. Splines and divided differences (`noise_level`) multiply up to six time differences. The product
     # is then at most 1e144, far below the largest floating-point number.
     latest: float = 1e24
-    # [s] Shortest time between samples. The product of six time steps is then at least 1e-90, far above the smallest
-    # floating-point number.
+    # [s] Shortest time between samples. The product of six time steps (see `latest`) is then at least 1e-90, far above
+    # the smallest floating-point number.
     shortest_step: float = 1e-15
     # [1] A step of a signal that exceeds this multiple of the typical step is a jump. A value of 0 between samples
     # whose magnitudes exceed the same multiple of the typical step is a lost sample: continuous signals approach 0

@@ -26,8 +26,8 @@ class ChainConfiguration(NamedTuple):
     # body, times sqrt(mass), (..., B, 12 B). The last axis is a flattened array (3 coordinates, B bodies,
     # 4 point masses).
     jacobian: Tensor
-    # Minus the acceleration of gravity, times sqrt(mass), for 3 coordinates of 4 point masses of each of
-    # B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
+    # Minus the acceleration of gravity for each of the 3 coordinates of each point mass, times
+    # sqrt(mass), (..., 12 B) for B bodies of 4 points each [m/s^2 kg^(1/2)].
     weight: Tensor
 
 
@@ -178,9 +178,10 @@ class BodyChain(nn.Module):
         # Angular momentum about the origin of the base, and linear momentum, of each point mass.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
         # The derivative of the kinetic energy with respect to the displacement of joint i is h_i .
-        # da_i/dt, with the sum h_i of the momenta (angular, linear) of the bodies that the joint carries,
-        # and the time derivative da_i/dt of its axis. The rotation of the velocity v of each point about
-        # the axis a contributes nothing: (a x v) . v = 0.
+        # da_i/dt, a product of 6-vectors (angular, linear). h_i is the momentum of all bodies that joint
+        # i carries, and a_i the twist of joint i per unit rate, with the time derivative da_i/dt. The
+        # displacement also rotates the velocity v of each carried point about the axis w of the joint,
+        # which does not change the energy: (w x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 

@@ -72,7 +72,7 @@ class ConstantMass(LinearMass):
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
     def prepare(self) -> Tensor:
-        """Return the parameter cache, which is M itself, (n, n)."""
+        """Return M, (n, n) [kg m^2, kg m, kg], as the parameter cache: it depends on parameters only."""
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,11 +85,19 @@ class ConstantMass(LinearMass):
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return d(1/2 qd^T M qd) / d(encoding of q), (..., 2 n): zeros, because M is constant."""
+        """Return zeros, (..., 2 n): the gradient of 1/2 qd^T M qd for a constant M.
+
+        The gradient is with respect to the encoding of q (see ``JointEncoding``), ``intermediates``,
+        which has the same shape.
+        """
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
-        """Return dM/dt, (..., n, n): zeros. rate: time derivative of the encoding of q, (..., 2 n)."""
+        """Return zeros, (..., n, n): the time derivative of M, which does not depend on q.
+
+        rate: time derivative of the encoding of q (see ``JointEncoding``), (..., 2 n); it gives the
+        shape.
+        """
         n = len(self.raw_armature)
         return rate.new_zeros(*rate.shape[:-1], n, n)
 
@@ -135,10 +143,10 @@ class DerivedMass(LinearMass):
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # The norm |X| of the class is ||D X D||_F / (smallest eigenvalue of D C D) with D =
-        # diag(C)^(-1/2), an upper bound of the spectral norm of L^-1 X L^-T. With `unit`_ij = D_ii D_jj /
-        # (this eigenvalue) / (1 - margin), |X| / (1 - margin) is the Frobenius norm of the elementwise
-        # product of `unit` and X.
+        # The spectral norm of L^-1 X L^-T, with L L^T = C, has the upper bound |X| = ||D X D||_F / s.
+        # Here D = diag(C)^(-1/2), and s is the smallest eigenvalue of D C D. `forward` compares |X| for X
+        # = M - C with 1 - margin: with unit_ij = D_ii D_jj / s / (1 - margin), |X| / (1 - margin) is the
+        # Frobenius norm of the elementwise product of `unit` and X.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -154,7 +162,7 @@ class DerivedMass(LinearMass):
         return self.entries(*functions.unbind(), *constants.unbind())
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: the layers of a network whose outputs are the n n entries of M."""
+        """Return the parameter cache: network layers whose outputs are the n^2 entries of M."""
         rows = self._by_outputs()
         # The linear map from the learned functions to the entries of M is multiplied into the weights of the
         # last layer, which saves an operation per evaluation.
@@ -190,20 +198,24 @@ class DerivedMass(LinearMass):
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n).
 
-        M' = C + t (M - C) is the mass matrix that is made positive definite by the factor t (see the
-        class). intermediates: second result of ``forward`` at q.
+        M' = C + t (M - C) is the positive definite mass matrix of the class: M is the network's matrix, C
+        the constant nominal matrix, and t the factor (1, 1/2, 1/4, ...). The encoding of q is cos q and
+        sin q (see ``JointEncoding``). qd: velocities, (..., n). intermediates: second result of
+        ``forward`` at q.
         """
         network, fraction = intermediates
-        # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T: M' = C + t (M -
-        # C) has dM' = t dM, since t is piecewise constant. The network's outputs are the entries of M.
+        # The network's outputs are the entries of M, and M' = C + t (M - C) has dM' = t dM: C is constant
+        # and t piecewise constant. The gradient of 1/2 qd^T M' qd with respect to the entries of M is
+        # therefore t/2 qd qd^T.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the time derivative of the mass matrix M' of the class, (..., n, n).
+        """Return the time derivative of the mass matrix M' = C + t (M - C), (..., n, n).
 
-        M' = C + t (M - C) is made positive definite by the factor t. rate: time derivative of the
-        encoding of q, (..., 2 n). intermediates: second result of ``forward``.
+        M is the network's matrix. C, the constant nominal matrix, and t, a piecewise constant factor,
+        make M' positive definite (see the class). rate: time derivative of the encoding of q (see
+        ``JointEncoding``), (..., 2 n) [1/s]. intermediates: second result of ``forward`` at q.
         """
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
@@ -219,7 +231,7 @@ class DenseIntermediates(NamedTuple):
 
     network: Intermediates
     factor: Tensor  # U of `DenseMass` without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A, (..., 3 n, n)
+    moved: Tensor  # U^-1 A, from which M is computed with e, (..., 3 n, n)
     scale: Tensor  # e, the diagonal factor of `DenseMass`, (..., 3 n)
 
 
@@ -267,7 +279,9 @@ class DenseMass(nn.Module):
         # Indices of the entries below the diagonal of the lower triangular factor U (see the class), in
         # row-major order.
         self.below = nn.Buffer(row * self.size + column)
-        # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
+        # `initial` is added to the outputs of the network. At zero outputs, U of the class is the
+        # identity and each entry of e is softplus(log(exp(1) - 1)) = 1: M is then the nominal mass
+        # matrix.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
         self.initial = nn.Buffer(initial)
         self.network = network
@@ -280,10 +294,11 @@ class DenseMass(nn.Module):
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse of the large matrix that contains M, (..., 3 n, 3 n): C U diag(e) U^T C^T.
+        """Return C U diag(e) U^T C^T, (..., 3 n, 3 n), the inverse of the large matrix that contains M.
 
-        The large matrix has a row and a column for the x, y and z axis of each joint; M is the block of
-        the z axes. C is constant; U and e are computed by the network (see the class).
+        The large matrix has a row and a column for the x, y and z axis of each joint; M is its block of
+        the z axes. C is the constant ``nominal_factor``. The network gives U, lower triangular with ones
+        on the diagonal, and e > 0, (..., 3 n).
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
@@ -293,8 +308,7 @@ class DenseMass(nn.Module):
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Return U without its diagonal of ones, (..., 3 n, 3 n), and the vector e, (..., 3 n).
 
-        M is computed from the lower triangular U and from e: it is a block of a matrix with three rows
-        per joint (see the class).
+        U is lower triangular, and M = (U^-1 A)^T diag(1 / e) U^-1 A with the constant A of the class.
         raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and
         softplus^-1(e).
         """
@@ -337,8 +351,9 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # For the kinetic energy T = 1/2 qd^T M qd, with U, A and e of the class, w = U^-1 A qd and
-        # p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
+        # M = (U^-1 A)^T diag(1 / e) U^-1 A, with a constant A. The kinetic energy T = 1/2 qd^T M qd is
+        # therefore the sum of w^2 / (2 e), with w = U^-1 A qd (`speed`). With p = w / e (`momentum`),
+        # dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).
@@ -347,8 +362,9 @@ class DenseMass(nn.Module):
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+        """Return dM/dt, (..., n, n).
 
+        rate: time derivative of the encoding of q (see ``JointEncoding``), (..., 2 n) [1/s].
         intermediates: second result of ``forward`` at q.
         """
         _, factor, moved, scale = intermediates
