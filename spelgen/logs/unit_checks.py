@@ -112,7 +112,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 def _knows_ratio(signals: JointSignals) -> bool:
     """Return True if velocities qd were logged and are proportional to dq/dt: the ratio qd : dq/dt then shows units."""
-    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments + 1
     return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
@@ -253,10 +253,9 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         message = f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt"
         return Advice(message, keys={"velocity": "differentiated"})
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
-    if len(signals.q) <= SIGNALS.increments:
-        # The correlation is computed from changes over ten samples. In a log of at most ten samples it is computed from
-        # the single change between the first and the last sample, so that it is always 1 or -1 and does not justify
-        # advice.
+    if len(signals.q) <= SIGNALS.increments + 1:
+        # The correlation is computed from changes over ten samples. In a log of at most 11 samples it is computed from
+        # a single change, so that it is always 1 or -1 and does not justify advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
