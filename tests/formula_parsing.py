@@ -53,7 +53,10 @@ def assert_close(found, true) -> None:
 
 
 def read_back(told: str) -> dict[str, str]:
-    """Parse a text of closed forms to {M11, ..., or V: expression}; an indented line continues an expression."""
+    """Return the closed forms in a text as {name: expression}: M11, M21, ... of the mass matrix, and the potential V.
+
+    The text has a line "name = expression" for each; an indented line continues an expression.
+    """
     found: dict[str, str] = {}
     for line in told.partition("\nBase parameters")[0].splitlines():
         name, is_row, expression = line.partition(" = ")

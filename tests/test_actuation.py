@@ -59,7 +59,11 @@ def urdf(folder, *transmissions, sidecar=""):
 
 
 def inputs(path):
-    """Return {(row, column): (kind, value)} of the entries of G that are not always zero."""
+    """Return {(row, column): (kind, value)} of the entries of the input matrix G that are not always zero, from 1.
+
+    path: a URDF. value: joint torque per input. kind: "fixed"; "coupled" for motors that drive several joints; "gain"
+    for a trained entry, whose value is the initial value.
+    """
     found = inspect(path).to_dict()["input_matrix"]["entries"]
     assert len(found) == 9
     return {(x["row"], x["col"]): (x["kind"], x["value"]) for x in found if x["kind"] != "zero"}
@@ -205,7 +209,10 @@ class TestModule:
 
 
 def test_the_simulation_moves_joints_by_motors(coupled):
-    """Logged torques are motor torques: G times the logged torque moves the rigid bodies."""
+    """Simulated logs contain motor torques: the rigid bodies move under G times these torques, minus the friction.
+
+    G is the input matrix, joint torque per motor torque.
+    """
     loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(

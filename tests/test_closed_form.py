@@ -19,7 +19,7 @@ def emitted(tmp_path_factory):
 
 
 def drawn(module, seed, deviation=0.5):
-    """Return the model of a module with normal random parameters of this standard deviation."""
+    """Return the model of an emitted module with normal random parameters of standard deviation ``deviation``."""
     model = module.Model()
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
@@ -28,7 +28,7 @@ def drawn(module, seed, deviation=0.5):
 
 
 def rigid(module):
-    """Return the untrained model of a module without friction and armature: the URDF's rigid bodies."""
+    """Return the untrained model of an emitted module, with zero friction and armature: the URDF's rigid bodies."""
     model = module.Model()
     model.nominal_armature.zero_()
     model.friction.nominal.zero_()

@@ -221,8 +221,8 @@ def _column(
 ) -> Iterator[tuple[Body, Element]]:
     """Yield the entries of M in the column of a body's joint, as pairs (body of the row, entry).
 
-    The first entry is the diagonal one, in the row of the body itself; then the rows of its ancestors up to the root
-    follow. M is the mass matrix of all joints, before mimic joints are eliminated.
+    The first entry is the diagonal one, in the row of the body itself. The next entries are in the rows of its
+    ancestors, from the parent to the root. M is the mass matrix of all joints, before mimic joints are eliminated.
 
     Args:
         arm: the arm.
