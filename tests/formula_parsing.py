@@ -16,7 +16,7 @@ CLOSE = 1e-10
 
 
 def assert_equal_to_pinocchio(arm: Chain, rows: dict[str, str], tolerance: float = CLOSE) -> None:
-    """Check that each closed form, M_ij and V, equals Pinocchio at random positions.
+    """Check that closed forms of the entries of M, and of V(q) - V(0), equal Pinocchio's values at random positions.
 
     Args:
         arm: gives the values of the base parameters in the expressions.

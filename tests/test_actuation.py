@@ -26,9 +26,10 @@ WRIST = (("j1", (("m1", 100.0),), "Simple"), ("pitch roll", (("m2", 60.0), ("m3"
 
 
 def urdf(folder, *transmissions, sidecar=""):
-    """Write the URDF of an arm with three turning joints (shoulder, wrist pitch, wrist roll) and these <transmission>s.
+    """Write the URDF of an arm with three turning joints (j1, pitch, roll) and transmissions; return its path.
 
-    sidecar: text of the settings file. Returns the path of the URDF.
+    transmissions: for each, the names of its joints, (name, gear ratio) of each of its actuators, and its type, such as
+    "Differential". sidecar: text of the settings file.
     """
     inertial = (
         '<inertial><origin xyz="0.2 0 0"/><mass value="2"/>'

@@ -30,9 +30,10 @@ def arm(request, robots, tmp_path):
 
 
 def logged(arm, trajectory, columns=None, **scaled):
-    """Write a log as CSV with quantities multiplied by factors; return its path.
+    """Write a trajectory as a CSV log; return its path.
 
-    columns: function of the names of all columns that returns the names to keep.
+    scaled: factors of quantities, such as tau=0.02. columns: function that returns the names of the columns to keep,
+    from the names of all columns; None: all are kept.
     """
     path = arm.robot.path.with_name("log.csv")
     changed = replace(trajectory, **{name: getattr(trajectory, name) * x for name, x in scaled.items()})

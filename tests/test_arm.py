@@ -461,7 +461,10 @@ def assert_close(ours, theirs, name):
 
 
 class Ours:
-    """Pinocchio model that is assembled from the bodies of a spelgen arm; Pinocchio does not read the URDF."""
+    """Pinocchio model that is assembled from the joints and bodies of an arm as `make_arm` has derived them.
+
+    Pinocchio does not read the URDF here (see `Theirs`).
+    """
 
     def __init__(self, arm):
         self.model = pin.Model()

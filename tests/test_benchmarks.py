@@ -66,7 +66,11 @@ def test_changes_are_ratios_of_the_same_cells():
 
 
 def test_noise_has_its_level_correlation_and_spectrum():
-    """The noise of `ErrorProcess` has the given level, autocorrelation exp(-lag / time) and an AR(1) spectrum."""
+    """Torque noise of `ErrorProcess` has the given level, the autocorrelation exp(-lag / T) and an AR(1) spectrum.
+
+    The level is the standard deviation of the noise divided by the standard deviation of the torque; T is the
+    correlation time.
+    """
     errors = real_errors.RealErrors(slow_noise=0.1, slow_correlation=0.5)
     process = real_errors.ErrorProcess(errors, np.ones(3), np.random.default_rng(0))
     torque = np.random.default_rng(1).normal(size=(400_000, 3))

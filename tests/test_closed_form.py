@@ -46,7 +46,7 @@ def near(a, b, tolerance=1e-9):
 
 
 def moved(q, qd, matrix_of):
-    """Return the derivative of matrix_of(q) with respect to time along qd."""
+    """Return the time derivative of the matrix ``matrix_of(q)`` at the velocity qd = dq/dt."""
     return torch.func.jvp(matrix_of, (q,), (qd,))[1]
 
 

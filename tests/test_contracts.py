@@ -84,7 +84,7 @@ def states(n: int, *shape: int, count: int = 4) -> tuple[Tensor, ...]:
 
 
 def assert_near(found: Tensor, expected: Tensor, bound: float = 1e-10) -> None:
-    """Assert equal shapes, and a difference of at most a tolerance relative to the largest entry."""
+    """Assert equal shapes, and differences of at most ``bound`` times the largest expected magnitude, or times 1."""
     assert found.shape == expected.shape
     assert (found - expected).abs().max() <= bound * max(1.0, expected.abs().max().item())
 

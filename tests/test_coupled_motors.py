@@ -70,8 +70,8 @@ def moved(seconds, seed=0):
 def on_motors(q, qd, qdd, arm, strength, armature):
     """Return joint torques and motor torques, (T, 6) [Nm] each, of a motion of an arm with coupled motors.
 
-    Friction and rotor inertia act at the motors. strength: Coulomb friction of each motor [Nm]. armature: inertia of
-    each rotor [kg m^2].
+    Friction and rotor inertia act at the motors. strength: Coulomb friction of each motor [Nm]; its viscous coefficient
+    is 0.3 times this number [Nm s/rad]. armature: inertia of each rotor [kg m^2].
     """
     speeds = np.eye(6)
     speeds[4:, 4:] = SPEEDS
@@ -404,7 +404,7 @@ def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
     set_initial_gains(model, samples, 0.3)
     with torch.no_grad():
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
-    # wide bounds, as the masses of the URDF are not the robot's
+    # The bounds are wide, since the rotor inertia in the log, 0.2 kg m^2, differs from the initial one of the model.
     np.testing.assert_allclose(found[1:5] / gains[1:5], 1.0, atol=0.35)
     assert found[0] == pytest.approx(np.median(found[1:5]), rel=0.3)
     assert found[5] == 1.0

@@ -157,7 +157,7 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
 
 
 def _is_in_cycle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
-    """Whether ``joint`` is part of a cycle of mimic joints."""
+    """Return True if ``joint`` is part of a cycle of mimic joints. by_name: {name: joint} of all joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint
     # `seen` contains the joint and its leaders up to here. It ends the loop in a cycle: at the joint if the cycle
