@@ -23,7 +23,7 @@ TYPES = ("revolute", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class Follower:
-    """A mimic joint ``name``: q = multiplier * q_leader + offset, with the position q_leader of the joint ``leader``."""
+    """A mimic joint ``name``: q = multiplier * q_leader + offset, with the position q_leader of joint ``leader``."""
 
     name: str
     leader: str

@@ -52,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults of simulations with neither `protocol` nor `inputs`: controllers track motions (`tracking`)."""
+    """Defaults of simulations for which neither `protocol` nor `inputs` is set, so that controllers track motions."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4

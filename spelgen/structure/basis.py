@@ -151,7 +151,7 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield sets of joints, in the order in which functions f_j(q) of M that depend on one set only are searched.
+    """Yield the sets of joints for which functions f_j(q) of M are searched that depend on this set only, in order.
 
     M is sum_k c_k A_k + sum_j f_j(q) B_j (see the module). Sets without joints near the root are first; of the sets
     with the same joint closest to the root, small sets are first. For three joints, the order is {3}, {2}, {2, 3}, {1},
