@@ -142,8 +142,9 @@ def random_model(
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
     """Replace parameters of a model by normal random numbers with zero mean.
 
-    deviation: standard deviation of all parameters, except raw armatures, which have 1. None: 0.3 for residual terms
-    and 1 / sqrt(fan-in) for networks, so that no term is negligible; other parameters are unchanged.
+    deviation: standard deviation of all parameters except `raw_armature`, the logarithm of armature / nominal armature,
+    whose standard deviation is always 1. None: 0.3 for residual terms and 1 / sqrt(fan-in) for networks, so that no
+    term is negligible; other parameters are unchanged.
     """
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
@@ -189,7 +190,10 @@ def frictionless(model: nn.Module) -> nn.Module:
 
 
 class ExactFunctions(nn.Module):
-    """Polynomials in place of a network of an emitted model: y = (polynomial - mean) / scale, with dy / d inputs."""
+    """Polynomials in place of a network of an emitted model, so that the functions of the model are known exactly.
+
+    The model computes a function as mean + scale y from a network output y, so y is (polynomial - mean) / scale here.
+    """
 
     def __init__(
         self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module

@@ -16,7 +16,10 @@ NOTHING = 1e-9  # [1] magnitude below which a quantity of order 1 counts as zero
 
 @dataclass
 class Seen:
-    """The axes and masses of an arm at random configurations, by Pinocchio; joints are numbered from 1."""
+    """Joint axes and origins of an arm at three random configurations, and the inertia of its last body, by Pinocchio.
+
+    Its methods test statements about the geometry, such as parallel axes. They number the joints from 1.
+    """
 
     arm: Chain
 

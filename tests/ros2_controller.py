@@ -117,7 +117,10 @@ class Controller:
         return None if reason is None else reason.decode()
 
     def text(self, name):
-        """Return the text of a harness function without arguments, such as "state", "interfaces", "ranges" or "log"."""
+        """Call a function of the C++ test harness that has no arguments, and return its result, a text.
+
+        name: name of the function without "harness_", such as "state", "interfaces", "ranges" or "log".
+        """
         return self.call(name).decode()
 
     def joint_state(self, topic):

@@ -1,4 +1,4 @@
-"""`make_arm` finds the joints and bodies of a URDF with exact rational numbers; dynamics equal Pinocchio's."""
+"""`make_arm` makes the joint frames and bodies of a URDF, in rational numbers; its dynamics equal Pinocchio's."""
 
 import json
 import re
@@ -351,7 +351,8 @@ class TestExactness:
                 joint("b", "3", "4", xyz="0 0 1"),
             )
         )
-        # joint "b" is one metre along the z axis of joint "a", in the frame of the tilted slider
+        # The fixed joint reverses the tilt of the slider: joint "b" is one metre along the z axis of joint "a". In the
+        # frame of the slider, with the rotation R relative to joint "a", this axis is row 2 of R.
         slider, last = arm.bodies[1:]
         assert last.translation == slider.rotation[2]
         assert (exact(slider) @ exact(last) == IDENTITY).all()
@@ -460,7 +461,10 @@ def assert_close(ours, theirs, name):
 
 
 class Ours:
-    """Pinocchio model that is assembled from the bodies of a spelgen arm; Pinocchio does not read the URDF."""
+    """Pinocchio model that is assembled from the joints and bodies of an arm as `make_arm` has derived them.
+
+    Pinocchio does not read the URDF here (see `Theirs`).
+    """
 
     def __init__(self, arm):
         self.model = pin.Model()
@@ -501,7 +505,10 @@ class Ours:
 
 
 class Theirs:
-    """Pinocchio model that Pinocchio reads from the URDF, with all joints, as a function of the arm's coordinates."""
+    """Pinocchio's own model of the URDF, in which mimic joints and locked joints are independent joints, too.
+
+    Its joint positions are slope q + offset, with the arm's coordinates q; locked joints are at zero.
+    """
 
     def __init__(self, path, arm):
         text = re.sub(r"<\?xml[^>]*\?>", "", path.read_text(encoding="utf-8"), count=1)

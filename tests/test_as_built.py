@@ -162,7 +162,7 @@ class TestHysteresis:
         np.testing.assert_allclose(tau[0.1 * t > self.PRESLIDING], 2.0, atol=1e-12)
 
     def test_a_cycle_dissipates_and_closes(self):
-        """Over closed cycles hysteretic friction does positive work, equal from the second cycle on."""
+        """Hysteretic friction dissipates energy in a closed cycle, the same energy from the second cycle on."""
         t = np.linspace(0, 3, 6001)
         q = 0.05 * np.sin(2 * np.pi * t)
         tau = self.torque(q, t)

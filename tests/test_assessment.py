@@ -18,10 +18,11 @@ def errors(relative, tip=None):
 
 
 def evaluation(relative=0.05, nmse=0.004, traces=None, seen=False, **others):
-    """Return an evaluation with two horizons.
+    """Return an evaluation with two horizons, 1 step and 1 s.
 
-    relative: relative error of the model at 1 s. nmse: nMSE of its torque. others: relative errors of other predictors.
-    seen: the test logs are training logs.
+    relative: relative error of the model at 1 s. nmse: nMSE of its torque. others: relative errors of other predictors,
+    by their names. traces: further traces of the evaluation, such as "coverage", the ranges of the test motion. seen:
+    True if the test logs are training logs.
     """
     horizons = []
     for k, (name, factor) in enumerate((("1 step", 0.5), ("1 s", 1.0))):

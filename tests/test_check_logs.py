@@ -272,7 +272,7 @@ def test_settings_that_logs_do_not_need_may_have_errors(spelgen, robots, arm, lo
 def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
     spelgen, robots, arm, log, tmp_path, monkeypatch
 ):
-    """Of logs beyond the bound of memory, the kept segments are checked, and the report states their number."""
+    """If logs exceed the memory bound, one of every k segments is kept and checked; the report states k."""
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
@@ -310,7 +310,7 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_constant_torque_is_reported(loaded, log, constant):
-    """A constant torque is reported, also the value 0.1, although rounding makes its mean differ from the samples."""
+    """A constant torque is reported even if rounding errors make its mean differ from its value, as for 0.1 Nm."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
     assert [x.gravity.explained for x in report.joints] == [None] * 3
@@ -493,7 +493,10 @@ def test_commands_on_round_levels_are_not_quantised(samples_held):
 
 
 def test_no_coupling_is_found_by_chance(loaded, log):
-    """If no parameters explain the torques, the best of all couplings is not reported."""
+    """For random-walk torques, which no parameters explain, no coupling of motors is found.
+
+    The best of all couplings lowers the torque error a little by chance, but is not significant.
+    """
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
         alone = Drives(np.eye(3), np.eye(3))

@@ -82,7 +82,10 @@ def results(study):
 
 
 def losses_of(result):
-    """Return {loss: value} of the model of a simulated arm."""
+    """Return {name: value} of the losses in the result of one run, such as "prediction loss, 1 s".
+
+    The run is of a simulated arm: there are errors of the model, but of no other predictor.
+    """
     assert all(set(errors) == {"model"} for errors in result.errors.values())
     return {label: errors["model"] for label, errors in result.errors.items()}
 

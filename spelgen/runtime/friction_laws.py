@@ -82,9 +82,9 @@ class FrictionConstants(NamedTuple):
 
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
-        # Each bristle is a spring of stiffness coulomb * fraction / breakaway. The Stribeck and load
-        # terms of dry friction vary with velocity and load, and are counted as dissipation, which may
-        # therefore be slightly negative.
+        # Each bristle is a spring of stiffness coulomb * fraction / breakaway: only the Coulomb term of
+        # dry friction stores energy. The Stribeck and load terms vary with velocity and load. Their power
+        # counts as dissipation, which may be slightly negative when a bristle relaxes.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 

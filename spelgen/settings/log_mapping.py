@@ -30,8 +30,8 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping,
-# which may have a factor.
+# {quantity: {unit of a log in the form of `plain_unit`: unit of a mapping}}. A unit of a mapping may have a factor:
+# positions in "cdeg" have the unit "0.01 deg".
 UNIT_NAMES: dict[str, dict[str, str]] = {
     quantity: {name: unit for unit, names in units for name in names.split()}
     for quantity, units in {
@@ -70,7 +70,11 @@ Accepted = Literal[
 
 
 def _scaled(value: object, validate: Callable[[object], str], info: ValidationInfo) -> str:
-    """Return a validated unit, which may have a factor, such as "0.01 deg", or another spelling, such as "degrees"."""
+    """Return a unit of a mapping in its standard spelling: "degrees" becomes "deg", "0.01 degrees" "0.01 deg".
+
+    value: unit in the settings, with an optional factor. validate: pydantic's check that a unit without factor is
+    allowed. info: has the name of the field, which is the quantity ("t", "q", "qd", "tau" or "u").
+    """
     text = value if isinstance(value, str) else ""
     match = re.fullmatch(r"((?:\d*\.?\d+(?:e[+-]?\d+)? ?)?)([^\d\s.].*)", text)
     if not match or (match[1] and not float(match[1])):
@@ -120,9 +124,10 @@ def plain_unit(text: str) -> str:
 
 
 def mapped_unit(quantity: str, unit: str) -> str | None:
-    """Convert a unit from the form of `plain_unit` to the form of a mapping, such as "0.01 deg"; None if unknown.
+    """Convert a unit of a log in the form of `plain_unit` to a unit of a mapping; None if the unit is unknown.
 
-    quantity: "t", "q", "qd", "tau" or "u".
+    Examples: "degrees" becomes "deg", "0.001 nm" becomes "0.001 Nm", "2 cdeg" becomes "0.02 deg". quantity: "t", "q",
+    "qd", "tau" or "u"; a unit of another quantity is unknown.
     """
     factor, _, name = unit.rpartition(" ")
     mapped = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
@@ -196,9 +201,9 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of the times and of the columns of all joints; default: SI units.
+    """Units of the times and of the columns of all joints, one per quantity; default: SI units.
 
-    If no unit of positions is set, positions in degrees are detected.
+    If no unit of positions is set, positions in degrees are reported as an error.
 
     Attributes:
         t: Time.
@@ -317,15 +322,15 @@ class LogMapping(Group):
 
     Attributes:
         topic: Topic to read, for a ROS bag with joint states in several topics.
-        columns: Names of the columns.
-        units: Units of the columns.
+        columns: Names of the columns, one per quantity.
+        units: Units of the columns, one per quantity.
         input: "position" for position servos: u is read instead of qd and tau.
         velocity: "differentiated" for logs without velocities.
         torque_delay: Delay of the logged torques relative to the positions; `spelgen logs` suggests a value [s].
         joints: Columns of single joints, by the joint's name in the URDF.
         accept: Codes of errors of `spelgen logs` to ignore.
-        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for a moment, and
-            rows that repeat the row before.
+        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for at most five
+            samples, and rows that repeat the row before.
         sample_rate: Rate of evenly spaced rows, whose times are ignored [Hz].
         calibration: Calibration of the motors by their names in the log, the content of LeRobot's calibration file, for
             the unit "normalised".
@@ -431,9 +436,9 @@ class LogMapping(Group):
         `input` and `accept` are unchanged. For joints whose logged positions wrap around after a period, the period of
         positions becomes one turn, 2 pi rad.
         """
-        # If the positions of a joint wrap around in the log, the positions in a file that spelgen writes may wrap
-        # around after one turn. For each joint with a period of positions, the new mapping therefore has a period of
-        # one turn.
+        # A joint with a period of positions may turn without limits. Its positions in the file with SI units may still
+        # wrap around, then after one turn (2 pi rad) and not after the period of the log. The returned mapping
+        # therefore has a period of one turn for such joints.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
@@ -452,7 +457,10 @@ class LogMapping(Group):
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def _unit(self, quantity: str, joint: str) -> tuple[float, str | None]:
-        """Return factor and unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
+        """Return the unit of a logged quantity of a joint as (factor, unit): (0.01, "deg") for "0.01 deg".
+
+        Without a unit in the mapping, the result is (1, None). quantity: "q", "qd", "tau" or "u".
+        """
         text: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if text is None and quantity == "u":

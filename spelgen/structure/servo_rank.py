@@ -96,14 +96,15 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
     triangles, potential = float_energies(arm, shifted, [list(ten) for ten in inertias])
-    # `mass`, (S, n + 1, 10 B, n, n): M per unit of each of the 10 B inertial parameters of the B bodies, at the complex
-    # positions shifted in each of the n + 1 `directions`. The imaginary part divided by `step` is the derivative of M
-    # in this direction.
+    # `mass`, (S, n + 1, 10 B, n, n): M per unit of each of the 10 B inertial parameters of the B bodies, for S samples,
+    # at the complex positions q + i step d for each of the n + 1 `directions` d. Its imaginary part divided by `step`
+    # is the derivative of M in the direction d.
     mass = np.zeros((*potential.shape, n, n), dtype=complex)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. Complex step: in the time `step`, q changes by step qd (the last
-    # of `directions`) and qd by step qdd, so the imaginary part of M qd, `momentum`, is step d/dt (M qd).
+    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq, with complex-step derivatives. For d/dt, `momentum` is the
+    # product of M at q + i step qd (the last of `directions`) and qd + i step qdd: its imaginary part is
+    # step d/dt (M qd). For d/dq, M and V are evaluated at q + i step e_k, with the unit vectors e_k.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)

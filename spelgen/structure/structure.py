@@ -75,7 +75,8 @@ class Structure:
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
     """Return the structure of the mass matrix M and the potential energy V of ``arm``.
 
-    It has the zero, constant and varying entries of M, the minimal form of M, and the joints that V depends on. assume:
+    It has the zero, constant and varying entries of M, the minimal form of M, and the joints that V depends on. The
+    minimal form is M = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints. assume:
     ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for the values
     in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
     """
