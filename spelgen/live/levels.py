@@ -77,10 +77,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         # body, at the origin of the last body.
         if tip.carrier == len(arm.chain.bodies) - 1:
             point = tip.pose[:3, 3]
-    tested = []
-    for k, fold in enumerate(folds):
-        others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
-        tested.append((fitted_to(fit, others), fold))
+    others = [list(itertools.chain(*folds[:k], *folds[k + 1 :])) for k in range(len(folds))]
+    tested = [(fitted_to(fit, training), fold) for training, fold in zip(others, folds, strict=True)]
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
     # Serialization rounds the noise levels. The rounded levels are returned, so that they are equal to the levels that
     # are later read from the run folder.
@@ -153,10 +151,11 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
-    # them. A torque limit in the URDF is unknown if logged torques exceed it by more than noise. Instead of an unknown
+    # them. A torque limit in the URDF is wrong if logged torques exceed it by more than noise. A limit of 1000 is often
+    # a placeholder: real limits are 1.6 to 50 times the largest torque of recordings. Instead of a wrong or unknown
     # limit, `limit` is a guess: torques above it (for example under a payload) do not count as saturated up to
     # `TUNING.jump` times it.
-    is_known = (effort < np.inf) & (1.2 * effort >= largest)
+    is_known = (1.2 * effort >= largest) & (effort < 100 * largest)
     limit = np.where(is_known, np.maximum(effort, 1.2 * largest), 2.5 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
@@ -164,20 +163,16 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
         minutes=sum(log.duration for log in logs) / 60, saturation=np.where(is_known, 1.0, TUNING.jump),
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
-    segments, pairs = [], []
-    for samples in tested:
-        blocks = [x.block for x in samples if x.block is not None]
-        segments.append(blocks)
-        # A block of the payload filter has twice the length of a block of the drift filter.
-        pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
+    segments = [[x.block for x in samples if x.block is not None] for samples in tested]
+    # A block of the payload filter has twice the length of a block of the drift filter.
+    pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
-    factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    payload = {"load_variance": factor, "load_freedom": freedom}
+    payload = load_variance(list(itertools.chain(*pairs)), levels)
     return _with_observer(levels.model_copy(update=payload), tested)
 
 
-def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
+def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, float]:
+    """Return the fields `load_variance`, a factor for the covariance of estimated payloads, and `load_freedom`.
 
     The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
     factor is found by trials: each trial estimates the payload from several consecutive blocks. The logs are without
@@ -193,8 +188,7 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     """
     factors = []
     for window in TUNING.trial_blocks:
-        squares = np.zeros(2)
-        trials = len(blocks) // window
+        squares, trials = np.zeros(2), len(blocks) // window
         for start in range(0, trials * window, window):
             load = LoadFilter(levels.load, levels.effort)
             for block in blocks[start : start + window]:
@@ -202,10 +196,9 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
                 for joint in range(load.n):
                     load.update(block, joint)
             squares += [load.x[:k] @ np.linalg.solve(load.P[:k, :k], load.x[:k]) / k for k in (1, 4)]
-        freedom = trials + TUNING.prior_trials
-        prior = TUNING.prior_trials * TUNING.prior_variance
+        freedom, prior = trials + TUNING.prior_trials, TUNING.prior_trials * TUNING.prior_variance
         factors.append((float(squares.max() + prior) / freedom, freedom))
-    return max(factors)
+    return dict(zip(("load_variance", "load_freedom"), max(factors), strict=True))
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:
