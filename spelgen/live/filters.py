@@ -54,7 +54,7 @@ class Block(NamedTuple):
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
         means = [a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)]
-        return Block(duration, *means, self.moving & later.moving)
+        return Block._make([duration, *means, self.moving & later.moving])
 
 
 class Blocks:

@@ -39,7 +39,7 @@ class ContactEvent:
         joints: names of the joints whose external torque exceeds the threshold.
         torques: largest external torque of each of these joints [Nm, N].
         force: largest estimated force at the tip [N].
-        is_load: True if the torques are those of a load: a load is reported during the contact, or directly after it.
+        is_load: True if a load causes the torques: its report is during the contact, or directly after it.
     """
 
     begin: float
