@@ -2,9 +2,11 @@
 
     python benchmarks/ablation.py [--recordings FOLDER] [--arms-folder URDFS] [--only NAME] [--case NAME]
 
-Cases: the documented splits of recordings, trained on 3 s and on all (torque nMSE of `hybrid` on the test recordings),
-and simulated arms of benchmarks/truth.py, one of them with the errors of real arms (error of M(q) as well). A cell is
-the relative change of the error without the mechanism, in per cent: +5.0 means that the mechanism lowers the error. A
+Cases, each fitted with `hybrid`: the documented splits of recordings (docs/real_logs.md), trained on the first 3 s and
+on all training recordings; a simulated UR10e with springs, gear ripple or uneven friction (benchmarks/arms.py); and
+simulated arms of benchmarks/truth.py, one of them with the errors of real arms and sensors (`real_errors.py`). The
+error is the torque nMSE on test motions, and for all arms of truth.py also the relative error of M(q). A cell is the
+relative change of the error without the mechanism, in per cent: +5.0 means that the mechanism lowers the error. A
 mechanism below 2 % in all cells, and without a test of a failure that it prevents, is to be removed.
 """
 
@@ -81,56 +83,63 @@ def tuned(table: Any, **changes: Any) -> tuple[tuple[Any, str, Any], ...]:
 
 
 def keep_prior(prior: Any, *_: Any) -> Any:
-    """Replace `update_widths`: all standard deviations of the prior keep their initial values."""
+    """Substitute for `update_widths`: return the prior unchanged; its standard deviations keep their initial values."""
     return prior
 
 
 def keep_armatures(prior: Any, *estimate: Any) -> Any:
-    """Replace `update_widths`: the prior standard deviation of the armatures keeps its initial value."""
+    """Substitute for `update_widths`: the prior standard deviation of the armatures keeps its initial value."""
     updated = torque_prior.update_widths(prior, *estimate)
     widths = updated.widths.model_copy(update={"armature": prior.widths.armature})
     return replace(updated, widths=widths)
 
 
 def one_body_width(prior: Any, *estimate: Any) -> Any:
-    """Replace `update_widths`: all bodies share one prior standard deviation, instead of one per body."""
+    """Substitute for `update_widths`: all bodies share one prior standard deviation, instead of one per body."""
     updated = torque_prior.update_widths(prior, *estimate)
     return replace(updated, body_widths=torch.full_like(updated.body_widths, updated.widths.bodies))
 
 
 def no_freedom(estimator: Any, squared_residual: Any, *_: Any) -> Any:
-    """Replace `NoiseEstimator.estimate`: root mean square residual, not corrected for the degrees of freedom."""
+    """Substitute for `NoiseEstimator.estimate`: noise without correction for the number of fitted parameters."""
     return ESTIMATE(estimator, squared_residual)
 
 
 def always_hysteretic(estimate: Any) -> Any:
-    """Replace `choose_friction_state`: friction of every joint has bristle states."""
+    """Substitute for `choose_friction_state`: return the fit in which friction of every joint has bristle states.
+
+    estimate: fit with rate-only friction, a `TorqueEstimate`; it is refitted with bristles.
+    """
     estimate.problem.jacobian.model.friction.memoryless.fill_(0.0)
     problem, state = stages._least_squares_noise_fit(estimate.problem, estimate.state)
     return torque_problem.alternate(problem, state)
 
 
 def keep_all(estimate: Any) -> Any:
-    """Replace `choose_friction_effects`: friction has all effects at every joint."""
+    """Substitute for `choose_friction_effects`: friction has all effects at every joint."""
     return estimate
 
 
 def no_occam_factor(estimate: Any) -> float:
-    """Replace `fraction_occam_factor`: the friction state is chosen by its likelihood only."""
+    """Return a log Occam factor of 0 in place of `fraction_occam_factor`: only likelihoods choose friction states."""
     return 0.0
 
 
 def no_limit(model: Any, samples: Any) -> None:
-    """Replace `limit_friction`: nominal friction depends on effort limits only, not on the measured torque."""
+    """Substitute for `limit_friction`: nominal friction depends on effort limits only, not on the measured torque."""
 
 
 def not_orthogonalized(projection: Any, joint: int, torque: Any) -> Any:
-    """Replace `orthogonalize`: a residual term keeps the part of its torque that rigid bodies could absorb."""
+    """Substitute for `orthogonalize`: a residual term keeps the part of its torque that rigid bodies could absorb."""
     return torque
 
 
 def alternately(model: Any, samples: Any, *rest: Any) -> joint_functions.ProjectedTerms:
-    """Replace `refit_terms`: residual terms and rigid bodies are fitted alternately, without variable projection."""
+    """Substitute for `refit_terms`: residual terms and rigid bodies are fitted alternately, not simultaneously.
+
+    `refit_terms` has the same arguments. The weights of all terms are written to the model; the result has no linear
+    terms, so that the next fit of the rigid bodies does not change these weights.
+    """
     with torch.no_grad():
         torque = residual_torque(model, *samples[:3])
         projected = joint_functions.refit_terms(model, samples, *rest)
@@ -195,7 +204,10 @@ def switched_off(mechanism: Mechanism | None) -> Iterator[None]:
 
 
 def real_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Yield names and functions that fit `hybrid` to documented splits: 3 s of recordings, and all of the training."""
+    """Yield two cases per documented split: fits to the first 3 s in total, and to all of the training recordings.
+
+    A case is its name, such as "ur10e, 3 s", and a function that fits `hybrid` and returns {"nMSE": test error}.
+    """
     for fold in folds(folder):
         if "/split" in fold.name:
             tests = next(iter(fold.tests.values()))
@@ -215,7 +227,10 @@ def fit_and_judge(urdf: Path, training: Any, tests: Any) -> Callable[[], dict[st
 
 
 def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Yield names and functions that fit `hybrid` to the simulated arms of `SIMULATED`, whose true M is known."""
+    """Yield a case per simulated arm of `SIMULATED`: its name, and a function that fits `hybrid` to its logs.
+
+    The function returns {"nMSE": torque error, "M": relative error of M}. Arms without a URDF in `folder` are omitted.
+    """
     for case in SIMULATED:
         if case.arm != "random" and not (folder / f"{case.arm}.urdf").exists():
             continue
@@ -224,7 +239,10 @@ def simulated_cases(folder: Path) -> Iterator[tuple[str, Callable[[], dict[str, 
 
 
 def effect_cases() -> Iterator[tuple[str, Callable[[], dict[str, float]]]]:
-    """Yield names and functions that fit `hybrid` to a simulated UR10e with springs, gear ripple or uneven friction."""
+    """Yield a case per effect in a simulated UR10e (springs, gear ripple, uneven friction), and one with all effects.
+
+    A case is its name, and a function that fits `hybrid` and returns {"nMSE": torque error on a test motion}.
+    """
     for effect, logs, test in arms.with_effects():
 
         def run(logs: Any = logs, test: Any = test) -> dict[str, float]:

@@ -1,13 +1,14 @@
-"""Errors per arm, baseline and preset: torques and states ahead on real logs, and torques of a simulated UR10e with
-effects in addition to rigid bodies.
+"""Torque errors of the presets and of other methods, and errors of predicted states of the presets, per arm.
 
     python benchmarks/arms.py [FOLDER]
 
-FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. nMSE: mean squared torque
-error divided by the torque's variance, mean over joints, pauses included. The presets are fitted as by `spelgen train`,
-everything else to the same samples. The networks are the ones of `rivals.py`; `+ network` is a network for the torque
-residual of least squares. States 0.1, 0.5 and 1 s ahead: error relative to the motion, as `spelgen
-evaluate` has it, open loop and with a constant disturbance from a momentum observer.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The first table has the nMSE of
+torques on recordings: mean squared error divided by the torque's variance, mean over joints, pauses included. The
+presets are fitted as by `spelgen train`. Least squares, ridge regression and the networks of `rivals.py` are fitted to
+the same filtered samples; `+ network` is a network for the torque residual of least squares. The second table has the
+errors of states that are predicted 0.1, 0.5 and 1 s ahead, relative to the motion as in `spelgen evaluate`: by
+constant velocity, and by the model without and with a constant disturbance torque from a momentum observer. The third
+table has the nMSE of torques of a simulated UR10e with a spring, gear ripple and friction that varies with position.
 """
 
 from __future__ import annotations
@@ -140,7 +141,10 @@ def splits(folder: Path) -> Iterator[Split]:
 
 
 def real(folder: Path) -> Iterator[Case]:
-    """Yield a case per documented split of the recordings: models of both presets, and the filtered torque samples."""
+    """Yield a case per documented split of recordings: models of `PRESETS`, and filtered training and test samples.
+
+    The splits into training and test recordings are described in docs/real_logs.md. Only test samples include pauses.
+    """
     for name, urdf, training, tests in splits(folder):
         fits, models = {}, {}
         for preset in PRESETS:
@@ -152,7 +156,10 @@ def real(folder: Path) -> Iterator[Case]:
 
 
 def simulated() -> Iterator[Case]:
-    """Yield a case per effect, and one with all effects, of a simulated UR10e that differs from its URDF."""
+    """Yield a case per effect of `EFFECTS`, and one with all effects, added to a simulated UR10e.
+
+    The rigid bodies and friction of the simulated arm also differ from its URDF.
+    """
     for name, logs, test in with_effects():
         models = {}
         for preset in PRESETS:

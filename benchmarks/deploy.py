@@ -1,10 +1,11 @@
-"""Exports compared with the torch module and each other: parity at 10,000 states, latencies of one call on one core.
+"""Differences between exports and the torch module at 10,000 states, and the time of one call of each export.
 
     python benchmarks/deploy.py [--parity] [--latency]
 
-Needs the extras deploy and simulate and a C compiler. Models: the six arms of robots/, both presets that go to C, every
-parameter changed by a normal number, so that every part has an effect; latencies also of hybrid without selected
-residual terms, which is the result of most fits.
+Needs the extras deploy and simulate and a C compiler. The presets are closed-form and hybrid, which can be exported to
+C. A random normal number is added to every parameter, so that every part of the model has an effect. Differences are
+printed for six arms of robots/, times on one core for the UR10e. Times are also measured for hybrid without selected
+residual terms, since most fits select none.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ FLAGS = ("-O2",)
 
 
 def trained(robot: str, preset: str, size: float = 0.05, *, residuals: bool = True) -> Trained:
-    """Return a model whose parameters are changed by normal numbers with standard deviation ``size``.
+    """Return a model to whose parameters random normal numbers with standard deviation ``size`` are added.
 
     Without ``residuals`` the parameters of residual terms are unchanged.
     """
@@ -94,12 +95,15 @@ def parity() -> None:
 
 def _largest(found: Parity) -> float:
     """Return the largest relative difference over all entry points, except entry points of the tip."""
-    # tip poses are omitted: they are compared with forward kinematics in single precision
+    # the tip's pose and Jacobian are omitted: they depend only on the URDF's geometry, not on the fitted parameters
     return max(value for name, value in found.differences.items() if not name.startswith("tip_"))
 
 
 def library(model: TrainedModel, folder: Path, flag: str, kind: type) -> Called:
-    """Compile the C of a model; return the function that calls its entry points. kind: NumPy type of its numbers."""
+    """Compile the C code of a model in ``folder``; return a function that calls the compiled entry points.
+
+    flag: compiler flag that selects single precision; "": double precision. kind: NumPy type of the same precision.
+    """
     program, own_folder = compiler(), folder / kind.__name__
     assert program is not None
     own_folder.mkdir()

@@ -101,7 +101,11 @@ class FigarohDynamics:
 
 
 def figaroh_dynamics(arm: Chain, settings: Any, samples: Sequence[DynamicsSamples]) -> FigarohDynamics:
-    """Identify an arm from samples by figaroh. Raises ImportError without figaroh, ArmError for mimic joints."""
+    """Identify an arm from samples by figaroh's weighted least squares; return the identified dynamics.
+
+    settings: spelgen's settings of the arm, for its model in Pinocchio. Raises ImportError without figaroh, ArmError
+    for mimic joints.
+    """
     from figaroh.tools.qrdecomposition import QRDecomposer
     from figaroh.tools.regressor import RegressorBuilder, RegressorConfig, eliminate_non_dynaffect
     from figaroh.tools.solver import solve_linear_system

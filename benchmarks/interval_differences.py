@@ -3,14 +3,14 @@
     python benchmarks/interval_differences.py ARM.urdf LOGS... [--preset hybrid] [--parts 1]
     python benchmarks/interval_differences.py ARM.urdf LOGS... --halvings 10
 
-Each recording, or each of its parts, is fitted separately, and each pair of fits is compared. With --halvings both
-halves of the logs are fitted, the logs in order of their names first, then in random orders. For each quantity the
-difference of two fits is compared with the root sum of squares of their half intervals, and the share of differences
-that are smaller is printed.
+Each recording is fitted separately, or each of its --parts parts of equal length, and each pair of fits is compared.
+With --halvings N, the logs are divided into two halves N times (every second log, in order of their names first, then
+in random orders), and the fits to both halves are compared. The two 95 % intervals of a quantity have the half widths
+h1 and h2. The share of differences between fits of at most sqrt(h1^2 + h2^2) is printed; it should be 95 %.
 
 Quantities of a fit to torques: base parameters, constants of the drives, and the diagonal of M and the gravity torque
-at positions within 30 % of the joints' ranges. Of a fit of servos: the delay, and the ratios to kp that both fits
-determine.
+at random positions, at most 30 % of half the range from the centre of each joint's range. Of a fit of servos: the
+delay, and kd, armature, dry friction, static error and dead zone relative to kp, if both fits determine them.
 """
 
 from __future__ import annotations
@@ -33,11 +33,14 @@ FRACTION = 0.3
 RATIOS = ("kd", "armature", "dry", "static_error", "dead_zone")
 
 Estimates = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Values and half intervals by quantity, (k,) each; NaN for values that a fit does not determine."""
+"""{quantity: (values, half widths of their 95 % intervals)}, (k,) each; NaN for values without an estimate."""
 
 
 def main() -> None:
-    """Fit recordings separately, and print the shares of differences between fits that lie inside the intervals."""
+    """Fit sets of recordings; print per quantity the share of differences between two fits within their 95 % interval.
+
+    The interval of a difference has the half width sqrt(h1^2 + h2^2), with the half widths h1 and h2 of both fits.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -67,7 +70,11 @@ def main() -> None:
 def groups(
     logs: Sequence[spelgen.Trajectory], parts: int, halvings: int
 ) -> Iterator[list[list[spelgen.Trajectory]]]:
-    """Yield groups of recordings, to fit and compare: one group of all parts, or per halving a group of two halves."""
+    """Yield groups of training sets. Each set is fitted, and the fits of a group are compared in pairs.
+
+    If `halvings` is 0, there is one group, in which each of the `parts` parts of each recording is a set. Otherwise
+    each halving of the recordings is a group of two sets.
+    """
     if not halvings:
         yield [[part] for part in parts_of(logs, parts)]
     for number in range(halvings):
@@ -86,11 +93,12 @@ def parts_of(logs: Sequence[spelgen.Trajectory], count: int) -> Iterator[spelgen
 
 
 def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> list[bool]:
-    """Return, for each value that two fits determine, whether the difference is within their combined half interval.
+    """Return, for each value that two fits determine, True if |difference| <= sqrt(h1^2 + h2^2).
 
     Args:
-        first: values and half intervals of one fit, (k,) each; NaN for values that it does not determine.
-        second: likewise, of the other fit.
+        first: values and half widths h1 of their 95 % intervals, (k,) each, in one fit; NaN for values that this fit
+            does not determine.
+        second: values and half widths h2 in the other fit.
     """
     difference = np.abs(first[0] - second[0])
     # difference and half intervals may be exactly zero, for a joint that gravity does not load
@@ -99,7 +107,11 @@ def agreements(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, n
 
 
 def estimates(fit: spelgen.Fit) -> Estimates:
-    """Return {quantity: (values, half 95 % intervals)}, (k,) each: base, drives, M and g, or `servo_estimates`."""
+    """Return {quantity: (values, half widths of their 95 % intervals)} of a fit, (k,) each.
+
+    A fit to torques has the quantities "base" (base parameters), constants of the drives by name, "M" (its diagonal)
+    and "g" (gravity torques), the last two at `POSITIONS` random positions. For a fit of servos see `servo_estimates`.
+    """
     if fit.record.servo is not None:
         return servo_estimates(fit.record.servo)
     posterior, result = fit.posterior, {}
@@ -116,7 +128,11 @@ def estimates(fit: spelgen.Fit) -> Estimates:
 
 
 def servo_estimates(servo: Content) -> Estimates:
-    """Return the delay [s] and the logarithms of `RATIOS` to kp of a fit of servos, with half intervals, by name."""
+    """Return {name: (values, half widths of their 95 % intervals)} of a fit of servos.
+
+    The delay has one value [s]. Each quantity of `RATIOS` has one value per joint, log(quantity / kp); it is NaN if the
+    fit does not determine it. servo: results of the fit in its run record.
+    """
     delay = servo["delay"]
     result = {"delay": (np.array([delay["value"]]), np.array([delay["half"]]))}
     for ratio in RATIOS:

@@ -13,7 +13,8 @@ from spelgen.fitting.posterior import Posterior
 
 QUANTITIES = ("base", "friction", "mass", "gravity")
 QUANTILE = 1.96
-# [1] error below which a true value of zero is omitted, relative to the quantity's largest true value
+# [1] Relative to the largest true value of a quantity. A value whose error and half interval are both smaller is
+# omitted, such as g of a joint that gravity does not load: rounding errors would determine error / half interval.
 NEGLIGIBLE = 1e-6
 
 
@@ -34,8 +35,9 @@ class SteadySliding:
 class TrueValues:
     """True values of a simulated arm, with which the intervals of its fit are compared.
 
-    combination: (r, K), maps inertial parameters and armatures to base parameters. base: (r,) base parameters.
-    friction: (speeds, n) of steady sliding [Nm, N]. mass: M, (T, n, n), and gravity: g, (T, n), at T positions.
+    combination: (r, K) matrix from inertial parameters and armatures to base parameters. base: (r,) base parameters.
+    friction: (speeds, n) [Nm, N], friction of steady sliding (see `SteadySliding`). mass: (T, n, n), M at T positions.
+    gravity: (T, n) [Nm, N], gravity torque g at these positions.
     """
 
     combination: np.ndarray
@@ -48,12 +50,12 @@ class TrueValues:
 def interval_ratios(
     posterior: Posterior, true: TrueValues, sliding: SteadySliding, q: np.ndarray
 ) -> dict[str, list[float]]:
-    """Return the errors divided by the half width of the 95 % interval, per quantity of `QUANTITIES`.
+    """Return |fitted value - true value| / half width of the 95 % interval, for all values of each of `QUANTITIES`.
 
     Omitted: values that are zero in truth and in the fit, such as g of joints that gravity does not load.
 
     Args:
-        posterior: of the fitted model.
+        posterior: posterior of the fitted model.
         true: values of the simulated arm, with g and M at the positions q.
         sliding: positions and speeds at which friction is compared.
         q: (T, n) positions at which g and the diagonal of M are compared.
@@ -63,7 +65,7 @@ def interval_ratios(
     truths = [x.ravel() for x in (true.base, true.friction, diagonal, true.gravity)]
 
     def quantities(model: ArmModel) -> torch.Tensor:
-        """Return base parameters, friction, diagonals of M and gravity torques of a model in one vector, (K,)."""
+        """Return base parameters, sliding friction, and diagonals of M and g at the positions q, of a model, (K,)."""
         base = combination @ torch.cat([model.inertial_parameters.flatten(), model.armature])
         mass = model.mass_matrix(positions).diagonal(dim1=-2, dim2=-1)
         friction, gravity = _sliding_friction(model, sliding), model.gravity(positions)

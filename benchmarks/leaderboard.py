@@ -95,15 +95,16 @@ class Fold:
 
     @property
     def durations(self) -> tuple[float, ...]:
-        """Return the training durations [s]: each of `SECONDS` that the recordings exceed, and infinity for all."""
+        """Return the training durations [s]: `SECONDS` below 95 % of the total, and infinity for all recordings."""
         total = sum(log.duration for log in self.training)
         return tuple(x for x in SECONDS if x < 0.95 * total or np.isinf(x))
 
 
 class Problem:
-    """Training samples of a fold's first seconds, and its test samples, equal for all methods.
+    """Training and test samples of a fold, filtered with one torque delay, so that all methods have the same samples.
 
-    Raises LogError if nothing moves.
+    The training samples are from the first `seconds` seconds of the fold's training recordings, in total. Raises
+    LogError if no joint moves in them.
     """
 
     def __init__(self, fold: Fold, seconds: float) -> None:
@@ -118,7 +119,10 @@ class Problem:
             raise LogError("no moving samples", expected="motion faster than 0.02 rad/s")
 
     def samples_of(self, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-        """Return the filtered torque samples of logs, as `train` and `evaluate` use them."""
+        """Return the filtered torque samples of logs, as `train` and `evaluate` use them.
+
+        pauses: if True, samples at standstill between motions are included.
+        """
         return dynamics_samples(logs, pauses=pauses, preprocessing=self.preprocessing, reach=self.reach)
 
     @cached_property
@@ -154,10 +158,10 @@ def urdf_values(problem: Problem) -> Prediction:
 
 
 def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> Torque:
-    """Return the torque of ridge regression; its penalty is chosen by cross-validation over blocks of time.
+    """Return the torque function of ridge regression, whose penalty is chosen by cross-validation over blocks of time.
 
-    The penalty is relative to the squared length of each column of the regressor of rigid bodies, viscous and Coulomb
-    friction, armature and offset; each joint is weighted by the range of its torque.
+    The regressor has columns of rigid bodies, viscous and Coulomb friction, armature and offset. The rows of a joint
+    are divided by the standard deviation of its torque. The penalty is relative to the squared length of each column.
     """
     friction = FrictionModel()
 
@@ -167,7 +171,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
     tau = np.concatenate([x.tau for x in samples])
     scale = np.maximum(tau.std(axis=0), 1e-3 * tau.std(axis=0).max())[:, None]
-    # regressor (T, n, K), each joint divided by the range of its torque
+    # regressor (T, n, K), each joint divided by the standard deviation of its torque
     rows = np.concatenate([*map(columns, samples)]) / scale
     length = np.sqrt(np.square(rows).sum(axis=(0, 1)))
     length[length == 0] = 1.0
@@ -180,7 +184,7 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
         return np.linalg.solve(gram[:-1, :-1] + penalty * np.eye(len(length)), gram[:-1, -1])
 
     def held_out_error(penalty: float) -> float:
-        # share of the samples that are in training blocks, by which the penalty is scaled
+        # The penalty is relative to the Gram matrix of all samples; training blocks have only this share of samples.
         share = (RIDGE_FOLDS - 1) / RIDGE_FOLDS
         error = 0.0
         for block, gram in zip(blocks, grams, strict=True):
@@ -193,9 +197,10 @@ def cross_validated_ridge(chain: Chain, samples: Sequence[DynamicsSamples]) -> T
 
 
 def by_least_squares(*, memory: bool) -> Method:
-    """Return the method "least squares of `identify`", with Coulomb friction or, if `memory`, with bristle states.
+    """Return the method that fits rigid bodies and friction by the least squares of `spelgen identify`.
 
-    Joints are weighted by the range of their torque.
+    Each joint has the weight 1 / standard deviation of its torque. memory: if True, friction has bristle states;
+    otherwise it is Coulomb friction.
     """
     method = LeastSquares("range", friction=FrictionModel(memory=memory))
 
@@ -237,7 +242,11 @@ METHODS: dict[str, Method] = {
 
 
 def folds(folder: Path) -> Iterator[Fold]:
-    """Yield all folds of the folder of recordings: the documented splits first, then single motions."""
+    """Yield all folds (training and test recordings) of the arms in a folder of recordings.
+
+    The documented splits (docs/real_logs.md) are first, each split of a single recording with its reversal. Folds that
+    are trained on one motion are last.
+    """
     motions: list[Fold] = []
     for name in ("ur10e", "airbot", "shanghai"):
         urdf = folder / name / f"{name}.urdf"
@@ -255,13 +264,19 @@ def folds(folder: Path) -> Iterator[Fold]:
 
 
 def recordings_of(folder: Path, urdf: Path) -> dict[str, Trajectory]:
-    """Return all recordings in the folder of an arm, by the name of their file."""
+    """Return {file name without suffix: recording} of all Parquet files in a folder of recordings of one arm.
+
+    urdf: URDF of the arm, whose joints determine the columns of the recordings.
+    """
     arm = load_arm(urdf)
     return {path.stem: spelgen.read_logs([path], arm)[0] for path in sorted(folder.glob("*.parquet"))}
 
 
 def splits(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Iterator[Fold]:
-    """Yield the documented splits of an arm's recordings; `shanghai` has a split per recording, which is its test."""
+    """Yield the documented splits of an arm's recordings into training and test recordings.
+
+    `ur10e` and `airbot` have one split. `shanghai` has a split per recording: it is the test, all others are training.
+    """
 
     def chosen(names: Iterable[str]) -> tuple[Trajectory, ...]:
         return tuple(logs[x] for x in names)
@@ -287,12 +302,15 @@ def motion_folds(name: str, urdf: Path, logs: Mapping[str, Trajectory]) -> Itera
 
 
 def motion_of(recording: str) -> str:
-    """Return the name of a recording's motion: a second recording of the same motion has the suffix `_again`."""
+    """Return the name of a recording's motion: the recording's name without the suffix `_again` of a repetition."""
     return recording.removesuffix("_again")
 
 
 def measured(fold: Fold, seconds: float, methods: Iterable[str]) -> Iterator[Row]:
-    """Yield a row of results per method, fitted to the first seconds of a fold; a failed fit's row has its error."""
+    """Fit methods to the first `seconds` seconds of a fold's training; yield a row of results per method.
+
+    The row of a failed fit has the text of the error. A method whose package is not installed has no row.
+    """
     common: Row = {"fold": fold.name, "seconds": duration_name(seconds)}
     try:
         problem = Problem(fold, seconds)
@@ -363,7 +381,11 @@ def main() -> None:
 
 
 def by_rivals(options: argparse.Namespace) -> list[Row]:
-    """Run the methods of `rivals.py` in their own environment, which appends to the results; return all results."""
+    """Run this script for the methods of `rivals.py` with the Python `options.rivals`; return all results.
+
+    The Python belongs to an environment in which these methods are installed. Its process appends its results to the
+    file `options.out`. The methods are added to `options.methods`.
+    """
     command = [
         options.rivals,
         __file__,

@@ -10,7 +10,8 @@ import numpy as np
 
 DEFAULT = "hybrid"
 REFERENCES = ("URDF", "ridge", "least squares", "with memory", "closed-form")
-# limits of the default's error relative to the best reference: on 95 % of the cells, and on every cell
+# Goals for the error of `DEFAULT` divided by the smallest error of `REFERENCES`: largest ratio on 95 % of the cells
+# (fold, training duration, group of test recordings), and on every cell.
 GOALS = (1.05, 1.25)
 MARKS = "<!-- leaderboard -->", "<!-- end of leaderboard -->"
 LARGE = 100.0  # [1] nMSE above which tables print only "> 100"
@@ -21,7 +22,11 @@ Cell = tuple[str, str, str]
 
 
 def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
-    """Return the nMSE of each method on moving samples, by cell (fold, duration, group) and method."""
+    """Return {cell: {method: nMSE}}, computed over test samples in which a joint moves.
+
+    A cell is a fold, the duration of its training data, and a group of its test recordings. rows: results of
+    `leaderboard.py`; failed fits are omitted.
+    """
     cells: dict[Cell, dict[str, float]] = {}
     for row in rows:
         groups = row.get("nmse")
@@ -33,7 +38,11 @@ def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
 
 
 def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
-    """Return the table of errors: a row per cell of the splits, and medians per arm and duration of motion pairs."""
+    """Return the table of nMSE per method, with a row for each cell (fold, duration, group of test recordings).
+
+    Folds with a training recording of one motion and a test recording of another, the motion pairs, share one row per
+    arm and duration. It has the median over the pairs, per method. The last column has `ratio_to_best` or its median.
+    """
     table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
     for (fold, seconds, group), errors in cells.items():
         arm, kind = fold.split("/")
@@ -57,13 +66,19 @@ def _median(values: Sequence[float]) -> str:
 
 
 def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`; None if one of them is absent."""
+    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`.
+
+    errors: nMSE by method. Return None if `hybrid` has no error, or none of `REFERENCES` has one.
+    """
     best = min((errors[name] for name in REFERENCES if name in errors), default=None)
     return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
 
 
 def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return lines on the error of the preset `hybrid` divided by the smallest of `REFERENCES`, and the worst cells."""
+    """Return a summary of the ratio of the error of `hybrid` to the smallest error of `REFERENCES`, over all cells.
+
+    A cell is a fold, a duration and a group of test recordings. Cells with ratios above `GOALS[1]` are listed.
+    """
     ratios = {cell: x for cell, errors in cells.items() if (x := ratio_to_best(errors)) is not None}
     if not ratios:
         return []
@@ -91,7 +106,10 @@ def changes(
     now: Mapping[Cell, Mapping[str, float]],
     methods: Iterable[str],
 ) -> list[str]:
-    """Return a line per method: the ratios of errors now to errors before, over cells that `before` and `now` have."""
+    """Return a line per method about the ratios nMSE now / nMSE before, over cells that `before` and `now` contain.
+
+    A line has median, geometric mean, maximum and minimum of the ratios, and the shares above 1.03 and below 0.97.
+    """
     lines = []
     for name in methods:
         ratios = {
@@ -111,7 +129,10 @@ def changes(
 
 
 def text(table: Sequence[Sequence[str]]) -> str:
-    """Return a table of cells as text with aligned columns: the first three to the left, others to the right."""
+    """Return a table as lines of text: the first three columns are aligned at the left margin, others at the right.
+
+    table: rows of strings.
+    """
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return "\n".join(
         "  ".join(

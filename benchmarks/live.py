@@ -1,4 +1,4 @@
-"""Payload, friction and contact estimates of the live estimator on recordings: every figure of docs/live.md.
+"""Payload, friction and contact estimates of the live estimator on recordings: all numbers of docs/live.md.
 
     python benchmarks/live.py [FOLDER] [--arms ur10e panda ...] [--runs FOLDER]
 
@@ -54,7 +54,8 @@ PAYLOAD = 2
 class Case:
     """An arm: its fit, the noise levels of its estimator, and logs that are not in the training.
 
-    tests: logs without a load; figures are means over these logs. others: other conditions, for example with a load.
+    tests: logs without a load, to which simulated payloads and contacts are added. others: logs with a load or under
+    other conditions.
     """
 
     name: str
@@ -75,7 +76,10 @@ class Case:
         return self.compiled.run(log.t, log.q, log.qd, log.tau if tau is None else tau)
 
     def samples(self, log: Trajectory, *, pauses: bool = False) -> DynamicsSamples | None:
-        """Return the filtered samples of a log, on which torques are compared; None if nothing moves."""
+        """Return the filtered samples of a log, for comparisons of torques; None if there are 50 or fewer.
+
+        pauses: if True, samples at standstill between motions are included.
+        """
         reach = bristle_reach(self.fit.model)
         found = dynamics_samples([log], pauses=pauses, preprocessing=self.fit.preprocessing, reach=reach)
         return found[0] if found and len(found[0].q) > 50 else None
@@ -175,9 +179,11 @@ def synthetic_loads(case: Case) -> None:
 
 
 def corrections(case: Case, log: Trajectory, columns: Columns, ahead: float) -> np.ndarray:
-    """Return estimates made `ahead` seconds before each sample: friction scale minus one, and disturbance, (2, T, n).
+    """Return predictions from the estimates known `ahead` [s] before each sample of a log, (2, T, n).
 
-    The disturbance decays with the time constant of the noise levels; after more than 0.3 s it is zero.
+    The first is the relative change of friction [1], the second the disturbance torque [Nm, N]. The disturbance decays
+    during `ahead` with the time constant in `case.levels`. As in the estimator, it is predicted as zero if `ahead`
+    exceeds 0.3 s. columns: outputs of the estimator along the log, a row per sample.
     """
     k = np.maximum(np.searchsorted(log.t, log.t - ahead, side="right") - 1, 0)
     scale, disturbance = columns.friction_scale[k] - 1, columns.disturbance[k]
@@ -223,7 +229,12 @@ def friction_of(case: Case, samples: DynamicsSamples) -> np.ndarray:
 
 
 def times_of(case: Case, log: Trajectory, samples: DynamicsSamples, pauses: bool) -> np.ndarray:
-    """Return the time of each filtered sample of a log, (T,) [s]: filtered like a torque, to get the same rows."""
+    """Return the time of each filtered sample of a log, (T,) [s].
+
+    Filtered samples (`case.samples`) have no times, and other rows than the log. A copy of the log that has the time as
+    torque is therefore filtered in the same way: the filtered torque is then the time. pauses: True if ``samples``
+    include samples at standstill.
+    """
     clock = np.repeat(log.t[:, None] - log.t[0], log.q.shape[1], axis=1)
     marked = dataclasses.replace(log, tau=clock)
     same = case.samples(marked, pauses=pauses)
@@ -271,12 +282,12 @@ def contacts(case: Case, theta: np.ndarray | None = None) -> None:
 
 
 def linear_bound(case: Case, before: float = 0.3, after: float = 0.15) -> None:
-    """Print the share of steps of 10 % of effort that a matched filter with the known waveform finds, per alarm rate.
+    """Print the share of torque steps that a matched filter detects, per rate of false alarms: a bound of detection.
 
-    The filter of a joint is the generalised least-squares estimate of a step of torque `after` [s] ago, from the
-    residuals of the momentum balance since the step and during `before` [s] before the step. Its covariance and its
-    threshold are estimated from the test logs themselves: no linear detector of one joint with a constant threshold
-    and this delay finds more. The alarm rate is divided equally among the joints.
+    A step is 10 % of the joint's effort limit. The filter is the generalised least-squares estimate of a step that
+    began `after` [s] ago, from the residuals of the momentum balance since then and during `before` [s] before. Its
+    covariance and threshold are estimated from the test logs themselves, so that no linear detector of one joint with
+    a constant threshold and this delay detects more. The rate of false alarms is divided equally among the joints.
     """
     model, effort, outputs = torque_model(case.fit), case.levels.effort, []
     for log in case.tests:

@@ -1,19 +1,22 @@
-"""Draw faults of the geometry of logs, and count how often `spelgen logs` names the fault.
+"""Simulate logs with random faults of columns, zeros, units or clocks, and count how often `spelgen logs` names them.
 
     python benchmarks/log_geometry.py [--arms rpr,ur10e] [--folder ../shared/arms] [--draws 3] [--faults 12] [--first 0]
                                       [--out runs/log_geometry.jsonl]
 
-Every draw is an arm with inertials 30 % wrong in the URDF, friction of one of five kinds, noise of 0.5 to 5 % of the
-torques, and 20 s of excitation or pick-and-place. The log is checked unchanged, and with single random faults:
-the sense of a joint's position, torque or both, an order of all columns or of the torques, a zero offset (a multiple of
-90 degrees, or any), another gravity than the settings state, angles in revolutions or degrees, and the motion, the
-torque or all signals of a joint logged 40 to 140 ms late or early, and a joint's clock that runs 0.4 to 1.4 % fast or
-slow.
+--draws logs per arm are simulated, with the seeds --first, --first + 1, ... Every log has 20 s of excitation or
+pick-and-place, torque noise of 0.5 to 5 %, and friction of one of five kinds. The inertials in the given URDF have
+errors of 30 %. Each log is checked without a fault, and then --faults times, each time with one random fault:
 
-A reading is a hypothesis on the meaning of a log's columns (`Hypothesis`); the right reading undoes the fault. A fault
-is `named` if the first reading that `spelgen logs` lists is the right one, `with others` if a later one is, `wrong` if
-all are wrong. If no reading is listed, the fault is `invisible` if the evidence for the right reading is below the
-threshold even with the inertials of the true arm (a vertical first axis, a symmetric wrist); otherwise it is not found.
+- the sign of a joint's position, of its torque, or of both is reversed;
+- all columns are permuted, or only the torques, or two torques are exchanged;
+- the zero of a joint is offset by a multiple of 90 degrees, or by any angle;
+- the direction of gravity in the settings is wrong, or angles are in revolutions or degrees;
+- the motion, the torque or all signals of a joint are 40 to 140 ms late or early, or its clock is 0.4 to 1.4 % off.
+
+`spelgen logs` lists hypotheses about the log (`Hypothesis`), the best first; the right hypothesis corrects the fault. A
+fault is `named` if the first hypothesis is the right one, `with others` if a later one is, `wrong` if none is. If no
+hypothesis is listed, the fault is `invisible` if even with the true inertials the evidence for the right hypothesis is
+too small, for example for the zero of a vertical first axis or of a symmetric wrist; otherwise it is not found.
 
 Results are appended to a file of JSON lines; a run continues where it stopped, and the tables include all rows.
 """
@@ -64,7 +67,11 @@ RESULTS = ("named", "with others", "invisible", "missed", "wrong")
 
 
 def draw_log(urdf: Path, number: int, folder: Path) -> tuple[Case, Arm, Arm, list[Trajectory]]:
-    """Return a random case of an arm, the arm with wrong inertials, the true arm, and the logs of the true arm."""
+    """Return the random conditions of logs, the arm with wrong inertials, the true arm, and the logs of the true arm.
+
+    urdf: file of the true arm. number: seed of all random values, such as friction, motion and noise. folder: the URDF
+    with wrong inertials and a copy of the settings are written to it.
+    """
     rng = np.random.default_rng([number, *urdf.stem.encode()])
     case = Case(
         number=number,
@@ -100,7 +107,7 @@ def samples_of(arm: Arm, logs: Sequence[Trajectory]) -> MotionSamples:
 
 
 def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
-    """Return a random fault of a kind of `KINDS`, as the reading that undoes it (see the module)."""
+    """Return a random fault of a kind of `KINDS`, as the hypothesis that corrects it."""
     right, n = Hypothesis.unchanged(arm), len(arm.coordinates)
     joint, present = np.eye(n)[rng.integers(n)], right.source[0]
     order, pair = rng.permutation(n), present.copy()
@@ -137,7 +144,7 @@ def draw_fault(arm: Chain, kind: str, rng: np.random.Generator) -> Hypothesis:
 
 
 def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
-    """Return the log with the fault that the reading `right` undoes: the inverse of the reading."""
+    """Return the log with the fault that the hypothesis `right` corrects, by the inverse of the correction."""
     n = len(right.offset)
     motion, torque = np.argsort(right.source)
     columns = [(log.q - right.offset) / right.scale[0], log.qd / right.scale[0], log.tau / right.scale[1]]
@@ -149,16 +156,16 @@ def wrong_log(log: Trajectory, right: Hypothesis) -> Trajectory:
 
 
 def compared(problem: GeometryProblem) -> list[HypothesisFit]:
-    """Return the readings of a log that explain its torques better than the unchanged one, the best first."""
+    """Return the hypotheses that explain the torques of a log better than the unchanged log does, the best first."""
     units = [PositionUnit(position_factors(problem.arm, problem.unchanged.scale[0]))]
     faults = kinds_of_faults(problem.arm, units)
     return list(compare_hypotheses(problem, faults)[1:])
 
 
 def is_same(one: Hypothesis, other: Hypothesis) -> bool:
-    """Return True if two readings of a log's columns agree up to the tolerances and to a delay of the whole log.
+    """Return True if two hypotheses about a log agree within tolerances. A common delay of all signals is ignored.
 
-    The tolerances are `NEAR` and `NEAR_DELAY`.
+    The tolerances are `NEAR` for offsets [rad] and for gravity (relative), and `NEAR_DELAY` for delays [s].
     """
     turn = np.angle(np.exp(1j * (one.offset - other.offset)))
     delay, drift = one.delay - other.delay, one.drift - other.drift
@@ -174,7 +181,11 @@ def is_same(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right: Hypothesis) -> str:
-    """Return the result of `spelgen logs` for the fault that the reading `right` undoes: one of `RESULTS`."""
+    """Apply a fault to logs, and return the result of `spelgen logs` for them: one of `RESULTS` (see the module).
+
+    arm: given arm, with wrong inertials. true: arm of the logs. logs: logs without the fault. kind: kind of the fault,
+    of `KINDS`. right: hypothesis that corrects the fault; the fault is the inverse of this correction.
+    """
     drives, chain, ideal = arm.actuation.drives(), arm.chain, true.chain
     if kind == "gravity":  # the fault is in the settings, which state another gravity; the log is right
         chain, ideal = replace(chain, gravity=right.gravity), replace(ideal, gravity=right.gravity)
@@ -189,7 +200,9 @@ def result_of(arm: Arm, true: Arm, logs: Sequence[Trajectory], kind: str, right:
     if named:
         return "wrong"
     visible = unchanged.cost - mended.cost > GEOMETRY.needed
-    if kind.startswith("zero"):  # a zero offset is visible only if no other inertials explain it
+    # Other inertials may explain the torques of an offset zero, which costs only prior probability. The zero is visible
+    # only if the right hypothesis also lowers the misfit (contribution of the torque residual to the cost) enough.
+    if kind.startswith("zero"):
         visible &= unchanged.misfit - mended.misfit > GEOMETRY.needed / 2
     return "missed" if visible else "invisible"
 
@@ -207,7 +220,10 @@ class Row:
 
 
 def rows_of(urdf: Path, number: int, faults: int) -> Iterator[Row]:
-    """Yield the result of a random log of an arm without a fault, then the results with `faults` single faults."""
+    """Yield the result for one random log without a fault, then for the same log with each of `faults` random faults.
+
+    number: seed of the log and of the faults. Random faults that change nothing within tolerances are omitted.
+    """
     with tempfile.TemporaryDirectory() as folder:
         case, arm, true, logs = draw_log(urdf, number, Path(folder))
     log = (urdf.stem, number, case.motion, case.noise)
@@ -243,7 +259,7 @@ def print_tables(rows: Sequence[Row]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Draw logs and faults, append the result of each to the file of results, and print the tables of all rows."""
+    """Check random logs with random faults, append the results to a file, and print tables of all its results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--arms", default=",".join(OWN + OTHERS))
     parser.add_argument("--folder", type=Path, default=Path("../shared/arms"))

@@ -19,7 +19,8 @@ RIPPLE_PERIODS = (
     100,
     160,
 )  # periods of torque ripple per revolution of a joint: eccentric bearings, gear teeth, motors
-CABLE_BREAKAWAY = (0.05, 0.5)  # [rad, m] displacement at which the hysteresis of a cable saturates
+# [rad, m] lowest and highest displacement at which the hysteresis of a cable saturates; each joint has a random value
+CABLE_BREAKAWAY = (0.05, 0.5)
 CURRENT_CORRELATION = 0.01  # [s] correlation time of the noise of the motor current
 BACKLASH_TORQUE = (
     0.05  # [1] torque at which gears change the tooth flank, relative to the torque's standard deviation
@@ -41,10 +42,11 @@ class RealErrors:
     encoder_step: float = 0.0  # [rad, m] resolution of positions
     sensor_cutoff: float = np.inf  # [Hz] cutoff of the first-order low-pass of the torque signal
     current_noise: float = 0.0  # [1] noise of the motor current, relative to the torque's standard deviation
-    slow_noise: float = 0.0  # [1] slow torque errors of other causes, relative to the torque's deviation
+    # [1] torque noise with the correlation time `slow_correlation`, relative to the torque's standard deviation
+    slow_noise: float = 0.0
     slow_correlation: float = 0.0  # [s] correlation time of `slow_noise`
-    gain: float = 0.0  # [1] relative standard deviation of the torque's unit, per joint
-    zero: float = 0.0  # [rad, m] standard deviation of the zero of positions, per joint
+    gain: float = 0.0  # [1] standard deviation of log(logged torque / true torque), one factor per joint
+    zero: float = 0.0  # [rad, m] standard deviation of the zero offset of logged positions, per joint
 
 
 def draw_errors(rng: np.random.Generator) -> RealErrors:
@@ -74,7 +76,11 @@ def draw_errors(rng: np.random.Generator) -> RealErrors:
 
 
 class ErrorProcess:
-    """Errors of a simulated arm with n joints, from their levels and random phases, periods and factors per joint."""
+    """Errors of a simulated arm with n joints, from their levels and random phases, periods and factors per joint.
+
+    gain: (n,) factors from true to logged torques [1]. zero: (n,) zero offsets of logged positions [rad, m]. cable:
+    (n,) magnitude of the hysteretic friction of cables [Nm, N].
+    """
 
     def __init__(self, errors: RealErrors, dry: np.ndarray, rng: np.random.Generator) -> None:
         """Draw the phases, periods and factors of the errors per joint; dry: (n,) nominal dry friction [Nm, N]."""
@@ -105,9 +111,9 @@ class ErrorProcess:
         return np.asarray(self._ripple * np.sin(self._periods * q + self._ripple_phase))
 
     def hysteresis(self, q: np.ndarray) -> np.ndarray:
-        """Return the friction of cables, (T, n) [Nm, N], along positions q (T, n) [rad, m].
+        """Return the hysteretic friction of cables, (T, n) [Nm, N], along positions q (T, n) [rad, m].
 
-        Long after a reversal its magnitude is `cable`, (n,).
+        Far from the last reversal its magnitude is the attribute `cable`.
         """
         return self.cable * play(q, self._breakaway) if self.cable.any() else np.zeros_like(q)
 
@@ -116,7 +122,7 @@ class ErrorProcess:
 
         Args:
             torque: (T, n) [Nm, N] that deflects the elastic joint.
-            inertia: (n,) [kg m^2, kg] of the link; with it the joint's stiffness has the `resonance` of the errors.
+            inertia: (n,) [kg m^2, kg] of the link. The stiffness of the joint is inertia (2 pi resonance)^2.
         """
         twist = torque / (inertia * (2 * np.pi * self.errors.resonance) ** 2)
         if self.errors.backlash:
@@ -127,7 +133,7 @@ class ErrorProcess:
     def sensed(self, torque: np.ndarray, rate: float, rng: np.random.Generator) -> np.ndarray:
         """Return the sensor's signal of a torque, both (T, n) [Nm, N]: low-passed, with correlated noise.
 
-        rate: of the samples [Hz].
+        rate: sample rate [Hz].
         """
         errors, seen = self.errors, torque
         if np.isfinite(errors.sensor_cutoff):

@@ -1,12 +1,11 @@
-"""Errors on real logs, compared with published baselines: every figure of docs/real_logs.md in one command.
+"""Errors on real logs, compared with published baselines: all numbers of docs/real_logs.md in one command.
 
     python benchmarks/real_logs.py [FOLDER]
 
 FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. Torque errors are nMSE (mean
 squared error divided by the torque's variance, mean over joints), once over the moving samples and once with the pauses
-between motions; the published figures of the baselines include pauses. Nothing is chosen here: the settings are
-the defaults of spelgen, and fits are made by `spelgen train`, with the delay of torques that it finds; least squares
-has the same samples.
+between motions; the published errors of the baselines include pauses. All fits have the default settings of `spelgen
+train`, which also estimates the delay of the torques. Least squares is fitted to the same samples.
 """
 
 from __future__ import annotations
@@ -128,7 +127,12 @@ def payload(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
-    """Print torque errors on other days' tests: as trained, and with friction or torque offsets adapted to each."""
+    """Print torque errors of the trained model, and of models adapted to each test recording, made on other days.
+
+    The first 10 s of a recording are used to refit friction and torque offsets (column "friction"), or all parameters,
+    as for another robot of the same type (column "another unit"). All errors are nMSE on the remainder of the
+    recording. logs: {name: recording}.
+    """
     print(
         "Friction and torque offsets fitted to the first 10 s of each, judged on the rest, pauses included\n"
     )
@@ -144,7 +148,10 @@ def other_days(fit: Fit, logs: dict[str, Trajectory]) -> None:
 
 
 def adapted(fit: Fit, log: Trajectory, adapt: Any) -> Fit:
-    """Return the fit with part of its parameters refitted to a log, as by `spelgen train --from`; adapt: which part."""
+    """Return a fit whose model is a copy of `fit.model`, adapted to a log, as by `spelgen train --from`.
+
+    adapt: parameters to refit: "load" (the last body), "friction" (friction and torque offsets) or "unit" (all).
+    """
     return spelgen.fit(copy.deepcopy(fit.model), log, spelgen.TorqueFit(adapt=adapt), arm=fit.urdf)
 
 
@@ -235,7 +242,10 @@ def trained(urdf: Path, logs: Sequence[Trajectory], preset: str = "closed-form")
 
 
 def samples_of(fit: Fit, logs: Sequence[Trajectory], *, pauses: bool = False) -> list[DynamicsSamples]:
-    """Return the filtered torque samples of logs, as `spelgen train` and `evaluate` use them."""
+    """Return the filtered torque samples of logs, as `spelgen train` and `evaluate` use them.
+
+    pauses: if True, samples at standstill between motions are included.
+    """
     reach = bristle_reach(fit.model)
     return dynamics_samples(logs, pauses=pauses, preprocessing=fit.preprocessing, reach=reach)
 

@@ -80,7 +80,8 @@ UR10E_JOINTS = [
 ]
 # [Nm/A] drive gains that the authors of the logs identified
 UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])
-UR10E_LOGS = {  # path of a log without "ur-" and suffix: its rows that the authors use
+# {folder and name of a log: rows that the authors of the data use}; the file is FOLDER/ur-NAME.csv for "FOLDER/NAME"
+UR10E_LOGS = {
     "identification_data/19_12_23_free": slice(None),
     "identification_data/20_01_13-load_2600": slice(None),
     "identification_data/20_01_31-load": slice(None),
@@ -250,7 +251,10 @@ class Arrays(pickle.Unpickler):
 
 
 def delan_characters(read: Read, folder: Path) -> None:
-    """Write the arrays of the simulated arm that draws characters, of Deep Lagrangian Networks; dt 0.04 s."""
+    """Write the data set of Deep Lagrangian Networks, a simulated arm that draws characters, as an NPZ file.
+
+    The sample interval is 0.04 s. read: function that returns the bytes of a file in the repository of the data set.
+    """
     content = Arrays(io.BytesIO(read("data/character_data.pickle"))).load()
     arrays = {"labels": np.array(content["labels"])}
     for name in sorted(content.keys() - {"labels"}):
@@ -400,7 +404,10 @@ def reader(repository: Repository, clones: Path) -> Read:
 
 
 def make(name: str, folder: Path, clones: Path) -> None:
-    """Write the recordings and the URDF of one source into its own folder."""
+    """Write the recordings and the URDF of one arm into the subfolder `name` of `folder`.
+
+    name: key of `SOURCES`. clones: folder of the cloned repositories; a repository is cloned if it is not there.
+    """
     source, target = SOURCES[name], folder / name
     target.mkdir(parents=True, exist_ok=True)
     source.make(reader(source.repository, clones), target)
@@ -418,7 +425,10 @@ def folder_of(argument: str | Path | None) -> Path:
 
 
 def panda_urdf(folder: Path) -> Path:
-    """Return the URDF of the Panda: in the folder of its recording, or in a folder of arms next to the recordings."""
+    """Return the file of the Panda's URDF. folder: folder of all recordings, with a subfolder per arm.
+
+    It is panda/panda.urdf in the folder, or arms/panda_erd.urdf next to the folder if the former does not exist.
+    """
     urdf = folder / "panda" / "panda.urdf"
     return urdf if urdf.exists() else folder.parent / "arms" / "panda_erd.urdf"
 

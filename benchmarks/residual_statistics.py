@@ -2,9 +2,10 @@
 
     python benchmarks/residual_statistics.py [FOLDER]
 
-FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The residual is from least
-squares with bristle states, in the training samples of each documented split; it does not depend on the fit of the
-presets. `benchmarks/truth.py` prints the same figures of its simulated arms for comparison.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The arms are identified by least
+squares, with friction that has bristle states, from the training recordings of each documented split
+(docs/real_logs.md). The residual is the torque error on the same recordings. Fits of the presets, such as `hybrid`, are
+not used. `benchmarks/truth.py` prints the same statistics of simulated arms for comparison.
 """
 
 from __future__ import annotations
@@ -84,7 +85,11 @@ def residual_statistics(
 
 
 def of_recordings(folder: Path) -> dict[str, ResidualStatistics]:
-    """Return the statistics of the training residual per documented split, after least squares with bristle states."""
+    """Return {split: statistics of the torque residual of least squares with bristle states} on training recordings.
+
+    folder: folder of recordings. The splits are described in docs/real_logs.md; a split whose trajectories are all
+    shorter than 4 s is omitted.
+    """
     from leaderboard import Problem, by_least_squares, folds
 
     found = {}
@@ -100,7 +105,7 @@ def of_recordings(folder: Path) -> dict[str, ResidualStatistics]:
 
 
 def table(rows: dict[str, Sequence[float]]) -> str:
-    """Return rows of statistics (`ResidualStatistics.columns`) by name as an aligned text table."""
+    """Return a table with the head `HEAD` as aligned text. rows: {name of a row: `ResidualStatistics.columns`}."""
     lines = [f"{'':34}" + "".join(f"{x:>{max(9, len(x) + 2)}}" for x in HEAD)]
     for name, columns in rows.items():
         cells = (f"{x:{max(9, len(head) + 2)}.2f}" for x, head in zip(columns, HEAD, strict=True))

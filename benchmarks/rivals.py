@@ -100,7 +100,7 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         def set_drive(changed: Any, parameter: Any, name: str = name) -> None:
             joint = changed.joint(name)
             damping, joint.frictionloss, joint.armature = parameter.value
-            joint.damping = [damping, 0.0, 0.0]  # damping coefficients of qd, |qd| and qd^2
+            joint.damping = [damping, 0.0, 0.0]  # (d0, d1, d2) of the torque (d0 + d1 |qd| + d2 qd^2) qd
 
         parameters.add(
             sysid.Parameter(
@@ -110,7 +110,10 @@ def mujoco_sysid(problem: Problem) -> Prediction:
     parameters.add(sysid.Parameter("offset", 0 * scale, -10 * scale, 10 * scale))
 
     def torque(x: DynamicsSamples, values: Any) -> np.ndarray:
-        """Return MuJoCo's inverse dynamics of samples with parameters `values`, plus the offset, (T, n) [Nm]."""
+        """Return the torque by MuJoCo's inverse dynamics plus the torque offset of each joint, (T, n) [Nm].
+
+        x: samples. values: `ParameterDict` of inertias, drive constants and offsets.
+        """
         changed = sysid.apply_param_modifiers(values, spec.copy())
         data, rows = mujoco.MjData(changed), []
         for q, qd, qdd in zip(x.q, x.qd, x.qdd, strict=True):
@@ -120,7 +123,12 @@ def mujoco_sysid(problem: Problem) -> Prediction:
         return np.array(rows) + values["offset"].value
 
     def residual(x: np.ndarray, values: Any) -> tuple[list[np.ndarray], None, None]:
-        """Return the scaled torque residuals (S, k) of k parameter vectors, the columns of x; S: samples x joints."""
+        """Return [residuals], None, None for k parameter vectors; `sysid.optimize` needs a result of this form.
+
+        x: (P, k), a parameter vector per column; or (P,). values: `ParameterDict` of `sysid`, overwritten with each
+        vector. residuals: (S n, k) or (S n,) [1], torque residuals of S samples and n joints, divided by `scale`, the
+        standard deviation of each joint's torque.
+        """
         columns = []
         for vector in x.reshape(len(x), -1).T:
             values.update_from_vector(vector)
@@ -134,7 +142,8 @@ def mujoco_sysid(problem: Problem) -> Prediction:
 def _set_inertia(body: Any, parameters: np.ndarray) -> None:
     """Set the inertia of a body of an MjSpec from its parameters (13,): m, m c, and I about the origin, 3 x 3.
 
-    It replaces sysid 4.0.0's own function, which sets the orientation to NaN; MuJoCo 4.0.0 rejects it.
+    The function of mujoco.sysid 4.0.0 for this purpose sets the orientation to NaN, and MuJoCo 4.0.0 rejects such a
+    body.
     """
     mass, moment, inertia = parameters[0], parameters[1:4], parameters[4:].reshape(3, 3)
     center = moment / mass
@@ -158,15 +167,21 @@ class InverseDynamicsKernel(nn.Module):
         n = len(revolute)
         self.revolute, self.joint = revolute, joint
         self.motion = nn.Parameter(torch.zeros(1 + n + n * (n + 1) // 2).double())
-        # small initial weights of cos q and sin q, as the product of the kernels over all joints has degree 2 n
+        # (2, n, 3) logarithms of the weights of 1, cos q and sin q. The kernel k2 of degree two is the product of two
+        # kernels of degree one, each with its own weights per joint. The product of k2 over n joints has degree 2 n:
+        # the initial weights of cos q and sin q are small, since otherwise the highest powers would dominate.
         self.position = nn.Parameter(torch.tensor([0.0, -3.0, -3.0]).double().repeat(2, n, 1))
         self.friction = nn.Parameter(torch.full((3,), -2.0).double())
         self.noise = nn.Parameter(torch.tensor(-4.0).double())
 
     def features(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the features of a motion (T, n): a, (T, A), of positions c, (T, n, 3), and of friction f, (T, 3).
+        """Return the features a (T, A), c (T, n, 3) and f (T, 3) of the kernel k (see the class) along a motion.
 
-        The symbols are the class's.
+        - a = (1, qdd, qd_i qd_j for i <= j), of all joints.
+        - c = (1, cos q, sin q) per turning joint, (1, q, 0) per sliding joint.
+        - f = (1, qd, tanh(qd / `SMOOTHING`)) of the joint whose torque is modelled.
+
+        q, qd, qdd: (T, n) each.
         """
         row, column = torch.triu_indices(q.shape[1], q.shape[1])
         one = torch.ones_like(q[:, :1])
@@ -187,16 +202,24 @@ class InverseDynamicsKernel(nn.Module):
 
 
 def gaussian_process(problem: Problem) -> Prediction:
-    """Fit a Gaussian process per joint, hyperparameters by maximum marginal likelihood; return mean and deviation."""
+    """Fit a Gaussian process per joint; return the mean and the standard deviation of its torque predictions.
+
+    The hyperparameters maximize the marginal likelihood of a subset of the samples.
+    """
     revolute = [kind == "revolute" for kind in problem.arm.chain.joint_types]
     training, fitted = subset(problem.samples, GP_SAMPLES), subset(problem.samples, GP_TRAINING)
     deviation = [np.maximum(getattr(training, k).std(axis=0), 1e-9) for k in ("qd", "qdd")]
     mean, scale = training.tau.mean(axis=0), np.maximum(training.tau.std(axis=0), 1e-9)
 
     def inputs(x: DynamicsSamples) -> tuple[Tensor, Tensor, Tensor]:
-        """Return positions, scaled velocities and scaled accelerations of samples, each (T, n)."""
+        """Return q, qd / s_v and qdd / s_a of samples, (T, n) each.
+
+        s_v and s_a are the standard deviations of velocity and acceleration in the training, each of the joint with the
+        largest one.
+        """
         q, qd, qdd = tensors(x)
-        # one scale of velocities and one of accelerations for all joints, as products of velocities mix joints
+        # The scales are common to all joints: the kernel has products of the velocities of two joints (Coriolis terms),
+        # whose relative magnitudes a scale per joint would change.
         return q, qd / float(deviation[0].max()), qdd / float(deviation[1].max())
 
     processes: list[tuple[InverseDynamicsKernel, tuple[Tensor, ...], Tensor, Tensor]] = []
@@ -215,7 +238,7 @@ def gaussian_process(problem: Problem) -> Prediction:
         processes.append((kernel, many, factor, weights))
 
     def moments(x: DynamicsSamples) -> np.ndarray:
-        """Return the mean and the standard deviation of the torque at samples, (2, T, n) [Nm, N]."""
+        """Return the predictive mean and standard deviation of the torque at samples, (2, T, n) [Nm, N]."""
         parts = [
             _moments(process, inputs(x[k : k + 2000]))
             for k in range(0, len(x.q), 2000)
@@ -248,11 +271,11 @@ def _negative_log_likelihood(kernel: InverseDynamicsKernel, x: tuple[Tensor, ...
 
 
 def _moments(process: tuple[Any, ...], inputs: tuple[Tensor, Tensor, Tensor]) -> np.ndarray:
-    """Return the mean and the standard deviation, noise included, of a joint's scaled torque, (2, T).
+    """Return the predictive mean and standard deviation, noise included, of a joint's standardized torque, (2, T).
 
     Args:
         process: kernel, training features, Cholesky factor of the training covariance, and weights of the mean.
-        inputs: q, and scaled qd and qdd, (T, n) each.
+        inputs: q, qd and qdd, (T, n) each; qd and qdd divided by their scales (see `gaussian_process`).
     """
     kernel, many, factor, weights = process
     with torch.no_grad():
@@ -288,7 +311,7 @@ def network(training: Sequence[DynamicsSamples], known: Torque | None = None) ->
     residuals = [x.tau if known is None else x.tau - known(x) for x in training]
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
-        """Return a new network, and the function from q, qd and qdd (T, n) to scaled torques (T, n)."""
+        """Return a new network, and the function from q, qd and qdd (T, n) to standardized torques (T, n)."""
         layers = mlp(inputs.shape[1], residuals[0].shape[1], settings.width, nn.Tanh)
         return layers, lambda q, qd, qdd: layers((torch.cat([q, qd, qdd], dim=-1) - mean) / scale)
 
@@ -319,10 +342,13 @@ class DeepLagrangian(nn.Module):
         return lower @ lower.mT + 1e-3 * torch.eye(q.shape[-1]).double()
 
     def forward(self, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-        """Return the scaled torque, (..., n), of a motion q, qd, qdd (..., n)."""
+        """Return the standardized torque along q, qd, qdd, (..., n) each: (torque - mean) / standard deviation.
+
+        Mean and standard deviation are of each joint's torque in the training samples (see `best_of`).
+        """
 
         def lagrangian(x: Tensor) -> Tensor:
-            """Return the Lagrangian T - V at positions x (..., n) and velocities qd, summed over the batch."""
+            """Return the Lagrangian T - V at positions x (..., n) and at qd of `forward`, summed over the batch."""
             kinetic = 0.5 * torch.einsum("...i,...ij,...j->...", qd, self.mass(x), qd)
             return (kinetic - self.potential(torch.cat([x.cos(), x.sin()], dim=-1))[..., 0]).sum()
 
@@ -336,7 +362,7 @@ def deep_lagrangian(training: Sequence[DynamicsSamples]) -> Torque:
     """Return the torque of a Deep Lagrangian network that is fitted to the training torques."""
 
     def make(settings: NetworkSettings) -> tuple[nn.Module, Callable[..., Tensor]]:
-        """Return a new network, and the function from q, qd and qdd (T, n) to scaled torques (T, n)."""
+        """Return a new network, and the function from q, qd and qdd (T, n) to standardized torques (T, n)."""
         model = DeepLagrangian(training[0].q.shape[1], settings.width)
         return model, model
 
@@ -395,8 +421,8 @@ def early_stopped(
 
     Args:
         weights: module with the parameters.
-        model: function from q, qd and qdd (T, n) to scaled torques (T, n).
-        seen: q, qd, qdd and the scaled torque of training samples, (T, n) each.
+        model: function from q, qd and qdd (T, n) to standardized torques (T, n), of mean zero and variance one.
+        seen: q, qd, qdd and the standardized torque of training samples, (T, n) each.
         held: likewise, of held-out samples.
         decay: weight decay of AdamW.
     """

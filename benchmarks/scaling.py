@@ -7,9 +7,10 @@ The arms are chains of turning joints with alternating axes; one thread is used.
 First table: fits of closed-form models to torques at 100 Hz, each in its own process: processor time and peak memory,
 for 10,000 and 1,000,000 samples and for 8 and 16 joints.
 
-Second table: training steps on windows of 5 samples, rk4 with one step from sample to sample, forward and backward in
-double precision: windows per second, memory of the gradient's graph, and the exponent with which the time per window
-grows from an arm with half the joints. Times are medians.
+Second table: training steps (the loss of predicted windows of 5 samples, and its gradient) in double precision; rk4
+with one step from sample to sample. Columns: windows per second for several batch sizes, memory per window that
+autograd keeps for the gradient, and an exponent: log2(time per window with n joints / time with n/2 joints), so that 1
+means a time in proportion to n. Times are medians.
 """
 
 from __future__ import annotations
@@ -49,7 +50,10 @@ JOINT = """<joint name="j{k}" type="revolute"><parent link="l{before}"/><child l
 
 
 def main() -> None:
-    """Print the table of fits to torques and the table of steps on windows; with --fit only the cost of one fit."""
+    """Print time and memory of fits to torques, and of training steps (loss and gradient) on windows of samples.
+
+    With --fit, print only processor time [s] and peak memory [GB] of one fit.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--presets", default="closed-form,phnode,spel")
@@ -64,7 +68,10 @@ def main() -> None:
 
 
 def compare_fits() -> None:
-    """Print time and memory of fits to torques, and their growth with samples and joints compared with the goals."""
+    """Print time and memory of fits to torques, and the growth of the time with samples and joints.
+
+    Goals: 100 times the samples take at most 12 times as long, and 16 joints at most 3 times as long as 8.
+    """
     costs = {}
     for joints, samples in ((6, 10_000), (6, 1_000_000), (8, 20_000), (16, 20_000)):
         command = [sys.executable, __file__, "--fit", str(joints), str(samples)]
@@ -115,7 +122,10 @@ def _recorded(urdf: Path, samples: int) -> Trajectory:
 
 
 def compare_steps(arguments: argparse.Namespace) -> None:
-    """Print windows per second, memory per window and the exponent of growth, per preset and number of joints."""
+    """Print windows per second, memory per window [kB] and an exponent, per preset and number of joints n.
+
+    The exponent is log2(time per window with n joints / time per window with n / 2 joints).
+    """
     heads = "".join(f"{batch:>9}" for batch in BATCHES)
     print(f"{'windows/s at a batch of':24}{heads}  kB/window  exponent")
     for preset in arguments.presets.split(","):
@@ -174,7 +184,7 @@ def _memory(model: ArmModel) -> float:
         kept: dict[int, int] = {}
 
         def keep(x: torch.Tensor, kept: dict[int, int] = kept) -> torch.Tensor:
-            """Record the storage size of a tensor x, (...,), that autograd saves, and return it."""
+            """Add the storage of a tensor x that autograd saves to `kept`, {address: size [bytes]}; return x."""
             kept[x.untyped_storage().data_ptr()] = x.untyped_storage().nbytes()
             return x
 

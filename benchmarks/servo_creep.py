@@ -2,12 +2,14 @@
 
     python benchmarks/servo_creep.py ARM.urdf --train LOGS... --test LOGS... [--preset hybrid]
 
-A hold begins two seconds after a joint's command became constant and lasts a minute at most; other joints may move.
-Holds in which the measured position moves by more than one encoder step are omitted. Creep is the largest displacement
-from the position at the beginning of the hold; motions of other joints cause a little of it, measured and predicted.
-`measured at rest`: the largest predicted creep over holds in which the measured joint does not move at all, and their
-number. `beyond measured`: the largest difference between predicted and measured creep. The model is fitted to the
-training logs and predicts each log, training and test, from its first state.
+A hold is an interval in which the command of one joint is constant; other joints may move. It begins two seconds after
+the last change of the command, and lasts a minute at most. Creep is the largest displacement of the joint from its
+position at the beginning of the hold; motions of other joints cause a little of it. Holds with a measured displacement
+of more than one encoder step are omitted, since the joint has not stopped. The columns `measured` and `model` have the
+largest measured and predicted creep. `measured at rest` has the largest predicted creep over the holds in which the
+measured position is constant, and in brackets the number of these holds. `beyond measured` has the largest difference
+of predicted minus measured creep. The model is fitted to the training logs and predicts each log, training and test,
+from its first state.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ import spelgen
 from spelgen.evaluation.replay import ServoModel
 from spelgen.logs.trajectory import split_at_gaps
 
-# [s] from a constant command to the beginning of a hold; longest duration of a hold
+# A hold is an interval with a constant command of a joint. AT_REST: [s] time from the last change of the command to the
+# beginning of the hold. MINUTE: [s] longest duration of a hold.
 AT_REST, MINUTE = 2.0, 60.0
 SHORTEST = 5.0  # [s] shortest duration of a hold
 
@@ -44,11 +47,12 @@ def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
 
 
 def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
-    """Return (joint, largest measured displacement, largest predicted displacement) [rad] for each hold of a log.
+    """Return (joint, measured creep, predicted creep) [rad] for each hold of each joint in a log (see `holds`).
 
-    Holds with a measured displacement of more than an encoder step are omitted.
+    Creep is the largest displacement from the position at the beginning of the hold. Holds with a measured creep of
+    more than one encoder step are omitted, since the joint has not stopped.
 
-    q: (T, n) predicted positions [rad]. step: of the encoder [rad].
+    q: (T, n) predicted positions [rad]. step: resolution of the encoder [rad].
     """
     assert log.u is not None
     found = []

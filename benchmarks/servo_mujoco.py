@@ -1,12 +1,12 @@
-"""An arm under position servos in MuJoCo: as a simulated robot for other benchmarks, and as a rival of a fitted model.
+"""An arm under position servos in MuJoCo: a simulated robot for other benchmarks, and a rival of a fitted model.
 
     python benchmarks/servo_mujoco.py RUN --train LOGS... --test LOGS...
 
-MuJoCo's position actuators are how such an arm is usually simulated. kp, kv, armature and frictionloss of each joint,
-an offset of its commands and the delay are fitted to windows of the training logs, starting from the parameters of the
-run's model, by `mujoco.minimize`, the least squares of `mujoco.sysid`. The bodies are the URDF's, and dry friction has
-the stiffest constraint that MuJoCo allows, as `spelgen export --to mjcf` writes both. The actuators, the model and its
-other baselines then predict the positions of the test logs from their commands.
+Such an arm is usually simulated with MuJoCo's position actuators. The rival has the bodies of the URDF and these
+actuators. Its kp, kv, armature, frictionloss and command offset of each joint, and one delay, are fitted to windows of
+the training logs by `mujoco.minimize`, the least squares of `mujoco.sysid`. The initial values are the parameters of
+the run's model. Dry friction has the stiffest constraint that MuJoCo allows, as in the files of `spelgen export --to
+mjcf`. The rival, the run's model and its other baselines then predict positions of the test logs from the commands.
 """
 
 from __future__ import annotations
@@ -44,12 +44,13 @@ STEP = 5e-4  # [s] integration step of the simulated robot
 HARD = [2e-3, 1.0]
 # joint that models backlash: armature relative to its drive's armature [1], damping relative to kp [s]
 SHARE, DAMPING = 0.02, 2e-4
-# [s] largest integration step of fitted actuators; the time constant of frictionloss is twice this step
+# [s] Largest integration step of fitted actuators. MuJoCo limits the stiffness of frictionloss: the time constant of
+# this constraint is at least twice the integration step, here 10 ms.
 FIT_STEP = 5e-3
 # number of windows and of solver steps of the fit of actuators, which takes half a minute
 WINDOWS, ITERATIONS = 60, 8
 DIFFERENCE = 1e-4  # finite-difference step of the unknowns of the fit
-# bounds of the fit: change of log drives; offset [rad, m]; delay [s]
+# bounds of the fit: change of log(kp), log(kv), log(armature), log(frictionloss) [1]; offset [rad, m]; delay [s]
 LOG_RANGE, OFFSET_RANGE, MAX_DELAY = 4.0, 0.3, 0.4
 
 
@@ -101,11 +102,11 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
     """Simulate an arm with servos from rest at the first command; return the positions of its links, (T, n) [rad].
 
     Args:
-        model: of `arm_with_servos`; its servos control motor positions, before the backlash of the gears.
+        model: result of `arm_with_servos`; its servos control motor positions, before the backlash of the gears.
         joints: names of the n driven joints.
         u: (T, n) commands [rad].
         dt: time between commands and between positions [s].
-        delay: of the commands [s].
+        delay: delay of the commands [s].
     """
     data = mujoco.MjData(model)
     drive = [model.joint(x).qposadr[0] for x in joints]
@@ -126,8 +127,10 @@ def positions(model: mujoco.MjModel, joints: list[str], u: np.ndarray, dt: float
 class PositionActuators:
     """Predictor of positions from commands: MuJoCo's position actuators on an arm with n joints and n bodies.
 
-    untrained: model with the URDF's inertias. drives: kp, kv, armature and frictionloss, (4, n). The actuators get the
-    command of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+    The actuators get the command of ``delay`` [s] ago plus ``offset`` (n,) [rad, m].
+
+    untrained: unfitted spelgen model, for the inertias of the URDF and the torque limits. drives: (4, n), the rows are
+    kp [Nm/rad, N/m], kv [Nm s/rad, N s/m], armature [kg m^2, kg] and frictionloss [Nm, N].
     """
 
     arm: Chain
@@ -137,10 +140,10 @@ class PositionActuators:
     delay: float
 
     def positions(self, segments: Sequence[LogRows], q: np.ndarray, qd: np.ndarray) -> list[np.ndarray]:
-        """Return the predicted positions (T, n) [rad, m] after the first row of each part of a log.
+        """Return the predicted positions (T, n) [rad, m] of each segment, without its first row.
 
         Args:
-            segments: logs and the rows of each to predict, from their commands.
+            segments: pairs of a log and the rows of it to predict; the log has the commands.
             q: (segments, n) initial positions [rad, m].
             qd: (segments, n) initial velocities [rad/s, m/s].
         """
@@ -221,7 +224,8 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     if len(arm.chain.bodies) > n or (motors_of(trained).numpy() != np.eye(n)).any():
         sys.exit("got coupled joints, expected a motor for each joint and a joint for each body")
     servo, friction = trained.servo.prepare(), trained.friction.prepare()
-    # kv includes the joint's viscous friction: separately they would differ only while the torque is limited
+    # kv is kd of the servo plus viscous friction of the joint. Only their sum affects the motion unless the actuator is
+    # at its torque limit, which applies to kd but not to viscous friction.
     rows = servo.kp, servo.kd + friction.viscous, trained.armature, friction.coulomb
     start = np.stack([row.detach().numpy() for row in rows])
     is_known = trained.servo.trained.numpy() == 0
@@ -232,14 +236,20 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
     q, qd = windows.q.numpy(), windows.qd.numpy()
 
     def actuators(x: np.ndarray) -> PositionActuators:
-        """Return the actuators for unknowns x (5 n + 1,): logarithms of 4 n drives, n command offsets, the delay."""
+        """Return the actuators for unknowns x, (5 n + 1,).
+
+        x: logarithms of kp, kv, armature and frictionloss of n joints, n command offsets [rad, m], and the delay [s].
+        """
         drives, offset = np.split(x[:-1].reshape(5, n), [4])
         drives = np.exp(drives)
         drives[0, is_known] = start[0, is_known]
         return replace(initial, drives=drives, offset=offset[0], delay=float(x[-1]))
 
     def errors(x: np.ndarray) -> np.ndarray:
-        """Return the position errors, (samples n,), after the burn-in of each window, for unknowns x (5 n + 1,)."""
+        """Return predicted minus measured positions of S samples, (S n,) [rad, m], for unknowns x (see `actuators`).
+
+        The first samples of each window, its burn-in, are omitted.
+        """
         candidate = actuators(x)
         model = candidate.model()
         model.opt.timestep = 1 / windows.rate / steps
@@ -248,13 +258,15 @@ def fit_position_actuators(arm: Arm, windows: ServoWindows, trained: ArmModel) -
         return error[:, windows.burn_in :].ravel()
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Return the position errors, (samples n, C), for C vectors of unknowns, the columns of x (5 n + 1, C)."""
+        """Return the position errors of S samples, (S n, C), for C vectors of unknowns, the columns of x."""
         return np.stack([errors(column) for column in x.T], axis=1)
 
     def jacobian(x: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Return the derivative of the position errors by finite differences, (samples n, 5 n + 1).
+        """Return the derivative of the position errors of S samples with respect to x, (S n, 5 n + 1).
 
-        An unknown such as kp is changed at all joints at once: its effect on other joints is small and neglected.
+        It is computed by finite differences. Each of the five parameters per joint, such as log(kp), is changed at all
+        joints at once: the effect of a joint's parameter on other joints is small and neglected. The last column is for
+        the delay. residuals: (S n, 1), errors at x. x: (5 n + 1, 1) unknowns (see `actuators`).
         """
         derivatives = np.zeros((len(residuals) // n, n, len(x)))
         for columns in (*np.arange(5 * n).reshape(5, n), 5 * n):

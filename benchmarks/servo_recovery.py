@@ -1,12 +1,13 @@
-"""Ratios to kp from fits of servos to simulated arms, compared with the true ratios; fits use the URDF and the logs.
+"""Servo parameters relative to kp, fitted to logs of simulated arms and compared with the true parameters.
 
     python benchmarks/servo_recovery.py ARM.urdf [--seeds 40] [--seconds 16] [--mujoco [--backlash 0.0025]]
 
-For each seed three recordings at 50 Hz (other commands, the same arm: servos, armatures, dry friction, delay, encoders
-of twelve bits, the URDF's effort limits, a dead zone of the servos with --dead-zone) are fitted as
-`spelgen train` does, and the truth is compared with the 95 % intervals. The arm is integrated in this file by
-semi-implicit Euler in steps of a millisecond, with dry friction as impulses, and M and bias of the URDF.
-With --mujoco MuJoCo simulates the arm; gears may have backlash then, with a mass on the side of the motor.
+The ratios are kd, armature, dry friction, dead zone and static error (dry friction + dead zone), each relative to kp.
+For each seed three recordings at 50 Hz, with different commands, are fitted as in `spelgen train`, and the true ratios
+are compared with the 95 % intervals. The arm is the same for all seeds. It has servos with a delay and with the URDF's
+effort limits, armatures, dry friction, encoders of twelve bits, and with --dead-zone a dead zone of the servos. This
+file integrates M and bias of the URDF by semi-implicit Euler in steps of a millisecond, with dry friction as impulses.
+With --mujoco MuJoCo simulates the arm, and gears may have backlash between the armature and the link.
 """
 
 from __future__ import annotations
@@ -44,8 +45,11 @@ def commands(random: np.random.Generator, t: np.ndarray, n: int) -> np.ndarray:
 def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor) -> torch.Tensor:
     """Simulate an arm with servos from rest at the first command; return its positions, (B, T, n) [rad].
 
+    The gains kp and kd, armature, dry friction and delay of the servos are the constants of this file.
+
     Args:
-        model: of the rigid bodies.
+        model: model of the arm; only its bias torques and its M are used, M with the armatures of the true servos in
+            place of its own.
         u: (B, T, n) commands [rad] of B motions.
         dead_zone: position error below which servos give no torque [rad].
         limit: (n,) largest torque [Nm].
@@ -74,7 +78,10 @@ def simulated(model: Any, u: torch.Tensor, dead_zone: float, limit: torch.Tensor
 
 
 def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Trajectory]]:
-    """Yield per seed the logs of the simulated arm: commands, and positions rounded to encoder steps."""
+    """Yield, for each seed, `RECORDINGS` logs of the simulated arm: commands, and positions rounded to encoder steps.
+
+    The velocities are differences of these positions. asked: options of the command line.
+    """
     model = spelgen.build(arm, "closed-form")
     t = np.arange(0, asked.seconds, 1 / RATE)
     limit = torch.tensor([x.effort or float("inf") for x in arm.chain.coordinates]).double()
@@ -101,7 +108,7 @@ def recordings(arm: spelgen.Arm, asked: argparse.Namespace) -> Iterator[list[Tra
 def in_mujoco(
     urdf: Path, arm: spelgen.Arm, u: list[np.ndarray], limit: np.ndarray, backlash: float
 ) -> np.ndarray:
-    """Simulate the same servos in MuJoCo, with backlash of the gears; return positions, (B, T, n) [rad].
+    """Simulate the servos of `simulated` in MuJoCo, with backlash of the gears; return positions, (B, T, n) [rad].
 
     Args:
         urdf: file of the arm.
@@ -121,7 +128,7 @@ def in_mujoco(
 
 
 def main() -> None:
-    """Simulate and fit recordings per seed; print the errors of the ratios and the coverage of their intervals."""
+    """Simulate and fit recordings per seed; print errors of kd / kp and other ratios, and coverage of the intervals."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

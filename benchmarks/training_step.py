@@ -1,13 +1,14 @@
 """Times of a training step: every preset, compared with PHNODE and with only the networks of the preset.
 
-PHNODE has three rows: as published, with one automatic derivative of dM^-1/dt for each entry; with one jvp (a
-forward-mode derivative) in place of them, as a user who knows torch would write it; and as the preset `phnode`, with
-explicit derivatives.
+PHNODE is the port-Hamiltonian neural network of Duong et al. (IEEE T-RO 40:3695, 2024). It has three rows: `published`
+computes dM^-1/dt with an automatic derivative per entry of the matrix; `with jvp` computes it with one forward-mode
+derivative, as a user who knows torch would; the preset `phnode` has explicit derivatives.
 
-Six joints, 256 windows of 5 samples, hidden layers of 64 units, rk4 with one step from sample to sample, forward
-and backward (without the update of the weights). Medians of repeats, alternated in one run, on one thread. "bound" is
-the part of a step that keeps M positive definite: the time saved by a step without the bound.
-PHNODE as published has its windows in four parts: in one part its graph needs 9 GB and takes the same time.
+A step is the loss and its gradient, without the update of the weights: six joints, 256 windows of 5 samples, hidden
+layers of 64 units, rk4 with one step from sample to sample. Times are medians of repeats, alternated in one run, on one
+thread. The column "bound" is the share of a step's time that a step without the bound saves; the bound keeps M positive
+definite. `published` and `with jvp` divide the windows into four parts: the graph of all windows would need 9 GB, and
+the time would be the same.
 """
 
 from __future__ import annotations
@@ -147,7 +148,10 @@ def seconds(work: Callable[[], None]) -> float:
 
 
 def sizes(model: ArmModel) -> str:
-    """Return the number of outputs of the networks of M, D, G and V, and of inputs of the network of M, as text."""
+    """Return the numbers of outputs of a model's networks, and of inputs of the network of M, as text; "" without M.
+
+    The outputs are of the networks of M (mass matrix), D (friction), G (input matrix) and V (potential energy).
+    """
     if not hasattr(model, "mass"):
         return ""
     mass, friction = (getattr(part, "network", None) for part in (model.mass, model.friction))
@@ -167,7 +171,11 @@ def median(times: list[float]) -> float:
 
 
 def main() -> None:
-    """Print the table of training steps: times of each preset and of PHNODE, and ratios."""
+    """Print the time of a training step [ms] of each preset and of both published forms of PHNODE (see the module).
+
+    The columns "published /", "with jvp /" and "phnode /" have the time of this form of PHNODE divided by the time of
+    the row.
+    """
     torch.set_num_threads(1)
     torch.manual_seed(0)
     data = Data(WINDOWS)

@@ -10,16 +10,22 @@ preset, `hybrid`, least squares with Coulomb friction and with bristle states, a
 it is installed, are fitted to the same samples. Results are appended to a file of JSON lines; a run continues where it
 stopped. `--panda` adds a simulated Panda with 40 s of logs at 200 Hz and 3 % noise.
 
-A star marks the true value. M error: mean over positions of |M - M*| / |M*| (Frobenius norm), and the largest relative
-error of a diagonal entry; g error: root mean square error divided by the root mean square of g*; error of the base
-parameters: likewise, each parameter multiplied by its root mean square torque along the test motion; friction error:
-likewise, without offsets; torque nMSE on another motion without noise, unfiltered and after a low-pass of 8 Hz.
+The errors are measured along a test motion without noise. A star marks a true value, rms is the root mean square:
 
-Truth is the output of the sensors without noise: with errors of units and zeros, M*, g* and the torque are in units of
-the logged torques, at the logged positions, and the true base parameters are the least-squares solution for the rigid
-torque of the test motion (the pseudo-true parameters of a misspecified model; White, Econometrica 50:1, 1982). The
-motion is the motion of the links, with the zeros of the sensors: motors with backlash have peaks of acceleration, and a
-regression on these peaks has a bias that no fit to filtered logs has.
+- M: mean of |M - M*| / |M*| (Frobenius norm); also the relative error of each diagonal entry's mean, of which the
+  largest is printed;
+- g: rms(g - g*) / rms(g*);
+- base parameters b: |w (b - b*)| / |w b*|, with the weight w = rms of each parameter's column of the regressor;
+- friction f: rms(f - f*) / rms(f*), after the mean of each joint (the offset) is subtracted from f and f*;
+- torque: nMSE (mean squared error / variance of the torque, mean over joints), unfiltered and low-passed at 8 Hz.
+
+True values are values that sensors without noise would log. The sensors of some cases have wrong torque units (logged
+torque = gain * torque) and wrong zero positions (logged q = q + zero): M*, g* and torques are then gain * M(q - zero),
+and so on, at the logged q. No base parameters reproduce such torques exactly. The true base parameters are therefore
+the least-squares solution for the logged rigid torque of the test motion (the pseudo-true parameters of a misspecified
+model; White, Econometrica 50:1, 1982). Their regressor has the motion of the links plus the zero offsets. It does not
+have the motion of the motors, although encoders measure it: backlash causes peaks in the acceleration of motors, and a
+regression on these peaks has a bias that fits to filtered logs do not have.
 
 Intervals: 95 % intervals of the default preset, see `intervals.py`. Residuals: correlation and spectrum, compared with
 the residuals of recordings if their folder is given.
@@ -87,7 +93,7 @@ class Case:
 
     number: int
     arm: str
-    urdf_error: float  # [1] relative standard deviation of the given URDF's inertials; infinite: placeholders
+    urdf_error: float  # [1] relative standard deviation of the URDF's inertials; infinite: dummy inertials
     friction: str
     armature: bool
     offsets: bool
@@ -150,7 +156,7 @@ class Truth:
         self.spring = np.zeros(n)
         if case.springs:
             joint = rng.integers(n)
-            # the spring's torque has the sign of gravity torque at the spring's own joint
+            # the spring has the torque `spring` sin(q) at one joint, like gravity of a pendulum that hangs at q = 0
             self.spring[joint] = 0.3 * size[joint]
         self.asymmetry = 0.3 * rng.normal(size=n) * (case.friction == "asymmetric")
         self.load = np.abs(gravity + self.spring * np.sin(middle.numpy())).mean(axis=0)
@@ -161,19 +167,29 @@ class Truth:
         return self.bodies.mass_matrix(q).detach().numpy() - np.diag(self.nominal)
 
     def _rigid_torque(self, motion: Motion) -> np.ndarray:
-        """Return the inverse dynamics of the rigid bodies along a motion of the links, (T, n) [Nm, N]."""
+        """Return the torque of inertia, Coriolis and gravity of the rigid bodies without armatures, (T, n) [Nm, N].
+
+        motion: q, qd and qdd of the links, (T, n) each, on the link's side of elastic joints and gears.
+        """
         q, qd, qdd = motion
         with torch.no_grad():
             bias = self.bodies.nonlinear_effects(torch.from_numpy(q), torch.from_numpy(qd)).numpy()
         return np.einsum("tij,tj->ti", self._rigid_mass(torch.from_numpy(q)), qdd) + bias
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """Return M with armatures at logged positions q (T, n), in the unit of logged torques, (T, n, n)."""
+        """Return M with armatures at logged positions q (T, n), (T, n, n) [kg m^2, kg].
+
+        The row of each joint is multiplied by `gain`, the factor from its true torque to its logged torque.
+        """
         mass = self._rigid_mass(torch.from_numpy(q - self.process.zero)) + np.diag(self.armature)
         return self.process.gain[:, None] * mass
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Return the torque of gravity and springs at logged positions q (T, n), in units of logged torques, (T, n)."""
+        """Return the torque of gravity and springs as a sensor would log it, (T, n) [Nm, N].
+
+        It is the true torque times `process.gain`, the factor from true to logged torques. q: (T, n) logged positions
+        [rad, m], including zero offsets.
+        """
         return self.process.gain * self._gravity(q - self.process.zero)
 
     def _gravity(self, q: np.ndarray) -> np.ndarray:
@@ -181,13 +197,19 @@ class Truth:
         return own + self.spring * np.sin(q)
 
     def friction_torque(self, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-        """Return the friction torque along a motion of the motors, (T, n) at the rate `FINE`."""
+        """Return the true friction torque along a motion of the motors, (T, n) [Nm, N].
+
+        q, qd: (T, n) true positions and velocities at the rate `FINE`. Friction of bristles depends on past positions.
+        """
         if self.case.friction == "bristles":
             return self._friction(q, qd, play(q, BRISTLES))
         return self._friction(q, qd, np.tanh(qd / 1e-3))
 
     def _friction(self, q: np.ndarray, qd: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return viscous plus dry friction at positions and velocities, (T, n); direction: of dry friction, -1..1."""
+        """Return viscous plus dry friction at true positions and velocities, (T, n) [Nm, N].
+
+        direction: (T, n), dry friction relative to its magnitude while sliding, -1..1; fractions during a reversal.
+        """
         dry = self.coulomb * direction * self.process.friction_factor(q)
         if self.case.friction == "stribeck":
             dry = dry * (1 + 0.6 * np.exp(-((qd / 0.1) ** 2)))
@@ -196,7 +218,11 @@ class Truth:
         return self.viscous * qd + dry * (1 + self.asymmetry * direction)
 
     def sliding_friction(self, sliding: SteadySliding) -> np.ndarray:
-        """Return the friction of steady sliding in the unit of logged torques, (speeds, n): see `SteadySliding`."""
+        """Return the friction of steady sliding as a sensor would log it, (speeds, n) [Nm, N].
+
+        It is the true friction times `process.gain`, the factor from true to logged torques. sliding: speeds, and
+        logged positions over which friction is averaged.
+        """
         q = sliding.q - self.process.zero
         rows = []
         for speed in sliding.speeds:
@@ -208,18 +234,18 @@ class Truth:
     def sensed(
         self, motion: Motion, temperature: np.ndarray | float = 1.0
     ) -> tuple[Motion, np.ndarray, np.ndarray]:
-        """Return the motion, the torque and its friction torque, (T, n) each, of the motors as ideal sensors show them.
+        """Return the motion of the motors, their torque, and the friction in this torque, as logged without noise.
 
-        Ideal sensors have the errors of units and zeros of the case, and no noise.
+        All arrays are (T, n). Positions include the zero offsets of the case, torques are multiplied by its `gain`.
 
         Args:
-            motion: of the links, at the rate `FINE`.
+            motion: motion of the links, at the rate `FINE`; motors deviate from it by the deflection of the joints.
             temperature: factor on friction, (T, n) or one number.
         """
         q, qd, qdd = motion
         link = self._rigid_torque(motion) + self.spring * np.sin(q)
         if self.case.errors:
-            # motors move relative to the links: velocity and acceleration of the deflection are differences
+            # motors move relative to the links; rates of the deflection are computed by finite differences
             twist = self.process.deflection(link, self.inertia)
             rate = np.gradient(twist, 1 / FINE, axis=0)
             q, qd, qdd = q + twist, qd + rate, qdd + np.gradient(rate, 1 / FINE, axis=0)
@@ -243,12 +269,16 @@ class Truth:
         return base.combination[inertial, :count], columns[:, :, base.columns[inertial]]
 
     def base_parameters(self, motion: Motion, combination: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the true base parameters (r,), or the pseudo-true ones (see the module) if units or zeros are wrong.
+        """Return the true base parameters, (r,).
+
+        If the case has `errors`, logged torques have wrong units and logged positions have zero offsets. The result is
+        then the least-squares solution for logged torques and positions (see the module).
 
         Args:
-            motion: of the links.
-            combination: (r, K) of `inertial_columns`, for this motion with the zeros of the sensors added.
-            columns: (T, n, r) likewise.
+            motion: test motion of the links, with true positions; logged positions are these plus the zero offsets.
+            combination: (r, K) matrix from K inertial parameters and armatures to base parameters, the first result of
+                `inertial_columns`.
+            columns: (T, n, r) regressor of the base parameters at the logged positions, its second result.
         """
         bodies = self.bodies.inertial_parameters.detach().numpy().ravel()
         exact = combination @ np.concatenate([bodies, self.armature])
@@ -266,7 +296,7 @@ class Truth:
 
 
 def _limit(value: float | None, default: float) -> float:
-    """Return a position limit of the simulated motion: the URDF's limit, clipped to +-2.5; default if it has none."""
+    """Return a position limit of the simulated motion [rad, m]: the URDF's, clipped to +-2.5, or else the default."""
     return default if value is None else float(np.clip(value, -2.5, 2.5))
 
 
@@ -304,7 +334,7 @@ def pick_and_place(truth: Truth, seconds: float, rng: np.random.Generator) -> Mo
 
 
 def record_log(truth: Truth, case: Case, rng: np.random.Generator) -> list[spelgen.Trajectory]:
-    """Simulate two motions of a case; return their logs: noisy positions, differences as velocities, noisy torques."""
+    """Simulate two motions of a case; return logs of noisy positions and torques, with finite differences as qd."""
     logs, own_rng, process = [], np.random.default_rng([case.number, 3]), truth.process
     for name in ("first", "second"):
         make = fourier_motion if case.motion == "excitation" else pick_and_place
@@ -418,7 +448,11 @@ def run_case(case: Case, folder: Path) -> dict[str, Any]:
 
 
 def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
-    """Return the errors of fitted dynamics along a test motion of the links, by name; see the module."""
+    """Return {name: error} of fitted dynamics along a test motion of the links; errors are relative (see the module).
+
+    Names: "mass" (M), "diagonal" (mean of each M_jj), "base" (base parameters), "gravity", "friction", "nmse" and
+    "nmse_filtered" (torque), and "intervals" (`interval_ratios`) if the fit has a posterior.
+    """
     every, dynamics = round(FINE / 100.0), fitted.dynamics
     sensed, true_tau, true_friction = truth.sensed(motion)
     q, qd, qdd = (np.ascontiguousarray(x[::every]) for x in sensed)
@@ -465,10 +499,11 @@ def measure(fitted: Fitted, truth: Truth, motion: Motion) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Dynamics that a method has fitted, and their parameters.
+    """Dynamics that one of `METHODS` has fitted, and their parameters.
 
-    bodies: inertial parameters, (B, 10), in the frames of the joints. armature: (n,). posterior: of the default preset.
-    residual: statistics of the torque residual (`residual_of`), of least squares with bristle states.
+    bodies: inertial parameters, (B, 10), in the frames of the joints. armature: (n,) [kg m^2, kg]. posterior: only for
+    the method "hybrid". residual: statistics of the torque residual in the training logs (`residual_of`), only for the
+    method "identify --memory".
     """
 
     dynamics: Any
@@ -500,9 +535,10 @@ def fit_least_squares(memory: bool) -> Callable[[Path, list[spelgen.Trajectory]]
 
 
 def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) -> list[float] | None:
-    """Return statistics of the torque residual of an identification on its own logs; None without bristle states.
+    """Return `ResidualStatistics.columns` (level, correlation, spectrum) of the torque residual of an identification.
 
-    They are `ResidualStatistics.columns`.
+    The residual is on the logs of the identification. Return None if the identified friction has no bristle states, or
+    if all logs are shorter than 4 s.
     """
     if not result.method.friction.memory:
         return None
@@ -518,7 +554,7 @@ def residual_of(result: spelgen.Identification, logs: list[spelgen.Trajectory]) 
 
 
 def fit_figaroh(urdf: Path, logs: list[spelgen.Trajectory]) -> Fitted:
-    """Identify the arm with figaroh, from samples shifted by the delay that `identify` finds."""
+    """Identify the arm with figaroh, from samples without the torque delay, which `spelgen.identify` estimates."""
     loaded = spelgen.load_arm(urdf)
     delay = spelgen.identify(loaded, logs).torque_delay.delay
     samples = dynamics_samples(logs, preprocessing=spelgen.Preprocessing(torque_delay=delay))

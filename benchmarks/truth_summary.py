@@ -27,7 +27,11 @@ CAUSES: dict[str, Callable[[Row], Any]] = {
 
 
 def summary(rows: Sequence[Row], methods: Sequence[str], recordings: Path | None = None) -> str:
-    """Return all tables as text, over the rows without a failed fit; recordings: folder to compare residuals with."""
+    """Return all tables as text, over the cases (rows) in which neither `hybrid` nor least squares failed.
+
+    methods: names of the methods in the table of errors. recordings: folder of recordings, with whose torque residuals
+    the residuals of simulated arms are compared.
+    """
     ours = (DEFAULT, *LEAST_SQUARES)
     good = [row for row in rows if not any("error" in row["results"][name] for name in ours)]
     if not good:
@@ -59,7 +63,11 @@ def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
 
 
 def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield lines on the error of `hybrid` divided by the smaller error of least squares: all cases, then per cause."""
+    """Yield lines on the error of `hybrid` divided by the smaller error of the two least-squares methods.
+
+    The errors are of M and of the torque. The lines have medians of this ratio and shares below limits: over all cases,
+    then for each value of each of `CAUSES`, the properties of cases such as the kind of friction.
+    """
     for key, goal in (("mass", 1.2), ("nmse", 1.02)):
         ratio = np.array([by_better_least_squares(row, key) for row in rows])
         limits = sorted({1.0, 1.02, 1.2, 2.0})
@@ -86,15 +94,19 @@ def by_cause(rows: Sequence[Row], cause: str) -> Iterator[tuple[Any, np.ndarray]
 
 
 def by_better_least_squares(row: Row, key: str) -> float:
-    """Return one error of the default, named by `key`, divided by the smaller error of the two least squares."""
+    """Return an error of `hybrid` in a case, divided by the smaller error of the two `LEAST_SQUARES` methods.
+
+    key: name of the error in the results of `truth.py`, for example "mass".
+    """
     errors = {name: row["results"][name][key] for name in (DEFAULT, *LEAST_SQUARES)}
     return float(errors[DEFAULT] / min(errors[name] for name in LEAST_SQUARES))
 
 
 def interval_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield lines on the share of true values within the default's 95 % intervals, and the width of the intervals.
+    """Yield lines on the 95 % intervals of `hybrid`, per quantity of `QUANTITIES`, such as base parameters.
 
-    width: 1 / (95 % quantile of error / half width); 1 is right, more is too wide.
+    A cell has the share of true values within their intervals [%], which should be 95, and in brackets the relative
+    width of the intervals, 1 / (95 % quantile of |error| / half interval): 1 is right, more than 1 is too wide.
     """
     rows = [row for row in rows if "intervals" in row["results"][DEFAULT]]
     if not rows:
@@ -115,7 +127,11 @@ def interval_lines(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def residual_rows(rows: Sequence[Row], recordings: Path | None) -> Iterator[tuple[str, Sequence[float]]]:
-    """Yield rows of residual statistics: of recordings and their median, then quantiles over simulated arms."""
+    """Yield (name, `ResidualStatistics.columns`) of torque residuals of recordings and of simulated arms.
+
+    Recordings have a row per split, and one with the median over the splits. Simulated arms with and without realistic
+    errors have three rows each: the 10 %, 50 % and 90 % quantiles over the cases with logs of at least 20 s.
+    """
     if recordings is not None:
         found = {name: x.columns() for name, x in of_recordings(recordings).items()}
         yield from found.items()

@@ -134,10 +134,10 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context manager that sets the file name of an OSError about `path` to `path`; other errors are unchanged.
+    """Context manager that sets `path` as the file name of an OSError about this file; other errors are unchanged.
 
-    An error is about `path` if it has no file name, as on a full disk, or if its file name contains the name of `path`,
-    as the name of the hidden file of `replacing` does.
+    Such an error may have no file name, as on a full disk, or the name of the hidden file that `replacing` writes
+    before it is renamed to `path`. It is recognised by a file name that is absent or contains the name of `path`.
     """
     try:
         yield

@@ -157,5 +157,5 @@ def observed(predictor: str) -> str:
 
 
 def is_drawn(predictor: str) -> bool:
-    """Return True if charts show a predictor: all without disturbance observer, and the model with one."""
+    """Return True if charts show ``predictor``. With a disturbance observer, charts show only the trained model."""
     return predictor == observed(MODEL) or not predictor.endswith(observed(""))

@@ -12,8 +12,11 @@ from typing import Literal
 WIDTH = 80
 MIN_NAME = 8
 """Smallest width of the first column [characters], to which names of rows are wrapped if a table is too wide."""
-BLANK = re.compile(r"(?<= )(?!s[)\]])")  # matches places between words, but not before the unit s
-SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")  # matches places at which names may be wrapped
+# Matches places between words at which names of rows may be wrapped, but not before the last s of a unit, as in [Nm s].
+BLANK = re.compile(r"(?<= )(?!s[)\]])")
+# Matches also places within words: after "_", "-", "/" and ".", but not after the point of a number, as in 1.5, and not
+# before the last s of a unit, as in [rad/s].
+SEPARATOR = re.compile(r"(?<=[_\-/. ])(?<!\d\.)(?!s[)\]])")
 
 
 @dataclass(frozen=True)
@@ -85,8 +88,9 @@ def _groups(columns: Sequence[Sequence[str]]) -> list[list[int]]:
 
     columns: texts of each column; column 0 has the names of the rows and is in no group.
     """
-    # Numbers cannot be wrapped. Names of rows are wrapped between words, or else within words, if the table is then
-    # split into fewer parts.
+    # Each group becomes a table of its own, below the previous one. Narrow names of rows permit more columns per table.
+    # Three forms of the names are therefore tried: not wrapped, wrapped between words, and wrapped within words. The
+    # first form with the smallest number of groups is used.
     names = columns[0][1:]
     forms = (
         names,

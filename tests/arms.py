@@ -80,9 +80,10 @@ def random_rotation(rng: np.random.Generator) -> Rows:
 
 
 def reference_arms(shared: Path, assume: str) -> Iterator[tuple[str, dict[str, Any], Chain, Structure]]:
-    """Yield each arm of the reference data: name, known structure, chain and derived structure.
+    """Yield the name, known structure, chain and derived structure (of M and V) of each arm of the reference data.
 
-    A structure is derived once per process. assume: "kinematics" or "inertials".
+    assume: "kinematics" for the structure that is valid for all inertial parameters, "inertials" for the structure with
+    the URDF's values. Arms without such a known structure are omitted. A structure is derived once per process.
     """
     for name, known in json.loads((shared / "arms" / "expected.json").read_text()).items():
         if known[assume] is not None:

@@ -205,7 +205,7 @@ class CompiledEstimator:
         return dict(zip(REFUSALS, counts.astype(int).tolist(), strict=True))
 
     def saved(self) -> ctypes.Array[ctypes.c_char]:
-        """Return the estimator's state in the saved form of the C interface."""
+        """Return the state of the estimator as the bytes that its C function `..._estimator_save` writes."""
         state = ctypes.create_string_buffer(self.library.saved_size())
         self.library[f"{self.name}_estimator_save"](self.state, state)
         return state
@@ -215,7 +215,10 @@ class CompiledEstimator:
         return bool(self.library[f"{self.name}_estimator_restore"](self.state, state))
 
     def compensate_external(self, wanted: bool) -> None:
-        """Set whether `torque` compensates external torques: an int of the C struct, behind 1 + n doubles."""
+        """Set whether `torque` compensates external torques, the option `compensate_external` of the C struct.
+
+        The option is an int. Only 1 + n doubles precede it in the struct: alarms_per_minute and torque_limit (n).
+        """
         ctypes.c_int.from_buffer(self.state, 8 * (1 + self.n)).value = wanted
 
     def torque(self, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, ahead: float) -> np.ndarray:

@@ -6,7 +6,9 @@ import numpy as np
 
 from spelgen.logs.dynamics_samples import DynamicsSamples
 
-# for links of 1 m, the data determine a gravity of 3 m/s^2; they do not determine masses and inertias: assumed here
+# The first moment of the lower link is multiplied by the length of the upper link in M, and by gravity in the gravity
+# torque: for a length of 1 m, the data determine a gravity of 3 m/s^2. Masses and inertias are assumed values: the data
+# determine only base parameters, such as the first moment, not the mass.
 URDF = """<robot name="planar">
   <link name="base"/>
   <link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>

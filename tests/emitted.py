@@ -1,6 +1,7 @@
-"""Emitted modules for tests: built from a URDF and imported by path.
+"""Emitted modules for tests, generated from a URDF and imported from a file.
 
-Their parameters are random, or exact polynomials replace their networks.
+Models of `random_model` have random parameters. In models of `exact_model`, polynomials in cos q, sin q and q replace
+the networks, so that M and V are exactly the URDF's.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def import_source(source: str, path: Path) -> ModuleType:
 
 
 def closed_forms(robots: Iterable[str], folder: Path) -> dict[str, tuple[ModuleType, Chain]]:
-    """Return {name: (emitted closed-form module, arm)} for the named robots and for the arm `FOLLOWED`."""
+    """Return {name: (closed-form module, arm)} for the named robots and for `FOLLOWED`, an arm with a mimic joint."""
     urdf = folder / "followed.urdf"
     urdf.write_text(FOLLOWED, encoding="utf-8")
     made = {}
@@ -104,9 +105,10 @@ def built(
     *,
     standalone: bool = False,
 ) -> tuple[str, Structure]:
-    """Derive one of the project's robots; return the text of its emitted module, and its structure.
+    """Return the text of a robot's emitted module, and the robot's derived structure of M and V.
 
-    assume, preset, design: see `Options`. standalone: True for a module that does not import spelgen.
+    robot: name of a URDF in the folder robots. assume, preset, design: see `Options`. standalone: True for a module
+    that does not import spelgen.
     """
     arm = _loaded(robot)
     spec = derive_spec(arm, Options(preset=preset, design=design, assume=assume))
@@ -127,9 +129,9 @@ def random_model(
     preset: str = "hybrid",
     design: Design | None = None,
 ) -> nn.Module:
-    """Return the emitted model of one of the project's robots, with random parameters.
+    """Return the emitted model of a robot, with random parameters.
 
-    seed, deviation: see ``randomise``. preset, design: see `Options`.
+    robot: name of a URDF in the folder robots. seed, deviation: see ``randomise``. preset, design: see `Options`.
     """
     source = built(robot, preset=preset, design=design)[0]
     model = import_source(source, folder / f"{robot}_spel.py").Model(seed=seed)
@@ -138,7 +140,12 @@ def random_model(
 
 
 def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> None:
-    """Set parameters to normal random numbers of this deviation; None: deviations for which no term is negligible."""
+    """Replace parameters of a model by normal random numbers with zero mean.
+
+    deviation: standard deviation of all parameters except `raw_armature`, the logarithm of armature / nominal armature,
+    whose standard deviation is always 1. None: 0.3 for residual terms and 1 / sqrt(fan-in) for networks, so that no
+    term is negligible; other parameters are unchanged.
+    """
     generator = torch.Generator().manual_seed(seed)
     for name, parameter in model.named_parameters():
         draw = torch.randn(parameter.shape, dtype=parameter.dtype, generator=generator)
@@ -149,7 +156,8 @@ def randomise(model: nn.Module, seed: int, deviation: float | None = None) -> No
         elif "residuals.raw" in name:
             parameter.data = 0.3 * draw
         elif "network" in name or "potential." in name or "residuals.mass." in name:
-            # scale 1 / sqrt(inputs); a Kolmogorov-Arnold layer has a grid of parameters per input, all of them count
+            # 1 / sqrt(fan-in); a unit of a Kolmogorov-Arnold layer has a parameter per input and grid point: its fan-in
+            # is the number of inputs times the number of grid points
             inputs = parameter[0].numel() if parameter.dim() == 3 else parameter.shape[-1]
             parameter.data = draw * inputs**-0.5
 
@@ -182,7 +190,10 @@ def frictionless(model: nn.Module) -> nn.Module:
 
 
 class ExactFunctions(nn.Module):
-    """Exact functions in place of a network of an emitted model: y = (polynomial - mean) / scale, with derivatives."""
+    """Polynomials in place of a network of an emitted model, so that the functions of the model are known exactly.
+
+    The model computes a function as mean + scale y from a network output y, so y is (polynomial - mean) / scale here.
+    """
 
     def __init__(
         self, functions: list[fmpq_mpoly], mean: torch.Tensor, scale: torch.Tensor, encoding: nn.Module

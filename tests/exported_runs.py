@@ -38,7 +38,7 @@ joints: {shoulder: {gear: 50}, slide: {gear: 20, gain: trained}, wrist: {actuate
 
 
 def moved_model(robot, preset, size=0.2):
-    """Return a model of one of the project's robots whose parameters have random changes (deviation `size`)."""
+    """Return a robot's model; a normal random number of standard deviation `size` is added to each parameter."""
     model = build(ROBOTS / f"{robot}.urdf", preset)
     random = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -48,7 +48,6 @@ def moved_model(robot, preset, size=0.2):
 
 
 def arm_of(robot):
-    """Load the arm of one of the project's robots, by name."""
     return load_arm(ROBOTS / f"{robot}.urdf")
 
 
@@ -82,5 +81,5 @@ def saved_run(model, urdf, folder: Path) -> RunFolder:
 
 
 def run_folder(robot, preset, folder: Path) -> RunFolder:
-    """Write the run folder of one of the project's robots with changed parameters (`moved_model`)."""
+    """Write the run folder of a robot's model with randomly changed parameters (`moved_model`)."""
     return saved_run(moved_model(robot, preset), ROBOTS / f"{robot}.urdf", folder)

@@ -16,7 +16,7 @@ CLOSE = 1e-10
 
 
 def assert_equal_to_pinocchio(arm: Chain, rows: dict[str, str], tolerance: float = CLOSE) -> None:
-    """Check that each closed form, M_ij and V, equals Pinocchio at random positions.
+    """Check that closed forms of the entries of M, and of V(q) - V(0), equal Pinocchio's values at random positions.
 
     Args:
         arm: gives the values of the base parameters in the expressions.
@@ -53,7 +53,10 @@ def assert_close(found, true) -> None:
 
 
 def read_back(told: str) -> dict[str, str]:
-    """Parse a text of closed forms to {M11, ..., or V: expression}; an indented line continues an expression."""
+    """Return the closed forms in a text as {name: expression}: M11, M21, ... of the mass matrix, and the potential V.
+
+    The text has a line "name = expression" for each; an indented line continues an expression.
+    """
     found: dict[str, str] = {}
     for line in told.partition("\nBase parameters")[0].splitlines():
         name, is_row, expression = line.partition(" = ")

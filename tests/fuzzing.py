@@ -30,9 +30,10 @@ MEMORY = 1_000_000  # [kB] limit of the memory that the examples of a test add t
 
 
 def fuzz(draw: st.SearchStrategy, examples: int, use: Callable[[Any], Any]) -> None:
-    """Call ``use`` with random examples of a strategy: at most FEW in `make test`, until time is up in `make fuzz`.
+    """Call ``use`` with random examples of a strategy.
 
-    examples: number of examples per seed in `make fuzz`.
+    `make test` uses one seed with at most FEW (12) examples. `make fuzz` uses new seeds, with ``examples`` examples
+    each, until the time of the test is up.
     """
     count = examples if MINUTES else min(examples, FEW)
     kept = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}

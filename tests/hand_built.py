@@ -10,7 +10,7 @@ SIDEWAYS = ((0, 0, 1), (1, 0, 0), (0, 1, 0))  # the joint's z axis is the parent
 
 
 def coordinate(name="a", kind="revolute", **changes):
-    """Return a coordinate with limits of +-1 and no friction; keywords replace its fields."""
+    """Return a coordinate with position limits of +-1 rad or m and no friction; keywords replace its fields."""
     known = {"lower": -1.0, "upper": 1.0, "effort": 10.0, "velocity": 10.0, "damping": 0.0, "friction": 0.0}
     return Coordinate(
         name=name, joint_type=kind, **({"continuous": False, "passive": False} | known | changes)

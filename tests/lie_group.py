@@ -1,7 +1,7 @@
-"""The port-Hamiltonian equations of the paper on SO(3)^k x R^3^l, with three axes per joint.
+"""Port-Hamiltonian equations of an arm with a rotation matrix in SO(3), or a position in R^3, for each joint.
 
-The emitted module integrates one coordinate per joint. This file has the equations of the paper (Wang, Chen, Ding,
-Sci Rep 15:33179, 2025), from rotation matrices to rates, to show that both are equal.
+They are the equations of Wang, Chen and Ding, Sci Rep 15:33179, 2025 (in this file: the paper). The emitted module has
+one coordinate per joint instead: tests check that its rates equal the rates of these equations.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """Methods of an emitted module that the equations on SO(3)^k x R^3^l use; shapes: docstrings of emitted modules."""
+    """Attributes and methods of an emitted module that `group_rates` uses, with the shapes of the module."""
 
     joint_types: tuple[str, ...]
 
@@ -52,10 +52,10 @@ class GroupModel(Protocol):
 
 
 def geodesic_distance(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Angle (...,) [rad] of the rotation from ``left`` to ``right``, (..., 3, 3): |log(R^T R')| / sqrt(2) of eq. 8.
+    """Return the angle, (...,) [rad], of the rotation from R = ``left`` to R' = ``right``, (..., 3, 3) each.
 
-    As the arc tangent of sine and cosine it is exact for small angles too, where an arc cosine loses half
-    its digits.
+    It is |log(R^T R')| / sqrt(2), eq. 8 of the paper (see the module). It is computed as the arc tangent of sine and
+    cosine, which is exact for small angles, too; an arc cosine would lose half its digits.
     """
     turn = left.mT @ right
     axis = torch.stack(
@@ -72,13 +72,14 @@ def geodesic_distance(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
 def group_rates(
     model: GroupModel, parts: Sequence[torch.Tensor], p: torch.Tensor, tau: torch.Tensor
 ) -> tuple[list[torch.Tensor], torch.Tensor]:
-    """Rates of the joints' R, (..., 3, 3), or r, (..., 3), and of their momenta p, (..., n, 3), in joint frames.
+    """Return the rates of each joint's position on the group, and of all momenta, by eq. 15 and 18 of the paper.
 
-    tau: (..., n) input. Eq. 18 for a turning joint, with the rows r_1, r_2, r_3 of R, and eq. 15 for a
-    sliding one:
+    parts: position of each joint (see `to_group`), a rotation matrix R or a vector r. p: momenta in joint frames,
+    (..., n, 3). tau: inputs, (..., n). The paper is Wang, Chen and Ding, see the module. The first line is for a
+    turning joint, with the rows r_1, r_2, r_3 of R, the second line for a sliding joint:
 
-        r_j' = r_j x dH/dp,  p' = p x dH/dp + sum_j r_j x dH/dr_j - D dH/dp + G u
-        r' = dH/dp,          p' = -dH/dr - D dH/dp + G u
+        r_j' = r_j x dH/dp,  p' = p x dH/dp + sum_j r_j x dH/dr_j - D dH/dp + G tau
+        r' = dH/dp,          p' = -dH/dr - D dH/dp + G tau
 
     dH/dR and dH/dr are automatic derivatives with respect to all entries of R and r. A joint moves about or along
     its z axis only, since its bearing blocks the x and y axes: H, D and G act only on the z components.
@@ -92,7 +93,8 @@ def group_rates(
     moving = model.input_matrix(q) @ tau.unsqueeze(-1) - model.dissipation(q, qd) @ qd.unsqueeze(-1)
     rates, forces = [], []
     for i, (part, slope) in enumerate(zip(parts, slopes, strict=True)):
-        # a turning joint has a rotation (..., 3, 3), a sliding joint a position (..., 3)
+        # A rotation, (..., 3, 3), of a turning joint has as many dimensions as p, (..., n, 3). A position, (..., 3), of
+        # a sliding joint has one less.
         turning = part.dim() == p.dim()
         rate, force = (_turning if turning else _sliding)(part, slope, p[..., i, :], velocity[..., i, :])
         rates.append(rate)
@@ -103,7 +105,11 @@ def group_rates(
 def _turning(
     rotation: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return dR/dt, (..., 3, 3), and the torque of H on a turning joint, (..., 3); see `group_rates`."""
+    """Return dR/dt, (..., 3, 3), and the conservative part of dp/dt, (..., 3), of a turning (revolute) joint.
+
+    The caller `group_rates` adds the dissipation -D dH/dp and the input G tau to dp/dt. rotation: R, (..., 3, 3).
+    slope: dH/dR, (..., 3, 3). p: momentum in the joint frame, (..., 3). velocity: dH/dp, (..., 3).
+    """
     rate = torch.linalg.cross(rotation, velocity.unsqueeze(-2).expand_as(rotation), dim=-1)
     torque = torch.linalg.cross(p, velocity, dim=-1) + torch.linalg.cross(rotation, slope, dim=-1).sum(dim=-2)
     return rate, torque
@@ -112,5 +118,9 @@ def _turning(
 def _sliding(
     position: torch.Tensor, slope: torch.Tensor, p: torch.Tensor, velocity: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return dr/dt and the force of H on a sliding joint, (..., 3) each; see `group_rates`."""
+    """Return dr/dt and the conservative part of dp/dt, (..., 3) each, of a sliding (prismatic) joint.
+
+    The caller `group_rates` adds the dissipation -D dH/dp and the input G tau to dp/dt. slope: dH/dr, (..., 3).
+    velocity: dH/dp, (..., 3). position and p have no effect.
+    """
     return velocity, -slope

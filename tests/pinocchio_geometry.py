@@ -16,7 +16,10 @@ NOTHING = 1e-9  # [1] magnitude below which a quantity of order 1 counts as zero
 
 @dataclass
 class Seen:
-    """The axes and masses of an arm at random configurations, by Pinocchio; joints are numbered from 1."""
+    """Joint axes and origins of an arm at three random configurations, and the inertia of its last body, by Pinocchio.
+
+    Its methods test statements about the geometry, such as parallel axes. They number the joints from 1.
+    """
 
     arm: Chain
 
@@ -79,10 +82,11 @@ class Seen:
         return True
 
     def carried(self, joint: int, turner: int) -> np.ndarray:
-        """Return the offset of a centre of mass from a plane, (configurations,), times the sine of two axes' angle [m].
+        """Return d sin(a) [m], (configurations,), with the distance d of a centre of mass from a plane.
 
-        The mass is moved by the sliding ``joint``. The plane contains the axis of joint ``turner`` and is parallel to
-        the axis of ``joint``.
+        The mass is all bodies that the sliding ``joint`` moves. The plane contains the axis of joint ``turner`` and is
+        parallel to the axis of ``joint``. a is the angle between both axes: their cross product, of length sin(a), is
+        used as the normal of the plane.
         """
         found = []
         for q, axes, points in zip(self.configurations, self.axes, self.points, strict=True):

@@ -62,13 +62,13 @@ class Model(PortHamiltonian):
         super().__init__([Joint(name, "revolute", -3.0, 3.0, 5.0, 1.0, 0.0) for name in JOINTS])
         generator = torch.Generator().manual_seed(seed)
         noise = 0.01 * torch.randn(5, generator=generator, dtype=torch.float64)
-        # initial b, log d and log e, the parameters of M
+        # initial values of b, log d and log e, with the symbols of M in the docstring of the class
         self.inertia = nn.Parameter(torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64) + noise[:3])
         self.weight = nn.Parameter(noise[3:].clone())
         self.friction = Damping()
 
     def prepare(self) -> None:
-        """Return an empty parameter cache: nothing can be precomputed."""
+        """Return None in place of a parameter cache, since nothing can be precomputed."""
 
     def configuration(self, q: torch.Tensor, prepared: None) -> Configuration:
         b, d = self.inertia[0], self.inertia[1].exp()

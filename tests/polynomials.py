@@ -43,7 +43,7 @@ class Polynomials:
 def polynomials(arm: Chain, *, inertials: bool = False) -> Polynomials:
     """Return the exact polynomials of M and V of ``arm``.
 
-    inertials: the URDF's inertial values are inserted; otherwise inertial parameters are variables.
+    inertials: if True, the URDF's inertial parameters are inserted as numbers; otherwise they are variables.
     """
     n, bodies = len(arm.coordinates), len(arm.bodies)
     names = [f"{letter}{k + 1}" for k in range(n) for letter in "csq"]
@@ -70,9 +70,10 @@ def _rational(number: Fraction) -> fmpq:
 
 
 def _reduced(polynomial: fmpq_mpoly, n: int) -> fmpq_mpoly:
-    """Return an equal polynomial in which each sine has at most the power one, by s^2 = 1 - c^2.
+    """Return an equal polynomial in which the sine of each of n coordinates has at most the power one.
 
-    Only arms with mimic joints need it: two bodies then turn with the same angle.
+    s^2 is replaced by 1 - c^2. The recursion already does so for the rotation of a single joint. Higher powers occur
+    only in arms with mimic joints, for example in products of the rotations of two joints with the same coordinate.
     """
     context = polynomial.context()
     for k in range(n):

@@ -41,10 +41,11 @@ class _Cholesky(nn.Module):
 
 
 class Published(nn.Module):
-    """Rates of the states (R, zeta), (..., 12 n), of n turning joints by PHNODE: eq. 18 of the paper, three axes each.
+    """Published PHNODE of n revolute joints, each modelled like a spherical joint: rates of (R, zeta), (..., 12 n).
 
-    R: rotation matrix, zeta: twist. Every derivative is automatic: dH/dR and dH/dp in one call, and dM^-1/dt one entry
-    at a time.
+    R: rotation matrix of each joint, zeta: its angular velocity about all three axes of the joint frame, (3,). The
+    rates of R and of the momenta p = M zeta are eq. 18 of Wang, Chen and Ding. Every derivative is automatic: dH/dR and
+    dH/dp in one call, and dM^-1/dt one entry at a time.
     """
 
     def __init__(self, joints: int, width: int, potential_width: int) -> None:

@@ -23,7 +23,7 @@ TYPES = ("revolute", "revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True)
 class Follower:
-    """A mimic joint ``name``: q = multiplier * q_leader + offset."""
+    """A mimic joint ``name``: q = multiplier * q_leader + offset, with the position q_leader of joint ``leader``."""
 
     name: str
     leader: str
@@ -65,9 +65,9 @@ STYLES = {
 
 @st.composite
 def arms(draw: Any) -> DrawnArm:
-    """Draw an arm of 2 to 6 joints, some with fixed plates between, a side branch, or a mimic joint.
+    """Draw an arm of 2 to 6 joints; some arms have plates (links on fixed joints), a side branch, or a mimic joint.
 
-    Hypothesis draws the joint types, these options, and the seed of the numbers.
+    Hypothesis draws the joint types, these options, and the seed of all random lengths, angles, axes and inertias.
     """
     style = STYLES[draw(st.sampled_from(tuple(STYLES)))]
     kinds = draw(st.lists(st.sampled_from(TYPES), min_size=2, max_size=6))
@@ -100,7 +100,7 @@ def _drawn(write: _Writer, kinds: list[str], plates: set[int], follows: str, sid
 
 @dataclass(frozen=True)
 class _Writer:
-    """Writer of URDF elements with random numbers of a style."""
+    """Writer of URDF elements with random numbers; ``style`` has the angles, offsets and axes to choose from."""
 
     style: _Style
     random: Random
@@ -128,7 +128,7 @@ class _Writer:
         return f'<link name="{name}">\n{_element("inertial", lines)}</link>\n'
 
     def origin(self) -> str:
-        """Return an <origin> with offsets and angles of the style."""
+        """Return an <origin> whose xyz and rpy are random choices from the offsets [m] and angles [rad] of `style`."""
         xyz = " ".join(self.random.choice(self.style.offsets) for _ in range(3))
         rpy = " ".join(self.random.choice(self.style.angles) for _ in range(3))
         return f'<origin xyz="{xyz}" rpy="{rpy}"/>'

@@ -80,7 +80,10 @@ class Controller:
         return getattr(self.library, f"harness_{name}")(self.handle, *arguments)
 
     def update(self, q, qd, effort=None, period=PERIOD, available=True):
-        """Run a control cycle at a state; return the commanded torques (n,)."""
+        """Run a control cycle of `period` [s]; return the commanded torques (n,) [Nm, N].
+
+        q, qd, effort: (n,) values of the state interfaces. available: False if these values cannot be read.
+        """
         self.time += period
         states = [q, qd] if effort is None else [q, qd, effort]
         pointer, _states = array(np.concatenate([np.asarray(x, float) for x in states]))
@@ -114,7 +117,10 @@ class Controller:
         return None if reason is None else reason.decode()
 
     def text(self, name):
-        """Return the text of a harness function without arguments, such as "state", "interfaces", "ranges" or "log"."""
+        """Call a function of the C++ test harness that has no arguments, and return its result, a text.
+
+        name: name of the function without "harness_", such as "state", "interfaces", "ranges" or "log".
+        """
         return self.call(name).decode()
 
     def joint_state(self, topic):

@@ -54,7 +54,11 @@ def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
 def servo_logs(
     count: int, seconds: float, servos: Servos = Servos(), seed: int = 0, swing: float = 1.0
 ) -> list[Trajectory]:
-    """Simulate logs at 50 Hz under commands that swing, hold and jump; the encoders have 4096 steps per revolution."""
+    """Simulate ``count`` logs of ``seconds`` each at 50 Hz, with encoders of 4096 steps per revolution.
+
+    The commands are sums of sines about levels that jump every 2 s. swing: factor of the sines; 0: only levels.
+    servos: true parameters of the servos.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.02)
     u = np.stack([_commands(rng, t, swing) for _ in range(count)])
@@ -68,7 +72,10 @@ def servo_logs(
 
 
 def _commands(rng: np.random.Generator, t: np.ndarray, swing: float) -> np.ndarray:
-    """Return random commands at times t (T,) [s], (T, 2) [rad]: sines of amplitude `swing` about levels that jump."""
+    """Return random commands at times t (T,) [s], (T, 2) [rad]: sums of sines about levels that jump every 2 s.
+
+    swing: factor of the sums; for 1, each is a sum of three sines with amplitudes of 0.05 to 0.3 rad.
+    """
     waves = sum(
         rng.uniform(0.05, 0.3)
         * np.sin(2 * np.pi * rng.uniform(0.05, 1.2, 2) * t[:, None] + rng.uniform(0, 6, 2))

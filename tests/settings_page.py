@@ -142,10 +142,10 @@ def rows(path: str, group: type[Group]) -> Iterator[tuple[str, ...]]:
 
 
 def meanings(group: type[Group], name: str, field: FieldInfo) -> dict[tuple[str, str], list[str]]:
-    """Return {(description, default): objectives} of a key, one entry per row of the table.
+    """Return {(description, default): objectives} of a key of settings, one entry per row of the page's table.
 
-    Objectives with different descriptions or defaults of an option have separate entries. The list of objectives is
-    empty for a key that does not depend on the objective.
+    Some keys of `training` have other descriptions or defaults for other objectives of the fit (torque, momentum,
+    rollout, servo): each entry then lists its objectives. For all other keys, the list of objectives is empty.
     """
     if group is not TrainingSettings or name not in OWNERS:
         value = field.get_default(call_default_factory=True)
@@ -166,7 +166,7 @@ def table(head: tuple[str, ...], lines: Iterator[tuple[str, ...]]) -> str:
 
 
 def other_defaults(group: type[Group]) -> Iterator[str]:
-    """Yield a sentence per subclass of a group, if it has the keys of the group: the defaults that differ."""
+    """Yield a sentence for each subclass of a group that has the same keys as the group: the different defaults."""
     for subclass in group.__subclasses__():
         if subclass.model_fields.keys() == group.model_fields.keys():
             pairs = zip(subclass.model_fields.items(), group.model_fields.values(), strict=True)

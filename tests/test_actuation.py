@@ -26,9 +26,10 @@ WRIST = (("j1", (("m1", 100.0),), "Simple"), ("pitch roll", (("m2", 60.0), ("m3"
 
 
 def urdf(folder, *transmissions, sidecar=""):
-    """Write the URDF of an arm with three turning joints (shoulder, wrist pitch, wrist roll) and these <transmission>s.
+    """Write the URDF of an arm with three turning joints (j1, pitch, roll) and transmissions; return its path.
 
-    sidecar: text of the settings file. Returns the path of the URDF.
+    transmissions: for each, the names of its joints, (name, gear ratio) of each of its actuators, and its type, such as
+    "Differential". sidecar: text of the settings file.
     """
     inertial = (
         '<inertial><origin xyz="0.2 0 0"/><mass value="2"/>'
@@ -59,7 +60,11 @@ def urdf(folder, *transmissions, sidecar=""):
 
 
 def inputs(path):
-    """Return {(row, column): (kind, value)} of the entries of G that are not always zero."""
+    """Return {(row, column): (kind, value)} of the entries of the input matrix G that are not always zero, from 1.
+
+    path: a URDF. value: joint torque per input. kind: "fixed"; "coupled" for motors that drive several joints; "gain"
+    for a trained entry, whose value is the initial value.
+    """
     found = inspect(path).to_dict()["input_matrix"]["entries"]
     assert len(found) == 9
     return {(x["row"], x["col"]): (x["kind"], x["value"]) for x in found if x["kind"] != "zero"}
@@ -72,7 +77,8 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
 @pytest.mark.parametrize(
     ("transmissions", "sidecar", "expected"),
     [
-        # torques at the joints: gears have no effect, and G is the identity
+        # by default, logged torques are joint torques: gears have no effect, and G is the identity, except that
+        # the diagonal entry of a passive joint is zero
         (WRIST, "", {(i, i): ("fixed", 1.0) for i in (1, 2, 3)}),
         (WRIST, "joints: {roll: {actuated: false}}", {(i, i): ("fixed", 1.0) for i in (1, 2)}),
         (
@@ -86,7 +92,7 @@ COUPLED = MOTOR + "couplings:\n- {joints: [pitch, roll], matrix: [[50, 0], [-10,
                 (3, 3): ("coupled", -60.0),
             },
         ),
-        # the settings file has precedence over the URDF; gains that neither states are trained
+        # the coupling in the settings has precedence over the URDF's; j1 has a gear in neither: its gain is trained
         (
             WRIST[1:],
             COUPLED,
@@ -204,7 +210,10 @@ class TestModule:
 
 
 def test_the_simulation_moves_joints_by_motors(coupled):
-    """Logged torques are motor torques: G times the logged torque moves the rigid bodies."""
+    """Simulated logs contain motor torques: the rigid bodies move under G times these torques, minus the friction.
+
+    G is the input matrix, joint torque per motor torque.
+    """
     loaded = load_arm(coupled[0])
     short = {"trajectories": 2, "duration": 0.5, "rate": 20.0}
     settings = loaded.settings.model_copy(

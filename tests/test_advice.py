@@ -1,7 +1,7 @@
-"""Messages about faults of logs advise lines of settings; with these lines in the settings the fault is corrected.
+"""Messages about faults of logs advise lines of the settings file; a file with these lines corrects the fault.
 
-Lines for jumps, dropouts, held samples, geometry, clipped torques, couplings, calibrations and times in another unit
-are applied in the tests of these checks.
+The advised lines about jumps, dropouts, held samples, geometry, clipped torques, couplings, calibrations and times in
+another unit are not tested here, but in the test modules of these checks.
 """
 
 import re
@@ -30,9 +30,10 @@ def arm(request, robots, tmp_path):
 
 
 def logged(arm, trajectory, columns=None, **scaled):
-    """Write a log as CSV with quantities multiplied by factors; return its path.
+    """Write a trajectory as a CSV log; return its path.
 
-    columns: function of the names of all columns that returns the names to keep.
+    scaled: factors of quantities, such as tau=0.02. columns: function that returns the names of the columns to keep,
+    from the names of all columns; None: all are kept.
     """
     path = arm.robot.path.with_name("log.csv")
     changed = replace(trajectory, **{name: getattr(trajectory, name) * x for name, x in scaled.items()})
@@ -88,7 +89,10 @@ def test_gain_of_torques_in_another_unit(arm, factor):
 
 @pytest.mark.parametrize("arm", ["rpr", "ur10e"], indirect=True)
 def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
-    """The advised line corrects the sense of the torques; the next message corrects their unit if it is still wrong."""
+    """The settings line that is advised first corrects the sense of the torques.
+
+    With this line, the check of the same log may report a wrong unit: a second advised line then corrects the unit.
+    """
     path = logged(arm, recorded(arm, 6), tau=-0.02)
     message = message_of(arm, path)
     assert "of the opposite sense" in message
@@ -103,7 +107,7 @@ def test_gain_of_torques_in_another_unit_and_of_the_opposite_sense(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("turn", [2 * np.pi, -2 * np.pi])
 def test_offset_of_angles_of_another_turn(arm, turn):
-    """Angles that are logged one turn beyond the limits of a joint are right after the advised offset."""
+    """If angles are logged one revolution beyond the limits of a joint, the advised offset corrects them."""
 
     def within_limits(arm, rng):
         t, q = pick_and_place(arm, rng)
@@ -118,7 +122,7 @@ def test_offset_of_angles_of_another_turn(arm, turn):
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_angles_beyond_both_limits_are_of_no_other_turn(arm):
-    """If a joint moves by more than its range, no offset corrects it, and the message advises none."""
+    """If the angles of a joint span more than its range, no offset shifts all of them into it, and none is advised."""
 
     def wide(arm, rng):
         t, q = pick_and_place(arm, rng)
@@ -193,7 +197,10 @@ UNITS = {
     indirect=["arm"],
 )  # fmt: skip
 def test_units_of_positions_and_velocities(arm, units, single):
-    """Positions and velocities in another unit, of all revolute joints or of one, get a line that corrects them."""
+    """If positions and velocities are in another unit, the message advises one settings line, which corrects them.
+
+    This holds if all revolute joints are logged in the other unit, and if only one is (`single`).
+    """
     log, turning = recorded(arm, 12), [x.joint_type == "revolute" for x in arm.chain.coordinates]
     changed = np.flatnonzero(turning)[-2:-1] if single else np.array(turning)
     q, qd = (1 / SCALES.get(unit, 1.0) for unit in UNITS[units])
@@ -305,7 +312,10 @@ def test_column_of_commands_that_another_joint_follows(tmp_path):
     ],
 )
 def test_unit_of_torques_beyond_the_drive(robots, tmp_path, line, factor):
-    """Without gravity, torques in another unit are found by the effort limit, and each advised line corrects them."""
+    """On an arm without gravity torques, torques in mNm are reported because they exceed 20 times the effort limit.
+
+    A settings line with this unit or with a gain corrects them. The line "units: {tau: Nm}" confirms them as Nm.
+    """
     text = (robots / "scara.urdf").read_text()
     (tmp_path / "arm.urdf").write_text(re.sub(r'effort="[^"]*"', 'effort="100"', text))
     arm = load_arm(tmp_path / "arm.urdf", joints=load_arm(robots / "scara.urdf").chain.joint_names[:2])

@@ -1,4 +1,4 @@
-"""The arm made from a robot has the right joints, bodies and exact numbers, compared with Pinocchio's reading."""
+"""`make_arm` makes the joint frames and bodies of a URDF, in rational numbers; its dynamics equal Pinocchio's."""
 
 import json
 import re
@@ -40,7 +40,10 @@ def joint(name, parent, child, kind="revolute", xyz="0 0 0.3", rpy="0 0 0", axis
 
 @pytest.fixture
 def robot(tmp_path):
-    """Return a function that makes a robot from joint elements, and their links; links in `bare` have no inertials."""
+    """Return a function that reads a robot with the given joint elements and with all links that these joints name.
+
+    The links have equal inertials, except links in `bare`, which have none.
+    """
 
     def make(*joints, bare=()):
         text = "".join(joints)
@@ -88,7 +91,7 @@ class TestChain:
         assert names(make_arm(robot(joint("a", "0", "1"), *jaws))) == ["a"]
 
     def test_a_last_joint_that_may_open_a_gripper_is_stated_with_the_tip_that_leaves_it_out(self, robot):
-        """The remark `ambiguous-chain` on a last link named like a gripper advises the link before it for --tip."""
+        """If the last link has a gripper's name, the remark `ambiguous-chain` advises the link before it as --tip."""
         arm = robot(joint("a", "0", "1"), joint("b", "1", "gripper_moving_part"))
         assert names(make_arm(arm)) == ["a", "b"]
         (remark,) = [x for x in make_arm(arm).diagnostics if x.code == "ambiguous-chain"]
@@ -112,7 +115,7 @@ class TestChain:
         assert "ambiguous-chain" in codes(arm)
 
     def test_a_last_joint_that_fingers_elsewhere_follow_is_stated(self, robot):
-        """A last joint that other joints mimic may drive a gripper: the remark advises the link before it for --tip."""
+        """A last joint that other joints mimic may drive a gripper: the remark advises the link before it as --tip."""
         drive = joint("drive", "palm", "l").replace('lower="-1" upper="2"', 'lower="0" upper="0.8"')
         followers = [joint("m1", "palm", "r", inside='<mimic joint="drive" multiplier="-1"/>')]
         followers += [joint("m2", "l", "t", inside='<mimic joint="drive"/>')]
@@ -348,7 +351,8 @@ class TestExactness:
                 joint("b", "3", "4", xyz="0 0 1"),
             )
         )
-        # joint "b" is one metre along the z axis of joint "a", in the frame of the tilted slider
+        # The fixed joint reverses the tilt of the slider: joint "b" is one metre along the z axis of joint "a". In the
+        # frame of the slider, with the rotation R relative to joint "a", this axis is row 2 of R.
         slider, last = arm.bodies[1:]
         assert last.translation == slider.rotation[2]
         assert (exact(slider) @ exact(last) == IDENTITY).all()
@@ -427,7 +431,7 @@ class TestLumping:
 
 
 class TestAgainstPinocchio:
-    """At random configurations, poses, M and potential energy are equal to Pinocchio's, which reads the URDF itself."""
+    """At random positions, joint frames, M and gravity torques equal Pinocchio's, which reads the same URDF."""
 
     def test_all_reference_arms_move_and_weigh_the_same(self, shared):
         rng = np.random.default_rng(0)
@@ -457,7 +461,10 @@ def assert_close(ours, theirs, name):
 
 
 class Ours:
-    """A Pinocchio model that is built from the bodies of an arm only."""
+    """Pinocchio model that is assembled from the joints and bodies of an arm as `make_arm` has derived them.
+
+    Pinocchio does not read the URDF here (see `Theirs`).
+    """
 
     def __init__(self, arm):
         self.model = pin.Model()
@@ -498,7 +505,10 @@ class Ours:
 
 
 class Theirs:
-    """Pinocchio's reading of the whole URDF, all joints included, as a function of the arm's coordinates."""
+    """Pinocchio's own model of the URDF, in which mimic joints and locked joints are independent joints, too.
+
+    Its joint positions are slope q + offset, with the arm's coordinates q; locked joints are at zero.
+    """
 
     def __init__(self, path, arm):
         text = re.sub(r"<\?xml[^>]*\?>", "", path.read_text(encoding="utf-8"), count=1)

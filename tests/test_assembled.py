@@ -1,4 +1,4 @@
-"""A model assembled in memory, its thin module and its standalone module are bitwise equal."""
+"""Models assembled in memory, from thin modules (which import spelgen.runtime) and standalone ones are equal."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,7 +26,10 @@ def spec_of(robot: str, preset: str) -> ModelSpec:
 
 @each_case
 def test_three_forms_of_a_model_are_equal_to_the_bit(robot, preset, tmp_path):
-    """The three forms have equal initial parameters; with equal random parameters, their dynamics are bitwise equal."""
+    """Three forms of a model have bitwise equal initial parameters and, for equal random parameters, equal dynamics.
+
+    The forms: assembled in memory, a thin module that imports spelgen.runtime, and a standalone module.
+    """
     spec = spec_of(robot, preset)
     models = {"assembled": assemble(spec, seed=3)}
     for standalone in (False, True):

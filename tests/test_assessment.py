@@ -1,4 +1,4 @@
-"""Each sentence of the assessment in a report agrees with the figures of the evaluation."""
+"""Each sentence of the assessment in a report agrees with the numbers of the evaluation (relative errors, nMSE)."""
 
 from dataclasses import replace
 
@@ -18,10 +18,11 @@ def errors(relative, tip=None):
 
 
 def evaluation(relative=0.05, nmse=0.004, traces=None, seen=False, **others):
-    """Return an evaluation with two horizons.
+    """Return an evaluation with two horizons, 1 step and 1 s.
 
-    relative: relative error of the model at 1 s. nmse: nMSE of its torque. others: relative errors of other predictors.
-    seen: the test logs are training logs.
+    relative: relative error of the model at 1 s. nmse: nMSE of its torque. others: relative errors of other predictors,
+    by their names. traces: further traces of the evaluation, such as "coverage", the ranges of the test motion. seen:
+    True if the test logs are training logs.
     """
     horizons = []
     for k, (name, factor) in enumerate((("1 step", 0.5), ("1 s", 1.0))):
@@ -169,7 +170,7 @@ def test_where_a_constant_velocity_is_better_the_model_is_for_torques():
     still = "velocity stays constant"
     better = "A constant velocity predicts better 1 s ahead: there, use the model for torques only."
     assert better in verdict(evaluation(0.9, 0.004, **{still: 0.6})).because
-    # A torque nMSE of 0.4 is too large for torques, too: no use is recommended in place of the prediction.
+    # With a torque nMSE of 0.4, torques are not accurate either: "use the model for torques only" is omitted.
     assert "better 1 s ahead. " in f"{verdict(evaluation(0.9, 0.4, **{still: 0.6})).because} "
     held = evaluation(0.9, 0.004, **{still: 0.6, "model + observer": 0.2})
     assert "A constant velocity" not in verdict(held).because

@@ -1,4 +1,4 @@
-"""Baselines are integrated with steps of their own, identified from the same logs, and kept with a run."""
+"""Baselines are identified from the training logs, saved in the run folder, and integrated with accurate steps."""
 
 import hashlib
 import json
@@ -50,7 +50,7 @@ class Slider:
 
 
 class Bristled(Slider):
-    """A slider with hysteretic friction whose stiffness at rest is 2000 N/m on 1 g, and a damping rate of 5000 1/s."""
+    """A slider with hysteretic friction: a bristle of 2 N that breaks away at 1 mm, which is 2000 N/m at rest."""
 
     elements, reach, force = 1, torch.tensor([[1e-3]], dtype=torch.float64), 2.0
 
@@ -82,7 +82,7 @@ def exact(slider, windows):
 
 
 def test_damping_far_beyond_an_explicit_step_is_integrated():
-    # the damping rate is 5000 1/s: a step of RK4 of 0.05 s would multiply the velocity by 1e7
+    # The damping rate is 5000 1/s: an explicit RK4 step of 0.05 s would multiply the velocity by 250^4 / 24 = 1.6e8.
     stiff, windows = Slider(1e-3, 5.0), pushed()
     qd = roll_out_stiff(stiff, windows, 1)[1]
     assert (qd[:, 2:] - exact(stiff, windows)[:, 2:]).abs().max() < 1e-2
@@ -221,7 +221,8 @@ def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
     after = digests(folder)
     assert after.pop("evaluation.json"), "the one file that evaluate writes"
     assert after == trained
-    # The test recording has the name of the training recording, but other samples.
+    # The test recording has the name of the training recording, but other samples. It does not count as training data:
+    # otherwise the assessment would begin with "Evaluated on training logs".
     assert text.startswith("Good enough for "), "the assessment comes first"
     run_command("report", str(folder))
     kept = json.loads((folder / "least_squares.json").read_text())

@@ -1,4 +1,4 @@
-"""Benchmarks: folds do not overlap, tables are right, and simulated errors have their level and correlation."""
+"""Benchmarks: folds do not overlap, tables are correct, simulated errors have the specified level and correlation."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,11 @@ def test_changes_are_ratios_of_the_same_cells():
 
 
 def test_noise_has_its_level_correlation_and_spectrum():
-    """The noise of `ErrorProcess` has the given level, autocorrelation exp(-lag / time) and an AR(1) spectrum."""
+    """Torque noise of `ErrorProcess` has the given level, the autocorrelation exp(-lag / T) and an AR(1) spectrum.
+
+    The level is the standard deviation of the noise divided by the standard deviation of the torque; T is the
+    correlation time.
+    """
     errors = real_errors.RealErrors(slow_noise=0.1, slow_correlation=0.5)
     process = real_errors.ErrorProcess(errors, np.ones(3), np.random.default_rng(0))
     torque = np.random.default_rng(1).normal(size=(400_000, 3))
@@ -77,9 +81,11 @@ def test_noise_has_its_level_correlation_and_spectrum():
     np.testing.assert_allclose(found.correlation, expected, atol=0.05)
     assert found.level == pytest.approx(0.1, rel=0.05)
     assert sum(found.power) == pytest.approx(1.0)
-    # spectrum of AR(1) noise: a share of 2 / pi arctan(2 pi f time) of its power is below the frequency f
+    # Spectrum of AR(1) noise: the share 2 / pi arctan(2 pi f T) of its power is below the frequency f, with the
+    # correlation time T = 0.5 s.
     below = 2 / np.pi * np.arctan(np.pi * np.array(residual_statistics.BANDS[1:-1]))
-    # the tolerance is the resolution of a periodogram of 4 s
+    # A periodogram of 4 s resolves 0.25 Hz: power within 0.125 Hz of an edge may count in the wrong band. At the first
+    # edge, 0.5 Hz, this is the power from 0.375 to 0.5 Hz, a share of 0.09: the tolerance.
     np.testing.assert_allclose(np.cumsum(found.power)[:-1], below, atol=0.09)
 
 
@@ -116,7 +122,11 @@ def test_elastic_joints_resonate_and_teeth_change_flanks():
 
 
 def test_play_sticks_and_slips():
-    """If the position rises and falls, the state of `play` is 1, then -1 within two break-away displacements."""
+    """The state of `play` is the bristle displacement divided by the break-away displacement, from -1 to 1.
+
+    It is 1 from one break-away displacement after the start of a rising position, and -1 from two break-away
+    displacements after the reversal.
+    """
     q = np.concatenate([np.arange(0, 101), np.arange(99, -1, -1)])[:, None] * 0.01
     z = real_errors.play(q, np.array([0.1]))[:, 0]
     np.testing.assert_allclose(z[:11], np.linspace(0, 1, 11), atol=1e-9)

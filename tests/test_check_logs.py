@@ -45,7 +45,10 @@ def arm(loaded):
 
 @pytest.fixture(scope="module")
 def log(arm) -> Trajectory:
-    """Return a log of 20 s of smooth motion at 100 Hz within the limits, with the URDF's torques and friction."""
+    """Return a log of 20 s of smooth motion within the limits, at 100 Hz with a jitter of the times.
+
+    Its torques are torques of the URDF's rigid bodies plus viscous and dry friction.
+    """
     random = np.random.default_rng(0)
     t = np.cumsum(0.01 * (1 + 0.1 * random.uniform(-1, 1, 2000)))
     middle, width, speed = np.array([0.0, 0.8, 0.2]), np.array([0.5, 0.2, 0.8]), np.array([0.5, 0.7, 1.1])
@@ -97,7 +100,7 @@ def test_motor_torques_are_taken_to_the_joints(loaded, arm, log):
 
 @pytest.fixture(scope="module")
 def loaded_joint(loaded, log) -> int:
-    """Return the index of the joint with the largest gravity torques; one check of the log serves all tests."""
+    """Return the index of the joint with the largest gravity torques. The log is checked once per test module."""
     joints = check_logs([log], loaded).joints
     return max(range(3), key=lambda k: joints[k].gravity.relative_deviation or 0)
 
@@ -269,7 +272,7 @@ def test_settings_that_logs_do_not_need_may_have_errors(spelgen, robots, arm, lo
 def test_logs_beyond_the_bound_of_memory_are_checked_by_segments(
     spelgen, robots, arm, log, tmp_path, monkeypatch
 ):
-    """Of logs beyond the bound of memory, the kept segments are checked, and the report states their number."""
+    """If logs exceed the memory bound, one of every k segments is kept and checked; the report states k."""
     names = [coordinate.name for coordinate in arm.coordinates]
     write_logs(tmp_path / "logs.parquet", [log], names)
     command = ["logs", "logs.parquet", "--robot", robots / "rpr.urdf", "--format", "json"]
@@ -307,7 +310,7 @@ def test_the_line_for_velocities_of_the_opposite_sense_mends_them(robots, arm, l
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 5.0])
 def test_a_constant_torque_is_reported(loaded, log, constant):
-    """A constant torque is reported, also the value 0.1, although rounding makes its mean differ from the samples."""
+    """A constant torque is reported even if rounding errors make its mean differ from its value, as for 0.1 Nm."""
     report = check_logs([replace(log, tau=np.full_like(log.tau, constant))], loaded)
     assert {x.code for x in report.findings} == {"constant-torque"}
     assert [x.gravity.explained for x in report.joints] == [None] * 3
@@ -378,7 +381,8 @@ def test_logs_of_real_arms_have_no_errors(shared):
 def test_a_payload_is_not_another_unit_of_torques(shared, name):
     """The gravity torque of a payload is not mistaken for another unit of the torques.
 
-    At wrist 2 it is 36 times the gravity torque of the URDF's wrist. The load may be named as a part of the last link.
+    At wrist 2 it is 36 times the gravity torque of the URDF's wrist. The only finding allowed is the warning
+    `urdf-inertials`, which advises to add the load to the last link.
     """
     folder = shared / "logs" / "ur10e"
     real = load_arm(folder / "ur10e.urdf")
@@ -489,7 +493,10 @@ def test_commands_on_round_levels_are_not_quantised(samples_held):
 
 
 def test_no_coupling_is_found_by_chance(loaded, log):
-    """If no parameters explain the torques, the best of all couplings is not reported."""
+    """For random-walk torques, which no parameters explain, no coupling of motors is found.
+
+    The best of all couplings lowers the torque error a little by chance, but is not significant.
+    """
     for seed in range(10):
         noise = np.random.default_rng(seed).standard_normal(log.tau.shape).cumsum(axis=0)
         alone = Drives(np.eye(3), np.eye(3))
@@ -536,8 +543,8 @@ def test_a_coupling_of_recorded_logs_is_reported_before_a_fit(shared):
 def test_seconds_of_recorded_logs_show_a_coupling(shared):
     """The coupling of the TX40's wrist is found in the first 5.4 s of its log.
 
-    The coupling lowers the squared torque residual in each of ten blocks of the log: a thousand times in one, three
-    times in the others.
+    The coupling lowers the squared torque residual in each of ten blocks of the 5.4 s: by a factor of 1000 in one
+    block, and of 3 to 20 in the others.
     """
     tx40 = load_arm(shared / "logs" / "tx40" / "tx40.urdf")
     (log,) = read_logs([shared / "logs" / "tx40"], tx40)
@@ -547,7 +554,10 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
 
 @pytest.mark.parametrize("name", ["ga_N12T25", "ga_N12T25_again", "opt"])
 def test_degrees_of_a_recorded_arm_with_coarse_encoders_are_one_error(shared, name):
-    """In degrees, the steps of coarse encoders exceed thresholds in rad, and yet no signal is reported as frozen."""
+    """If angles of coarse encoders are logged in degrees, the only error is the unit: no signal is reported as frozen.
+
+    In degrees, the steps of the encoders exceed thresholds in rad.
+    """
     folder = shared / "logs" / "airbot"
     airbot = load_arm(folder / "airbot.urdf")
     (log,) = read_logs([folder / f"{name}.parquet"], airbot)

@@ -9,7 +9,8 @@ from benchmarks.truth import Case, Truth, record_log, wrong_urdf
 from spelgen.arm.configured_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
 
-# Findings that are correct for these logs: they are about the amount of motion, and the URDF's inertials are wrong.
+# Codes of findings that are correct for these logs: joints may rest, move in one direction, or exceed limits of effort
+# or velocity in the short random motion; the inertials of the URDF are wrong (`urdf-inertials`).
 TRUE = {"one-way", "joint-at-rest", "beyond-effort-limit", "beyond-velocity-limit", "urdf-inertials"}
 
 
@@ -31,7 +32,10 @@ def recorded(robot: Path, seed: int, folder: Path, **properties):
 
 @pytest.mark.parametrize(("robot", "seed"), [("ur10e", 0), ("panda", 2), ("ur10e", 5)])
 def test_synchronous_joints_with_dry_friction_get_no_advice(robots, tmp_path, robot, seed):
-    """Friction after reversals is not reported as a motor coupling, and friction of one-way motion not as a stop."""
+    """Logs of joints that start and stop together, with dry friction, get no warning of couplings or mechanical stops.
+
+    Friction after reversals resembles a motor coupling, and friction of one-way motion a mechanical stop.
+    """
     arm, logs = recorded(robots / f"{robot}.urdf", seed, tmp_path)
     report = check_logs(logs, arm)
     assert not report.errors

@@ -19,7 +19,7 @@ def emitted(tmp_path_factory):
 
 
 def drawn(module, seed, deviation=0.5):
-    """Return the model of a module with normal random parameters of this standard deviation."""
+    """Return the model of an emitted module with normal random parameters of standard deviation ``deviation``."""
     model = module.Model()
     generator = torch.Generator().manual_seed(seed)
     for parameter in model.parameters():
@@ -28,7 +28,7 @@ def drawn(module, seed, deviation=0.5):
 
 
 def rigid(module):
-    """Return the untrained model of a module without friction and armature: the URDF's rigid bodies."""
+    """Return the untrained model of an emitted module, with zero friction and armature: the URDF's rigid bodies."""
     model = module.Model()
     model.nominal_armature.zero_()
     model.friction.nominal.zero_()
@@ -46,7 +46,7 @@ def near(a, b, tolerance=1e-9):
 
 
 def moved(q, qd, matrix_of):
-    """Return the derivative of matrix_of(q) with respect to time along qd."""
+    """Return the time derivative of the matrix ``matrix_of(q)`` at the velocity qd = dq/dt."""
     return torch.func.jvp(matrix_of, (q,), (qd,))[1]
 
 

@@ -1,4 +1,4 @@
-"""`spelgen compare`: all presets have the same data, losses are the paper's, interrupted runs are resumed."""
+"""`spelgen compare`: all presets have the same data, losses are as in Wang et al. (2025), killed runs are resumed."""
 
 import json
 import math
@@ -82,7 +82,10 @@ def results(study):
 
 
 def losses_of(result):
-    """Return {loss: value} of the model of a simulated arm."""
+    """Return {name: value} of the losses in the result of one run, such as "prediction loss, 1 s".
+
+    The run is of a simulated arm: there are errors of the model, but of no other predictor.
+    """
     assert all(set(errors) == {"model"} for errors in result.errors.values())
     return {label: errors["model"] for label, errors in result.errors.items()}
 
@@ -154,7 +157,7 @@ def test_figures_of_a_run_agree_with_one_another(results):
 
 
 def test_losses_are_the_mean_squared_errors_of_rollouts_from_the_logs(study, results):
-    """Losses equal squared errors from the logs, summed over joints and averaged over samples and windows."""
+    """Losses are squared errors of rollouts (position + velocity), sums over joints, means over samples and windows."""
     job = next(job for job in study.jobs if job.preset == "hybrid")
     model, losses = trained(job), losses_of(results["hybrid"])
     for key, role, samples in (

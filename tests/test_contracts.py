@@ -25,13 +25,14 @@ ALL_ROBOTS = ("hybrid", "minimal", "closed-form")
 WITH_FRICTION_STATE = ("hybrid", "closed-form")
 THREE = ("two_link", "rpr", "six_dof")
 URDFS = {"mimic": FOLLOWED, "gantry": GANTRY}  # generated arms, tested like the robots of the repository
-# Standard deviations of random parameters; None: the scales of `randomise`. With 1.0 the bound of M is active.
+# {variant: standard deviations of random parameters}; a test is repeated for each. None: the standard deviations of
+# `randomise`. With 1.0, the mass matrix of minimal would be indefinite at some q without the model's bound.
 DEVIATIONS = {"minimal": (None, 1.0), "closed-form": (0.5,)}
 LARGE = {
     "phnode": None,
     "phnode-kan": None,
     "closed-form": 1.5,
-}  # largest scale of parameters: at 3.0 phnode would invert an ill-conditioned matrix
+}  # {variant: standard deviation of random parameters}; default: 3.0, where phnode inverts an ill-conditioned matrix
 
 each_case = pytest.mark.parametrize(
     ("variant", "robot"),
@@ -63,7 +64,10 @@ def module_of(tmp_path_factory):
 
 @pytest.fixture
 def random_model(module_of):
-    """Return a model of a variant and a robot with random parameters of this standard deviation."""
+    """Return a function (variant, robot, seed, deviation) that returns a model with random parameters.
+
+    deviation: standard deviation of the parameters; None: see `randomise`.
+    """
 
     def model(variant, robot, seed, deviation=None):
         made = module_of(variant, robot).Model(seed=seed)
@@ -74,13 +78,13 @@ def random_model(module_of):
 
 
 def states(n: int, *shape: int, count: int = 4) -> tuple[Tensor, ...]:
-    """Return random q, qd, qdd and tau, (*shape, n) each."""
+    """Return the first ``count`` of random q, qd, qdd and tau, (*shape, n) each, with standard deviation 1.5."""
     generator = torch.Generator().manual_seed(0)
     return tuple(1.5 * torch.randn(*shape, n, dtype=torch.float64, generator=generator) for _ in range(count))
 
 
 def assert_near(found: Tensor, expected: Tensor, bound: float = 1e-10) -> None:
-    """Assert equal shapes, and a difference of at most a tolerance relative to the largest entry."""
+    """Assert equal shapes, and differences of at most ``bound`` times the largest expected magnitude, or times 1."""
     assert found.shape == expected.shape
     assert (found - expected).abs().max() <= bound * max(1.0, expected.abs().max().item())
 

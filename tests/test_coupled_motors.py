@@ -39,13 +39,14 @@ from spelgen.simulation.simulate import simulate
 
 # matrix from torques of the last two motors to torques of the last two joints
 WRIST = np.array([[50.0, 50.0], [40.0, -40.0]])
-# matrix from velocities of the last two joints to velocities of the motors, relative to motor 5
+# Speeds of motors 5 and 6 (rows) per speed of joints 5 and 6 (columns): WRIST^T, with each row divided by its largest
+# entry, 50.
 SPEEDS = np.array([[1.0, 0.8], [1.0, -0.8]])
 
 
 @pytest.fixture(scope="module")
 def wrist(tmp_path_factory):
-    """Return a module and the loaded arm: six joints, with a differential at the last two."""
+    """Return an emitted module and its arm of six joints; a differential couples the motors of the last two."""
     folder = tmp_path_factory.mktemp("wrist")
     names = [f"j{k}" for k in range(1, 7)]
     shutil.copy(ROBOTS / "six_dof.urdf", folder / "arm.urdf")
@@ -58,8 +59,8 @@ def wrist(tmp_path_factory):
     return import_source(generate(arm, preset="closed-form"), folder / "wrist.py"), arm
 
 
-def moved(model, seconds, seed=0):
-    """Return q, qd, qdd and torque of a smooth motion: rigid bodies, and friction and rotors at the motors."""
+def moved(seconds, seed=0):
+    """Return q, qd and qdd, (T, 6) each, of a random motion at 100 Hz: sums of four sines."""
     rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 0.01)[:, None, None]
     speed, phase, size = (rng.uniform(*x, (4, 6)) for x in ((0.7, 4.0), (0.0, 6.3), (0.2, 0.5)))
     q, qd, qdd = ((size * speed**k * np.sin(speed * t + phase + k * np.pi / 2)).sum(axis=1) for k in range(3))
@@ -69,8 +70,8 @@ def moved(model, seconds, seed=0):
 def on_motors(q, qd, qdd, arm, strength, armature):
     """Return joint torques and motor torques, (T, 6) [Nm] each, of a motion of an arm with coupled motors.
 
-    Friction and rotor inertia act at the motors. strength: Coulomb friction of each motor [Nm]. armature: inertia of
-    each rotor [kg m^2].
+    Friction and rotor inertia act at the motors. strength: Coulomb friction of each motor [Nm]; its viscous coefficient
+    is 0.3 times this number [Nm s/rad]. armature: inertia of each rotor [kg m^2].
     """
     speeds = np.eye(6)
     speeds[4:, 4:] = SPEEDS
@@ -81,7 +82,10 @@ def on_motors(q, qd, qdd, arm, strength, armature):
 
 
 def noisy(tau):
-    """Return torques (T, 6) with noise of 1 %; without noise a fit would take seven times as long."""
+    """Return torques, (T, 6), with noise of 1 % of each joint's standard deviation.
+
+    A fit to torques without noise takes seven times as long.
+    """
     return tau + 0.01 * tau.std(axis=0) * np.random.default_rng(2).standard_normal(tau.shape)
 
 
@@ -95,14 +99,14 @@ def test_motor_speeds_are_of_the_joint_that_each_moves_most(wrist):
 
 
 def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
-    module, arm = wrist
+    _, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     errors = []
     for drives in (arm.actuation.drives(), None):
-        motion = moved(module, 20.0)
+        motion = moved(20.0)
         tau, _ = on_motors(*motion, arm, strength, armature)
         found = least_squares(arm.chain, [DynamicsSamples("x", *motion, tau)], LeastSquares("range"), drives)
-        fresh = moved(module, 10.0, seed=1)
+        fresh = moved(10.0, seed=1)
         tau, measured = on_motors(*fresh, arm, strength, armature)
         errors.append(np.square(found.torque(*fresh) - tau).mean(axis=0) / tau.var(axis=0))
         if drives is not None:
@@ -119,11 +123,11 @@ def test_least_squares_finds_friction_and_rotors_of_coupled_motors(wrist):
 def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
     module, arm = wrist
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
-    motion = moved(module, 6.0)
+    motion = moved(6.0)
     _, tau = on_motors(*motion, arm, strength, armature)
     model = module.Model()
     fit_torque(model, [DynamicsSamples("x", *motion, noisy(tau))])
-    fresh = moved(module, 10.0, seed=1)
+    fresh = moved(10.0, seed=1)
     _, tau = on_motors(*fresh, arm, strength, armature)
     with torch.no_grad():
         found = model.inverse_dynamics(*(torch.from_numpy(x) for x in fresh)).numpy()
@@ -133,10 +137,10 @@ def test_a_closed_form_model_is_fitted_to_a_coupled_wrist(wrist):
 def test_derivatives_are_right_for_coupled_motors(wrist):
     """With coupled motors, derivatives of the fit with respect to every parameter equal finite differences."""
     module, arm = wrist
-    motion = [x[::40] for x in moved(module, 4.0)]
+    motion = [x[::40] for x in moved(4.0)]
     _, tau = on_motors(*motion, arm, np.ones(6), np.ones(6))
     model = module.Model(seed=1)
-    z = bristles_along(moved(module, 4.0)[0], bristle_reach(model))[::40]
+    z = bristles_along(moved(4.0)[0], bristle_reach(model))[::40]
     jacobian = TorqueJacobian(model, TorqueSamples.of([DynamicsSamples("x", *motion, tau, z)]))
     noise = torch.ones(6).double()
     start = jacobian.rigid.flatten(jacobian.rigid.initial)
@@ -154,14 +158,15 @@ def test_derivatives_are_right_for_coupled_motors(wrist):
 
 
 def test_energy_and_memory_are_those_of_the_motors(wrist):
-    """Dissipation, bristles and rotors act at motor speeds: power is qd^T D qd, and M contains C^T A C.
+    """Friction and rotor inertia act at the motor speeds C qd, and bristles are displaced by motor displacements.
 
-    C: motor speeds per joint speed. A: diagonal matrix of the armatures. D: dissipation matrix.
+    D qd is the friction torque, where the dissipation matrix D couples joints 5 and 6. M contains C^T A C, with the
+    diagonal matrix A of the armatures. A joint displacement dq displaces the bristles by C dq.
     """
     module, _ = wrist
     model = module.Model()
     with torch.no_grad():
-        q, qd, _ = (torch.from_numpy(x[:50]) for x in moved(module, 1.0))
+        q, qd, _ = (torch.from_numpy(x[:50]) for x in moved(1.0))
         torque, dissipation = model.friction_torque(q, qd), model.dissipation(q, qd)
         torch.testing.assert_close((dissipation @ qd.unsqueeze(-1)).squeeze(-1), torque)
         assert torch.linalg.eigvalsh(dissipation).min() >= 0
@@ -190,7 +195,7 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
     np.testing.assert_allclose(arm.actuation.drives().speeds, driven.actuation.drives().speeds)
     strength, armature = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]), np.full(6, 0.2)
     module = import_source(generate(arm, preset="closed-form"), tmp_path / "joint_torques.py")
-    motion, fresh = moved(module, 6.0), moved(module, 10.0, seed=1)
+    motion, fresh = moved(6.0), moved(10.0, seed=1)
     (tau, _), (expected, _) = (on_motors(*x, driven, strength, armature) for x in (motion, fresh))
     samples = [DynamicsSamples("x", *motion, tau)]
     found = least_squares(arm.chain, samples, LeastSquares("range"), arm.actuation.drives())
@@ -204,13 +209,14 @@ def test_motors_may_be_coupled_where_joint_torques_are_logged(wrist, tmp_path):
 
 
 def recorded(arm, logged_at, ratio, late=0.0):
-    """Return a log of 20 s of a six-joint arm whose motor 6 turns with joint 6 and `ratio` times joint 5, 2 % noise.
+    """Return a log of 20 s of a six-joint arm with a coupled motor: motor 6 has the speed qd_6 + ratio qd_5.
 
-    logged_at: "joints" or "motors", at which the torques are logged. late: delay of the torques [s].
+    logged_at: "joints" or "motors", at which the torques are logged. late: delay of the torques [s]. The noise of each
+    torque is 2 % of its standard deviation.
     """
     rng = np.random.default_rng(0)
     t = np.arange(0.0, 20.0, 0.01)
-    q, qd, qdd = moved(None, 20.0, seed=3)
+    q, qd, qdd = moved(20.0, seed=3)
     speeds = np.eye(6)
     speeds[5, 4] = ratio
     friction = np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0])
@@ -302,7 +308,10 @@ def test_no_delay_is_estimated_with_an_unspecified_coupling(uncoupled):
 
 @pytest.mark.usefixtures("coarse_validation")
 def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
-    """A fit finds the coupling in the logs: it equals the fit of an arm whose settings state the coupling."""
+    """A fit finds a motor coupling in logged motions and torques.
+
+    Its motor speeds and its score equal the result of a fit to the same log with the coupling in the settings.
+    """
     log, names = recorded(uncoupled, "joints", 1.0, late=0.01), uncoupled.chain.joint_names
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
     setting = f"couplings: [{{joints: [{names[4]}, {names[5]}], matrix: [[1, 1], [0, 1]]}}]\n"
@@ -319,9 +328,10 @@ def test_a_fit_has_the_coupling_that_its_logs_show(uncoupled, tmp_path):
 
 
 def test_a_coupling_that_goes_with_the_delay_is_a_delay(uncoupled, monkeypatch):
-    """A coupling whose evidence vanishes after a correction of the torque delay is not reported: the delay is.
+    """If a motor coupling lowers the torque error only before the torque delay is corrected, it is not reported.
 
-    The case is number 160 of `benchmarks/truth.py`: an arm without friction, with a delay of 5 ms.
+    The delay is reported instead. The case is number 160 of `benchmarks/truth.py`: an arm without friction, with a
+    delay of 5 ms.
     """
     coupling = Coupling(5, 4, 1.0, "joints")
 
@@ -342,7 +352,10 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
 
 
 def trained_gains(tmp_path, names, gear=1):
-    """Return a closed-form model of six_dof.urdf with trained motor gains, initially `gear`."""
+    """Return a closed-form model of six_dof.urdf; the motors of the joints ``names`` have trained gains.
+
+    gear: initial value of all these gains (joint torque per motor torque).
+    """
     shutil.copy(ROBOTS / "six_dof.urdf", tmp_path / "arm.urdf")
     joints = ", ".join(f"{x}: {{gear: {gear}, gain: trained}}" for x in names)
     (tmp_path / "arm.yaml").write_text(f"torque: motor\njoints: {{{joints}}}\n", encoding="utf-8")
@@ -370,7 +383,8 @@ def test_intervals_contain_unknown_gains_if_the_masses_of_the_urdf_are_wrong(unc
     fitted = fit(model, [replace(log, tau=log.tau / gains)], TorqueFit(), arm=load_arm(tmp_path / "arm.urdf"))
     found = fitted.posterior.drives["gain"]
     assert all(x.low <= gain <= x.high for x, gain in zip(found, gains, strict=True))
-    # The relative error of the scale is below the 30 % of a single mass, since six masses are averaged.
+    # The common scale of the gains is fixed by the masses of the URDF. Its relative error is below 30 %, the error of a
+    # single mass, since the errors of six masses are averaged.
     assert abs(np.log([x.value / gain for x, gain in zip(found, gains, strict=True)]).mean()) < 0.3
 
 
@@ -390,14 +404,17 @@ def test_initial_gains_that_are_far_off_are_replaced(uncoupled, tmp_path):
     set_initial_gains(model, samples, 0.3)
     with torch.no_grad():
         found = model.input_matrix(torch.zeros(6).double()).diagonal().numpy()
-    # wide bounds, as the masses of the URDF are not the robot's
+    # The bounds are wide, since the rotor inertia in the log, 0.2 kg m^2, differs from the initial one of the model.
     np.testing.assert_allclose(found[1:5] / gains[1:5], 1.0, atol=0.35)
     assert found[0] == pytest.approx(np.median(found[1:5]), rel=0.3)
     assert found[5] == 1.0
 
 
 def test_initial_gains_that_are_right_are_kept(uncoupled, tmp_path):
-    """Initial gains that agree with the torques are kept: `gear` is not applied twice."""
+    """Initial gains that agree with the torques are kept.
+
+    The gear of 40 in the settings is the initial gain already: it must not multiply the gains once more.
+    """
     model = trained_gains(tmp_path, uncoupled.chain.joint_names, gear=40)
     log = recorded(uncoupled, "joints", 0.0)
     (samples,) = dynamics_samples([replace(log, tau=log.tau / 40.0)])

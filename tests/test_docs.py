@@ -1,8 +1,8 @@
 """Console and Python blocks of each documentation page run in order and print the outputs on the page.
 
-In a ```console block a line `$ COMMAND` is followed by its output, and an ```output block follows the Python block
-that prints it; `pytest --update` rewrites both. ```text blocks and indented ones are not run: they show long runs,
-or no commands. A tutorial is a notebook as well, of the same cells.
+In a ```console block, a line `$ COMMAND` is followed by its output. The output of a Python block is in the ```output
+block after it. `pytest --update` rewrites both outputs. ```text blocks and indented code blocks are not run: they show
+commands that take long, or no commands. Each tutorial is also a notebook with the same cells.
 """
 
 import ast
@@ -87,7 +87,10 @@ def tree(folder: Path) -> dict[Path, bytes]:
 
 
 def cell(text: str, block: str, output: str = "") -> str:
-    """Return a block of code and its output, as in `text` if the text contains the block, else with `output`."""
+    """Return the Markdown of a tutorial's cell: the Python code `block`, and the ```output block after it.
+
+    The output is copied from `text`, the Markdown of the page, if `text` contains the block. Otherwise it is `output`.
+    """
     for match in CELL.finditer(text):
         if match[1] == block:
             return match[0]

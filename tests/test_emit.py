@@ -35,7 +35,7 @@ follow_imports = normal
 
 @pytest.mark.parametrize(("robot", "preset"), [("two_link", "hybrid"), *(("rpr", p) for p in PRESETS)])
 def test_golden_text(robot, preset, request):
-    """Thin modules equal their golden copies; ``pytest --update`` rewrites these."""
+    """Thin modules (which import spelgen.runtime) equal their golden copies, which ``pytest --update`` rewrites."""
     path = GOLDEN / f"{robot}_{preset.replace('-', '_')}.py"
     text = built(robot, preset=preset)[0]
     if request.config.getoption("--update"):
@@ -46,7 +46,7 @@ def test_golden_text(robot, preset, request):
 
 
 def test_a_standalone_module_contains_the_text_of_the_thin_one(tmp_path):
-    """The lines of the arm, its model and the specification are equal in the thin and the standalone form."""
+    """Standalone modules contain the arm, model and specification of thin modules, which import spelgen.runtime."""
     for preset in PRESETS:
         thin, standalone = (built("rpr", preset=preset, standalone=x)[0] for x in (False, True))
         arm, model = thin.split("\n\n\nclass Model(")

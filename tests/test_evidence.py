@@ -30,7 +30,10 @@ from spelgen.settings.fits import GaussianPrior
 
 
 class Unabsorbed:
-    """Projection of a model whose rigid bodies and friction can absorb no added torque."""
+    """Stub for the projection of joint torques: `orthogonalize` returns an added torque unchanged.
+
+    A real projection subtracts the part of the torque that the rigid-body and friction parameters would absorb.
+    """
 
     @staticmethod
     def orthogonalize(joint, torque):
@@ -129,7 +132,8 @@ def hybrid(robots):
 def test_a_term_has_to_hold_in_the_recording_that_is_held_out(hybrid, other, selected):
     """A residual term is selected only if it also lowers the error in a second, held-out recording.
 
-    Both halves of the first recording support the term; the second recording has the torque times `other`.
+    Both halves of the first recording support the term. In the second recording, the torque residual is the same
+    function of q times `other`: 1 supports the term, -0.2 does not.
     """
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
@@ -195,7 +199,10 @@ def test_spring_extrapolates_to_positions_without_samples(hybrid):
 
 
 def test_slow_passes_are_few_errors(hybrid):
-    """If a joint passes its range once, its samples count as only 1 + range / knot spacing independent errors."""
+    """If a joint moves through its range once, its samples count as only 1 + range / spacing independent errors.
+
+    spacing: distance of the knots of the position-dependent functions of the joint [rad], here for a range of 2 rad.
+    """
     from spelgen.fitting.torque.joint_functions import joint_functions
 
     lengths = []
@@ -270,7 +277,10 @@ def first_seconds(folder: Path, arm: str, seconds: float) -> tuple[TorqueSolutio
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_second_of_motion_supports_no_fit(shared, arm):
-    """A fit to 1.5 s of motion warns of too few data: it names methods of similar error, and the seconds to record."""
+    """A fit to 1.5 s of motion warns of too few data, and states how many seconds to record.
+
+    The warning names the URDF's values and ridge regression as methods that may be as good as the fit.
+    """
     _, codes, messages = first_seconds(shared / "logs", arm, 1.5)
     assert "few-data" in codes
     assert "URDF" in messages[0] and "ridge" in messages[0] and " s in which all joints move" in messages[0]

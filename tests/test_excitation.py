@@ -76,16 +76,19 @@ def test_the_optimised_motion_is_more_informative(loaded, found):
 
 
 def test_a_random_motion_beyond_effort_limits_is_called_so(found):
-    """The text marks the condition number of the first random motion if this motion exceeds effort limits."""
+    """If the torques of the first random motion exceed effort limits, `Excitation.text` says so.
+
+    "beyond effort limits" follows the condition number of this motion, `first`. found: result of `excite`.
+    """
     assert not found.first_overruns
     assert "beyond effort limits" not in found.text()
     assert f"{found.first:.3g}, beyond effort limits" in replace(found, first_overruns=True).text()
 
 
-def test_the_condition_number_is_that_of_the_regressor(arm, found):
-    """Without friction and rotors, the condition number equals that computed from Pinocchio's rigid-body regressor.
+def test_the_optimised_motion_excites_all_base_parameters(arm, found):
+    """The optimised motion excites all 36 base parameters: Pinocchio's rigid-body regressor along it has rank 36.
 
-    The rank is determined numerically.
+    Relative to the largest singular value, the 36th is above 1e-3 and the 37th below 1e-9.
     """
     pin = pytest.importorskip("pinocchio")
     from spelgen.dynamics.pinocchio_arm import pinocchio_model
@@ -99,7 +102,7 @@ def test_the_condition_number_is_that_of_the_regressor(arm, found):
         for state in zip(motion.q[::10], motion.qd[::10], motion.qdd[::10], strict=True)
     ]
     values = np.linalg.svd(np.concatenate(rows), compute_uv=False)
-    # singular values: the motion excites all 36 base parameters, and no others exist
+    # singular values, in decreasing order: the UR10e has 36 base parameters
     assert values[35] / values[0] > 1e-3 > 1e-9 > values[36] / values[0]
 
 
@@ -219,7 +222,8 @@ def test_the_command(robots, tmp_path, monkeypatch):
     assert shown.exit_code == 0, shown.stderr
     assert max(map(len, shown.stdout.splitlines())) <= 80
     assert "of the first motion at random" in shown.stdout
-    # `inspect` states only 6 base inertial parameters, so the text names the groups of the 13.
+    # For two joints, 13 = 6 base parameters + 2 x 4 for friction and armature - 1, the armature of joint 1, which acts
+    # like the inertia of link 1. The command prints these groups, since `inspect` states only the 6 base parameters.
     assert "of the regressor of 13 parameters: base parameters, friction and armature" in shown.stdout
     with open("x.csv", newline="") as file:
         head, *rows = csv.reader(file)

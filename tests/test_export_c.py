@@ -228,9 +228,10 @@ def test_bristles_follow_their_law_along_a_displacement():
 
 @needs_gcc
 def test_c_carries_frictions_memory(tmp_path):
-    """C has the friction state: two elements per joint, which change dry friction by their deflection.
+    """C adds the torque of bristles, two per joint with deflection z: dry friction * sum(fraction * z / break-away).
 
-    The macro NZ is the number of states.
+    At steady sliding, z is the break-away displacement times tanh(qd / smoothing velocity). The macro NZ is the number
+    of bristles.
     """
     model = Trained(moved_model("two_link", "closed-form"), arm_of("two_link")).described
     model = replace(model, breakaway=REACH, friction=model.friction._replace(bristle_fractions=FRACTIONS))

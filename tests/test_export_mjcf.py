@@ -27,9 +27,9 @@ from spelgen.exporting.rigid_body_projection import rigid_body_projection
 
 @pytest.mark.parametrize("robot", ["rpr", "scara", "panda"])
 def test_closed_form_bodies_go_to_mujoco_exactly(robot):
-    """Rigid bodies and tip of closed-form models are exact in MuJoCo.
+    """M, tip position, armature and lower limits in MuJoCo equal the values of the exported closed-form model.
 
-    The test compares them itself, independently of the check of the export (200 states, to 1e-9).
+    The test evaluates MuJoCo at one position. The export's own check compares the dynamics at 200 random states.
     """
     model, arm = moved_model(robot, "closed-form"), arm_of(robot)
     found = export(model, "mjcf", arm=arm)
@@ -151,9 +151,10 @@ ROUNDED = """<robot name="rounded"><link name="base"/>
 
 
 def test_all_targets_agree_on_the_tip(tmp_path):
-    """Each export places the tip where Pinocchio does, to 1e-12, although the URDF's angles have only five digits.
+    """Each export places the tip where Pinocchio places it for the same URDF, within 1e-12.
 
-    The model replaces such angles by exact multiples of pi/2.
+    The URDF has rounded angles such as 1.5708. The dynamics of the model use pi/2 instead, but the pose of the tip
+    uses the angles of the URDF, as Pinocchio does.
     """
     pin = pytest.importorskip("pinocchio")
     (tmp_path / "arm.urdf").write_text(ROUNDED.format("", "", ""))

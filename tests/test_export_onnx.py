@@ -29,7 +29,10 @@ ENTRIES = (
 
 @pytest.fixture(scope="module", autouse=True)
 def functions_parsed_once():
-    """Cache 500 functions of torch's exporter, which otherwise parses and lists them per file (nearly a second)."""
+    """Cache the list of torch's 500 ONNX operator functions and their parsed code, to save time.
+
+    Without the cache, torch lists and parses them again for each exported file, which takes nearly a second.
+    """
     parsed = property(functools.cache(TracedOnnxFunction.function_ir.fget))
     listed = staticmethod(functools.cache(ONNXRegistry.from_torchlib))
     with pytest.MonkeyPatch.context() as patch:

@@ -39,7 +39,10 @@ def with_parts(robot, *parts):
 
 
 def closed_form(model, robot):
-    """Return the closed-form model with the bodies and drives of a hybrid model."""
+    """Return the closed-form model of an arm with the inertial, friction and armature parameters of `model`.
+
+    model: hybrid model of the arm, whose residual terms are omitted. robot: name of the arm, such as "rpr".
+    """
     found = build(arm_of(robot), "closed-form").requires_grad_(False)
     found.load_state_dict(
         {key: value for key, value in model.state_dict().items() if key in found.state_dict()}
@@ -98,7 +101,8 @@ def test_a_function_of_one_joint_is_exported_at_this_joint():
     model = with_parts("scara")
     functions = model.residuals
     functions.raw_torque_splines[1, 20] = 1.0
-    # ripple at two frequencies, the largest of which is twice the gear ratio
+    # Amplitude k is of the cosine with k + 1 periods per revolution of the joint, up to k = 63. Amplitudes 64 and 65
+    # are of the motor, with 80 (the gear ratio) and 160 periods. Set here: 3 periods (k = 2) and 160 (k = 65).
     functions.raw_torque_ripple[0, [2, 65]] = torch.tensor([1.0, 2.0], dtype=torch.float64)
     # a prismatic joint has no revolutions, and so no ripple is exported
     functions.raw_torque_ripple[2, 3] = 1.0

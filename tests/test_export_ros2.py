@@ -108,7 +108,8 @@ def test_the_plugin_equals_the_model(package, tmp_path):
         # the first call has no history: it assumes the friction states of steady sliding at qd
         model.friction_torque(torch.zeros_like(q), qd, model.memory(qd)),
         model.inverse_dynamics(q, qd, qdd, model.memory(qd)),
-        # the second call: joints have moved against the deflection that the first velocity caused
+        # The second call updates the friction states by the displacement since the first call, which is opposite to qd:
+        # it reduces the bristle deflections of steady sliding at qd.
         model.inverse_dynamics(q + moved, qd, qdd, model.memory_after(model.memory(qd), moved)),
     ]
     found = np.array([[float(x) for x in line.split()] for line in told])

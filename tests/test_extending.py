@@ -30,14 +30,20 @@ JOINTS = ["joint1", "joint2"]
 
 
 def places(thing: str) -> list[str]:
-    """Return the files that docs/extending.md names for an extension; thing: its name there, such as "a baseline"."""
+    """Return the source files that docs/extending.md names for an extension.
+
+    thing: name of the extension in the first column of the page's table, such as "a baseline".
+    """
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith(f"| {thing} |"))
     return re.findall(r"`(spelgen/[\w/]+\.(?:py|yaml))`", row.split("|")[2])
 
 
 def stands_in(thing: str, module) -> bool:
-    """Return True if docs/extending.md names, for the extension `thing`, the file of `module` and at most one more."""
+    """Return True if docs/extending.md names the file of `module`, and at most one other file, for an extension.
+
+    The page states that each extension is a change in one place or two. thing: name of the extension in the page.
+    """
     named = places(thing)
     return str(Path(inspect.getfile(module)).relative_to(ROOT)) in named and len(named) <= 2
 

@@ -194,7 +194,11 @@ def test_a_name_in_place_of_a_configuration_is_reported(robots):
 
 
 def test_logs_are_read_for_the_choice_of_an_objective_only_if_it_depends_on_them(robots):
-    """If options determine the objective, or contradict it, the logs are not read, which may take long."""
+    """Logs, which may take long to read, are read only if the choice of the objective depends on their sample rates.
+
+    They are not read if the model or the options determine the objective. An option that belongs to another objective
+    is an error, which is raised without reading the logs.
+    """
 
     def unread():
         raise AssertionError("the logs were read")

@@ -1,4 +1,4 @@
-"""Files of `inspect --formulas` are readable and complete, and contain no code from names."""
+"""Files of `inspect --formulas` are readable and complete, and names in a URDF cannot inject code into them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ ON_A_BOARD = {
 
 @pytest.fixture
 def spelgen(tmp_path, monkeypatch):
-    """Return a function that runs a command in this process, in an empty folder."""
+    """Return a function that runs a command of spelgen in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return lambda *arguments: CliRunner().invoke(app, [str(each) for each in arguments])
 

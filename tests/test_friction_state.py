@@ -50,7 +50,8 @@ def test_one_pass_over_positions_solves_the_differential_equation():
     for moved in qd:  # reference: explicit Euler, with steps far below the smallest break-away displacement
         z = z + model.memory_rate(z, moved)
     found = bristles_along(q[::1000].numpy(), BristleReach(np.array(REACH)))[-1]
-    # only fine samples are compared in value: between coarse samples a reversal may be skipped
+    # The states z at every 10th position are compared with the reference. Every 1000th position (`found`) is too coarse
+    # for this, since reversals between samples are lost: only the bound |z| <= reach is tested there.
     finer = bristles_along(q[::10].numpy(), BristleReach(np.array(REACH)))[-1]
     assert np.abs(finer / REACH - (z / reach).numpy()).max() < 1e-2
     assert np.abs(found / REACH).max() <= 1.0
@@ -63,7 +64,8 @@ def test_a_step_of_any_length_is_exact_in_one_direction():
     parts = z
     for part in torch.rand(50, 1).double().softmax(dim=0):
         parts = moved_bristles(parts, (part * way).unsqueeze(-1), reach)
-    # fifty displacements of 20 mrad in total accumulate rounding errors of about 1e-17, and the exact state may be zero
+    # An absolute tolerance is needed, since the exact deflection may be zero. Fifty displacements of 20 mrad in total
+    # accumulate rounding errors of about 1e-17 rad.
     torch.testing.assert_close(parts, moved_bristles(z, way.unsqueeze(-1), reach), rtol=1e-12, atol=1e-15)
 
 

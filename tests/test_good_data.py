@@ -34,7 +34,11 @@ START = 1_700_000_000_000_000_000
 
 
 def joint_state(store, stamp: int, names, *arrays):
-    """Return a JointState message with the time [ns] in its header."""
+    """Return a JointState message of ROS 1 or ROS 2 with the time `stamp` [ns] in its header.
+
+    store: type store of rosbags, which has the message classes. arrays: position, velocity and effort of the joints in
+    `names`, (n,) each.
+    """
     header, clock = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     stamps = {"stamp": clock(sec=stamp // 10**9, nanosec=stamp % 10**9), "frame_id": ""}
     if "seq" in header.__dataclass_fields__:  # headers of ROS 1 have a sequence number
@@ -342,7 +346,10 @@ NO_LIMITS = {
 
 
 def unlimited_arm(robots, folder, name, form):
-    """Write and load one of the project's robots without finite position limits; form: how the <limit> states it."""
+    """Return one of the project's robots without limits of position, velocity and effort.
+
+    form: key of `NO_LIMITS`, which are attributes of a <limit> that mean "unlimited".
+    """
     text = re.sub(r"<limit [^>]*/>", f"<limit {NO_LIMITS[form]}/>", (robots / f"{name}.urdf").read_text())
     (folder / "x.urdf").write_text(text)
     return load_arm(folder / "x.urdf")

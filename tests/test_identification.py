@@ -1,4 +1,7 @@
-"""The regressor equals Pinocchio's; least squares recovers known arms and published figures."""
+"""The regressor equals Pinocchio's, and least squares recovers the known parameters of simulated arms.
+
+For recorded logs of the UR10e and the Panda, it gives the published torque errors (shared/logs/README.md).
+"""
 
 import json
 
@@ -61,14 +64,18 @@ def test_regressor_spans_what_pinocchios_does_and_gives_its_torque(robots, robot
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_base_parameters_are_those_of_inspect(robots, robot):
-    """Base parameters of bodies have names, order, groups and values of `inspect`, and precede those for friction."""
+    """The first base parameters are of the bodies and equal the base parameters of `inspect` in name, order and value.
+
+    The base parameters of friction follow, without a parameter for the armature of joint 1.
+    """
     path = robots / f"{robot}.urdf"
     arm = load_arm(path).chain
     exact = exact_base_parameters(arm)
     base = base_parameters(arm, FrictionModel())
     inertial = 10 * len(arm.bodies)
     assert base.bodies == len(exact) == inspect(path).to_dict()["base_parameters"]
-    # names may differ by R (regrouped): the rotor inertia of a symmetric last link adds to the link's
+    # A name ends with R if other parameters are regrouped into the base parameter. `base`, unlike `exact`, has rotor
+    # inertias. The inertia of a symmetric last link includes its rotor inertia, so its name may differ by the R.
     names = [name.removesuffix("R") for name in base.names[: base.bodies]]
     assert names == [each.name.removesuffix("R") for each in exact]
     assert {each.name for each in inspect(path).closed_forms().base} == {each.name for each in exact}
@@ -350,7 +357,10 @@ def test_an_estimate_has_no_digits_below_its_interval(value, std, text):
 
 
 def test_a_table_of_parameters_explains_r_and_has_the_digits_of_the_intervals():
-    """A value has the last digit of its interval, and the note states the meaning of R if a name ends with it."""
+    """A value is rounded to the same decimal place as the half width of its interval, in the table of parameters.
+
+    If a name ends with R, as in m1R (a parameter that includes parameters of other links), the note below explains R.
+    """
     plain, combined = Interval("hx2", -0.232561, 0.019), Interval("m1R", 2.426412, 0.018)
     assert interval_listing("", [plain], "note").rows == (("hx2", "-0.233", "0.037", "fair"),)
     assert interval_listing("", [plain], "note").note == "note"

@@ -38,14 +38,16 @@ OURS = {f"spelgen.{name}" for name in LAYERS}
 
 # Exact arithmetic, which fits and pages of runs must not import, neither directly nor through other modules.
 SYMBOLIC = {"sympy", "flint", "spelgen.arm", "spelgen.structure"}
-# Module that every file may import: it computes G from the files, without the exact arithmetic of its folder.
+# Exception to SYMBOLIC: every file may import this module of `arm`. It computes the input matrix G (joint torques per
+# drive torque) from the URDF and the settings in floating point, without exact arithmetic.
 PLAIN = {"spelgen.arm.actuation"}
 DERIVING = ("urdf.", "arm.", "structure.", "emission.", "certificate.")
 # Modules of `emission` that make models in memory, and therefore import torch.
 MODELS = {f"emission.{name}" for name in ("assemble", "build")}
 DERIVES = [x for x in LAYERS if x.startswith(DERIVING) and x not in MODELS]
 OF_A_RUN = {f"render.{name}" for name in ("charts", "scene")}
-# Exceptions: these modules import the exact base parameters, to identify by least squares as well.
+# Fits must not import the exact arithmetic in SYMBOLIC. These two modules are exceptions: with each fit, they fit a
+# least-squares baseline, which needs the exact base parameters.
 LEAST_SQUARES = ("fitting.fit", "fitting.train")
 FITS = [x for x in LAYERS if x.startswith(("logs.", "fitting.")) and x not in LEAST_SQUARES]
 NEVER = {
@@ -60,7 +62,7 @@ def folder(name: str) -> str:
 
 
 def test_every_file_imports_only_from_its_layer_and_those_above():
-    """Each file imports only from its own layer and from layers above it in LAYERS.
+    """Each file imports only from its own folder and from folders before it in FOLDERS.
 
     The runtime, which emitted modules contain, imports only itself, torch and the standard library (CARRIED).
     """
@@ -76,8 +78,11 @@ def test_every_file_imports_only_from_its_layer_and_those_above():
     assert {name: found for name, found in wrong.items() if found} == {}
 
 
-def test_no_file_imports_from_a_higher_layer():
-    """No file imports the modules that NEVER lists for it, directly or indirectly: derivation imports no torch."""
+def test_no_file_imports_a_module_that_is_excluded_for_it():
+    """No file imports a module that the table `NEVER` forbids for it, neither directly nor through other files.
+
+    For example, the files of `arm` must not import torch.
+    """
     wrong = {}
     for name, never in NEVER.items():
         modules = reached(name) - PLAIN

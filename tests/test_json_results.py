@@ -1,4 +1,4 @@
-"""With --format json a command prints one line of JSON; figures beyond a limit have their own exit code."""
+"""With --format json a command prints one line of JSON; an error above its --limit has its own exit code."""
 
 import json
 from types import SimpleNamespace

@@ -97,7 +97,10 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 
 
 def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
-    """Positions in 0..360 degrees, of joints with and without limits, have one error, whose line mends the log."""
+    """Positions in degrees that wrap around at 360 give one error, which names the unit and advises a settings line.
+
+    With this line, the log has no errors. The joints with wrapped positions have no limits; the others have limits.
+    """
     text = (robots / "six_dof.urdf").read_text()
     joints = load_arm(robots / "six_dof.urdf").chain.joint_names
     for joint in joints[::2]:
@@ -144,7 +147,8 @@ def test_words_of_a_register_are_named_and_the_line_to_write_decodes_them(arm, t
         "unsigned": values % size,
         "turn": values % size,
     }[form]
-    # the register overflows when its value reaches plus or minus half of its range, here in the middle of the motion
+    # A register with `size` values wraps around at -size/2 and size/2. Here its zero is such that it wraps at the mean
+    # position of the motion.
     if form == "overflow":
         words = (values - values.mean() + size) % size - size / 2
         values = values - values.mean() + size / 2
@@ -182,7 +186,7 @@ def test_the_first_jump_of_a_joint_that_rests_at_zero_is_counted(arm, tmp_path):
 
 
 def test_sign_bits_and_outliers_of_half_a_turn_of_angles_without_limits(robots, tmp_path):
-    """Without position limits, a sign bit is not mistaken for a wrap of angles by whole turns.
+    """At joints without position limits, sign-and-magnitude words of an encoder are not mistaken for wrapped angles.
 
     An outlier of half a turn does not shift the samples after it.
     """
@@ -293,7 +297,7 @@ def test_the_newest_state_written_at_a_rate_that_is_no_multiple_of_its_own(arm, 
     log = {name: x if name == "t" else x[first] for name, x in columns.items()}
     (found,) = read_logs(written(log, tmp_path / "log.csv"), joints)
     assert len(found) == pytest.approx(len(np.unique(newest)), rel=0.02)
-    # not 1: where all joints reverse, positions hardly change, so that a repeated state may not be recognised
+    # tolerance: where all joints reverse, positions hardly change, so that a repeated state may not be recognised
     assert np.mean((np.diff(found.q, axis=0) != 0).any(axis=1)) > 0.98
 
 
@@ -362,7 +366,7 @@ def columns_of(columns, quantity, joints):
 def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, tmp_path, form):
     """Wrapped servo commands and positions are unwrapped together.
 
-    They wrap at different rows, and may start a revolution apart.
+    Commands and positions wrap at different rows, and their first values may differ by a revolution.
     """
     for number, name in enumerate(ROBOTS):
         text = (robots / f"{name}.urdf").read_text().replace('type="revolute"', 'type="continuous"')
@@ -391,7 +395,10 @@ def test_wrapped_commands_of_servos_are_unwrapped_with_their_positions(robots, t
 
 @pytest.mark.parametrize("form", ["degrees", "two's complement", "sign and magnitude"])
 def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
-    """One finding decodes positions and commands of all joints, also of a joint that moves little from 0."""
+    """Positions q and commands u that are logged as raw register values are one error with one line for all joints.
+
+    form: encoding of negative values in the registers. The elbow stays near 0, so that only changes of sign show it.
+    """
     arm = load_arm(write_servo_arm(tmp_path))
     t, rng = 0.02 * np.arange(1500), np.random.default_rng(0)
     motion = {"shoulder": 0.9 * np.sin(t), "elbow": -0.004 * (t > 15) + 0.003 * rng.standard_normal(len(t))}

@@ -1,4 +1,4 @@
-"""Logs beyond the bound of memory: evenly spread segments of all files are kept, and fitted like any other logs."""
+"""Logs above the memory limit: evenly spread segments of all files are kept, and fitted like any other logs."""
 
 import subprocess
 import sys
@@ -46,7 +46,7 @@ def same(first: Trajectory, second: Trajectory) -> bool:
 
 @pytest.fixture
 def bound(monkeypatch):
-    """Return a function that sets the bound of kept samples to a number of rows."""
+    """Return a function that sets the memory limit of kept samples, `TUNING.kept_bytes`, to a number of rows."""
 
     def set_bound(rows: int) -> None:
         tuning = replace(segments.TUNING, kept_bytes=ROW * rows, segment_samples=SEGMENT)
@@ -69,7 +69,10 @@ def test_logs_within_the_bound_are_read_whole(tmp_path, bound, format):
 @pytest.mark.parametrize("files", [1, 4])
 @pytest.mark.parametrize("rows", [100, 700, 1599, 3199])
 def test_kept_segments_are_evenly_spread_over_all_files(tmp_path, bound, files, rows):
-    """Every k-th segment of consecutive rows is kept, over all files, and the bound is not exceeded."""
+    """Every k-th segment of consecutive rows of all files is kept, with the k for which they fit the memory limit.
+
+    k is the smallest power of two that suffices.
+    """
     logs = recordings()
     for number in range(files):
         share = len(logs) // files
@@ -145,9 +148,10 @@ def test_windows_of_reduced_logs_cross_no_gap(tmp_path, bound):
 
 
 def test_a_fit_of_reduced_logs_is_one_of_its_samples(robots, tmp_path, bound):
-    """A fit to logs beyond the bound equals a fit to the kept samples in memory: weights, split and digest.
+    """A fit to logs that exceed the memory bound (here 1600 rows) equals a fit to the kept samples in memory.
 
-    A resumed run uses the same samples.
+    Equal are the weights, the digest of the data and the split into training and validation. A resumed run uses the
+    same samples, and refuses changed logs.
     """
     module = tmp_path / "arm.py"
     module.write_text(generate(robots / "two_link.urdf", preset="spel", width=4))
@@ -205,5 +209,5 @@ def test_memory_is_bounded_by_the_largest_file_and_the_kept_samples(tmp_path, fo
         peaks[function] = int(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
     largest = (tmp_path / f"0.{format}").stat().st_size
     assert peaks["read_bounded_logs"] < 3 * largest + 4 * kept
-    # without the bound, the measured peak memory contains all samples
+    # `read_logs` has no memory limit: its measured peak contains all samples
     assert peaks["read_logs"] > 8 * 22 * rows * files

@@ -16,7 +16,10 @@ from spelgen.settings.log_mapping import LogMapping
 
 
 def clipped_joints(arm, log) -> dict[str, list[float]]:  # noqa: F811
-    """Return the limits in the errors about clipped torques, per joint; a log may have no other errors."""
+    """Return, per joint, the limits [Nm, N] that the errors about clipped torques state.
+
+    An error of the log that is not about clipped torques makes the test fail.
+    """
     found = {}
     for error in check_logs([log], arm).errors:
         joint, limits = re.match(r"joint '(.*)', tau: got torques that stop at (.*?) N", str(error)).groups()

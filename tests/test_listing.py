@@ -96,7 +96,10 @@ def test_a_table_too_wide_for_the_words_of_its_names_is_cut_into_several():
 
 
 def test_a_name_is_broken_within_a_word_only_to_avoid_another_table():
-    """A table that is split anyway keeps the names of joints whole, if the number of its parts is the same."""
+    """Names of joints are broken within a word only if the table is then split into fewer parts.
+
+    Here the table has two parts with broken and with whole names, so the names remain whole.
+    """
     for cells in (["0.00131"] * 11, ["1.31e-04"] * 12):
         rows = [(name, *cells) for name in ("1 (0.05 s)", "joint_wrist_yaw [rad]")]
         tables = Listing("", ("", *"abcdefghijkl"[: len(cells)]), tuple(rows)).text().split("\n\n")
@@ -105,7 +108,7 @@ def test_a_name_is_broken_within_a_word_only_to_avoid_another_table():
 
 
 def test_a_table_with_times_in_its_names_is_at_most_80_characters_wide():
-    """The room for names counts a number and its unit s as one word, as their wrapping does."""
+    """The column of names is wide enough for a number with its unit s, such as "0.005 s", which is never wrapped."""
     for width in range(5, 20):
         rows = tuple((name, *[width * "1"] * 9) for name in ("1 step (0.005 s)", "10 steps (0.05 s)"))
         assert max(map(len, Listing("", ("", *"abcdefghi"), rows).text().splitlines())) <= 80

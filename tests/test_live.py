@@ -69,7 +69,7 @@ def levels(arm):
 
 @pytest.fixture(scope="module")
 def run(arm, levels, tmp_path_factory):
-    """Return a run folder of the model, with the noise levels `levels`, which state half a minute of logs."""
+    """Return the path of a run folder with the model and the noise levels `levels`, from half a minute of logs."""
     folder = saved_run(arm[0], ROBOTS / "six_dof.urdf", tmp_path_factory.mktemp("live"))
     folder.estimator.write_text(json.dumps(levels.model_dump(mode="json") | {"minutes": 0.5}))
     config = json.loads(folder.config.read_text())
@@ -97,9 +97,10 @@ def coupled(folder):
 
 @pytest.mark.parametrize("robot", ["six_dof", "rpr", "coupled"])
 def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
-    """dp/dt of the momentum balance equals torque minus friction along any motion.
+    """Along any motion, `balance` satisfies dp/dt = torque - friction at all driven joints, with p = M qd.
 
-    This holds for mimic joints, prismatic joints and coupled motors as well.
+    Its `torque` is G tau + dL/dq of the Lagrangian L, and so includes gravity and velocity-dependent terms. The arms
+    have mimic joints, prismatic joints and coupled motors as well.
     """
     urdf = coupled(tmp_path) if robot == "coupled" else ROBOTS / f"{robot}.urdf"
     model = build(urdf, "hybrid").double()
@@ -174,10 +175,11 @@ def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
     found = estimator.torque(log.q[k], log.qd[k], qdd[k])
     bare = model.inverse_dynamics(*numbers(log.q[k], log.qd[k], qdd[k])).numpy()
     assert np.abs(found - expected).max() < 0.25 * np.abs(bare - expected).max()
-    # predictions of more than 0.3 s ahead do not include the disturbance
+    # predictions of more than 0.3 s ahead do not include the estimated disturbance torque
     later = estimator.torque(log.q[k], log.qd[k], qdd[k], ahead=1.0)
     np.testing.assert_allclose(found - later, estimator.drift.x[:, 1], atol=1e-9)
-    # Before the first payload report, the payload is part of the external torque: `compensate_external` includes it.
+    # The first payload report comes after these 180 samples, so the predicted torque does not include the payload yet.
+    # With `compensate_external`, it includes the estimated external torque, and thereby the weight of the payload.
     part, k = dataclasses.replace(log, tau=tau)[:180], 179
     for compensated in (False, True):
         early = Estimator(load_run(run), levels=levels, compensate_external=compensated)
@@ -373,11 +375,11 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
     ("effort", "expected"), [(np.inf, "used"), (1.0, "saturated"), (0.6, "used"), (200.0, "used")]
 )
 def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
-    """Torques of four times the largest logged torque are refused as saturated only if the URDF has such a limit.
+    """Samples with torques beyond the effort limit of the URDF are refused as saturated if the limit is plausible.
 
-    A limit of the URDF that logged torques exceed is wrong, and a very large one is a placeholder: both are unknown.
-
-    effort: torque limit of the URDF, divided by the largest logged torque. expected: result for these torques.
+    A limit that logged torques exceed is wrong, and a very large one is a placeholder: both are unknown, as without a
+    limit. Then four times the largest logged torque is used; only more than ten times this torque is refused. effort:
+    limit of the URDF, divided by the largest logged torque. expected: result for four times the largest logged torque.
     """
     model, log, _ = arm
     largest = np.abs(log.tau).max(axis=0)
@@ -389,7 +391,7 @@ def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
         assert intake.accept(log.t[1], log.q[1], log.qd[1], factor * largest) == refusal
     stored = levels.model_dump(mode="json")
     assert len(stored.pop("saturation")) == model.n
-    # runs of earlier versions have no entry `saturation`: all their torque limits are used
+    # runs of earlier versions have no entry `saturation`: it is 1, so that torques are saturated at the torque limit
     assert NoiseLevels.model_validate(stored).saturation.tolist() == [1.0]
 
 
@@ -416,7 +418,7 @@ def test_hostile_samples_give_finite_estimates(arm, levels, run):
 
 
 def test_one_log_has_one_result(arm, levels, run):
-    """Samples one at a time give the same estimates as a whole log, in the same bytes each time."""
+    """Two replays of a log give bitwise equal estimates; samples one at a time give them up to rounding errors."""
     _model, log, _ = arm
     short = log[:600]
     _, states = estimates(run, levels, short, short.tau)
@@ -449,9 +451,10 @@ def test_the_payload_is_the_map_estimate(offset):
     linear, precision = precision @ mean, precision - np.diag(1 / np.square(TUNING.load_prior))
 
     def cost(factor):
-        """Return the cost of the payload whose pseudo-inertia has this triangular root (10,), so that it is consistent.
+        """Return the negative log posterior of the payload with the pseudo-inertia L L^T.
 
-        The prior mean is 2 kg.
+        L is lower triangular with the entries `factor` (10,): each such payload is physically consistent. The mean mass
+        of the prior is 2 kg.
         """
         triangle = np.zeros((4, 4))
         triangle[np.tril_indices(4)] = factor
@@ -521,7 +524,7 @@ def test_errors_that_recur_with_the_motion_do_not_become_a_payload(levels):
 def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
     """Thresholds from one short log of each of 300 arms give less than one false alarm per minute, on average.
 
-    The peaks of residuals are exponentially distributed.
+    The logs consist of exponentially distributed random peaks, for which the expected rate of alarms is known.
     """
     random, windows = np.random.default_rng(0), round(60 * minutes / TUNING.window)
     alarms = []
@@ -532,14 +535,17 @@ def test_thresholds_keep_the_rate_of_alarms_after_short_logs(levels, minutes):
         # expected alarms per minute: probability that a peak exceeds its threshold, times peaks per minute
         alarms.append(60 / TUNING.window * np.exp(-(thresholds - 1.0)).sum())
     assert np.mean(alarms) < 1.0
-    # thresholds are not arbitrarily high; without estimation errors they would be log(720) + 1 = 7.6
+    # The thresholds of the last arm are not arbitrarily high. Peaks exceed x with probability exp(1 - x). Six joints
+    # have 720 peaks per minute, of which one may exceed its threshold: the ideal threshold is log(720) + 1 = 7.6.
+    # Thresholds from short logs have a margin, since the distribution of the peaks is only estimated.
     assert np.median(thresholds) < 25.0
 
 
 def test_scales_of_peaks_are_shrunk_by_their_error(levels):
-    """Scales of peaks are shrunk towards each other by their standard error.
+    """The peak scales of the joints are shrunk towards their mean, strongly if their standard errors are large.
 
-    Equal scales become nearly equal; different scales that many peaks determine remain different.
+    A scale is the parameter of the exponential distribution of the peaks of a joint's residual. Estimates of equal true
+    scales become nearly equal; different true scales with small standard errors, from many peaks, remain different.
     """
     random, n = np.random.default_rng(2), len(EFFORT)
 
@@ -563,24 +569,24 @@ def test_scales_of_peaks_are_shrunk_by_their_error(levels):
 
 
 def test_thresholds_hold_in_a_log_that_differs(levels):
-    """If one of three logs has doubled residuals, a fourth log with doubled residuals causes at most one alarm.
+    """Thresholds from three logs give at most one alarm in a log of doubled residuals if one of the three is doubled.
 
-    With thresholds from three logs of equal residuals, it causes more.
+    If the residuals of the three logs are equally large, the thresholds give more than three alarms in the doubled log.
     """
     random = np.random.default_rng(1)
     logs = [1.0 + random.exponential(size=(100, 6)) for _ in range(4)]
     found = levels.model_copy(update=held_out_tail([logs[0], logs[1], 2 * logs[2]], levels))
-    # at most one alarm in 50 s
+    # 100 windows are 50 s, in which the thresholds for one alarm per minute may cause one alarm
     assert ((2 * logs[3] > found.thresholds(1.0)).any(axis=1)).sum() <= 1
     alike = levels.model_copy(update=held_out_tail(logs[:3], levels))
     assert ((2 * logs[3] > alike.thresholds(1.0)).any(axis=1)).sum() > 3
 
 
 def test_noise_levels_are_found_with_one_thread(arm, run, monkeypatch):
-    """The fits of the noise levels use one thread of torch, like the fit of the run.
+    """The fits that estimate the noise levels use one thread of torch, like the fit of the run.
 
-    With torch 2.13 and two threads, `train` of a 6-joint arm did not end: the number of threads had been raised from
-    one, after which the factorisation of a batch of matrices of order 150 does not end.
+    Reason: if the number of threads is raised from one to two after the fit, torch 2.13 does not end the factorisation
+    of a batch of matrices of order 150, and `train` of a 6-joint arm hangs.
     """
     threads = []
 
@@ -640,7 +646,8 @@ def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
     assert payload["status"] == "payload"
     assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
     assert "load changes" not in result.stderr
-    # the run folder keeps its noise levels, which an estimator of the arm with the load needs
+    # `train --from` copies the noise levels (estimator.json) of the source run into the new run. A live estimator
+    # of the new model, the arm with its load, needs them.
     assert (tmp_path / "run" / "estimator.json").exists()
 
 

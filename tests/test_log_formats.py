@@ -110,9 +110,9 @@ def test_velocities_are_differentiated_only_where_that_is_asked(tmp_path):
         read_logs([path], ("a",))
     (found,) = read_logs([path], ("a",), mapping=LogMapping(velocity="differentiated"))
     inner = [k for k in range(100) if k % 50 not in (0, 49)]
-    # error of central differences, dt^2 / 6
+    # error of central differences: dt^2 |d^3 q / dt^3| / 6 = 1.7e-5 rad/s
     np.testing.assert_allclose(found.qd[inner, 0], np.cos(t[inner]), atol=2e-5)
-    # error of one-sided differences at the ends of segments, dt / 2
+    # error of one-sided differences at the ends of segments: dt |qdd| / 2 = 0.005 rad/s for dt = 0.01 s, |qdd| <= 1
     assert np.abs(found.qd[[0, 49, 50, 99], 0] - np.cos(t[[0, 49, 50, 99]])).max() < 0.006
     assert found.qd[100] == 0.0
 
@@ -361,9 +361,9 @@ def test_arrays_that_promise_more_than_they_hold_are_refused(tmp_path):
 
 
 def test_a_new_format_is_a_reader_and_its_name_among_the_formats(tmp_path, monkeypatch):
-    """A new log format needs only a reader and its name in FORMATS, as docs/extending.md states.
+    """A new log format needs only a reader and an entry in FORMATS, as docs/extending.md states.
 
-    Reading, folders, messages and suggestions then include it.
+    Files of the format are then found in folders, read, named in messages, and get a suggested mapping.
     """
 
     def read(file, joints, mapping):
@@ -684,22 +684,36 @@ def test_the_cut_last_line_of_a_csv_is_left_out(tmp_path):
     (tmp_path / "x.csv").write_text("\n".join([*lines, lines[-1][:9]]))
     (found,) = read_logs(tmp_path / "x.csv", JOINTS)
     check(found, "x")
-    assert found.remarks == (f"the last line is cut off and was left out: {lines[-1][:9]}",)
+    assert found.remarks == (f"the last line is no complete row and was left out: {lines[-1][:9]}",)
     (tmp_path / "x.csv").write_text("\n".join([*lines[:3], lines[3][:9], *lines[4:]]))
     with pytest.raises(LogError, match=r"x\.csv:4: got \d values \(.*\), expected 7, as in the header"):
         read_logs(tmp_path / "x.csv", JOINTS)
 
 
-def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path):
-    (tmp_path / "x.csv").write_text(f"{text_log()}\nSamples: 4\nDuration: 3 s\n")
+@pytest.mark.parametrize(
+    "footer",
+    [
+        "\nSamples: 4\nDuration: 3 s\n",
+        "\nMin,-1,-2,-3,-4,-5,-6\n\nMean,0.1,0.2,0.3,0.4,0.5,0.6\n",
+        '\n"Mittel","1","2","3","4","5","6"\r\n"Größe",1,2,3,4,5,6\r\n\r\n',
+    ],
+)
+def test_lines_below_the_last_row_are_left_out_with_one_remark(tmp_path, footer):
+    """Texts and statistics of the columns at the end of a CSV file are no samples."""
+    (tmp_path / "x.csv").write_text(text_log().rstrip("\n") + footer, encoding="utf-8")
     (found,) = read_logs(tmp_path / "x.csv", JOINTS)
     check(found, "x")
-    assert found.remarks == ("the last 2 lines are no rows and were left out: Samples: 4",)
+    assert found.remarks == (
+        f"the last 2 lines are no rows and were left out: {footer.split(chr(10))[1].rstrip()[:30]}",
+    )
 
 
 @pytest.mark.parametrize("place", ["above", "below", "comment"])
 def test_a_line_of_units_counts_at_each_place_beside_the_header(tmp_path, place):
-    """A unit that a line above or below the header states is never read as an SI unit."""
+    """A line of units above or below the header, or in a comment, is not ignored.
+
+    It states mNm for the torques here. Torques are expected in Nm, so the error advises to state `units: {tau: mNm}`.
+    """
     lines = text_log().splitlines()
     units = UNIT_LINE.replace("Nm", "mNm")
     head = {"above": [units, lines[0]], "below": [lines[0], units, "measured" + ",measured" * 6]}
@@ -802,6 +816,64 @@ def test_places_of_lists_are_columns(tmp_path, form):
         read_logs(tmp_path / "x.csv", JOINTS, mapping)
 
 
+OF_ROW = {
+    "another arm at the same times": lambda k: [JOINTS, ("left_shoulder", "left_elbow")],
+    "another arm in the first row": lambda k: [("left_shoulder", "left_elbow"), JOINTS],
+    "a hand in some rows": lambda k: [JOINTS, ("thumb", "index", "ring")][: 1 + (k % 3 == 1)],
+    "a gripper in some rows": lambda k: [JOINTS + ("gripper",) * (k % 2)],
+    "another order in some rows": lambda k: [JOINTS[:: 1 - 2 * (k % 3 == 1)]],
+}
+"""Lists of joint names of the rows at the time step k."""
+
+
+@pytest.mark.parametrize("rows", OF_ROW)
+@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet"])
+def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, suffix):
+    """Rows with other joint names, or in another order, never change the values of the arm's joints."""
+    t = 0.01 * np.arange(40)
+    q = np.stack([np.sin(5 * t), 2 + np.cos(7 * t)], axis=1)
+    log = []
+    for k, now in enumerate(t):
+        for names in OF_ROW[rows](k):
+            values = np.array([q[k, JOINTS.index(x)] if x in JOINTS else 9.0 - 0.01 * k for x in names])
+            lists = {"position": values, "velocity": values + 1, "effort": values + 2}
+            log.append({"time": now, "name": list(names)} | {x: y.tolist() for x, y in lists.items()})
+    path = tmp_path / f"x.{suffix}"
+    if suffix == "jsonl":
+        path.write_text("\n".join(map(json.dumps, log)))
+    elif suffix == "parquet":
+        pa.parquet.write_table(pa.Table.from_pylist(log), path)
+    else:
+        pa.csv.write_csv(pa.Table.from_pylist([{x: str(y) for x, y in row.items()} for row in log]), path)
+    (found,) = read_logs(path, JOINTS, yaml.safe_load(suggest_mapping(path, JOINTS).text))
+    np.testing.assert_allclose(found.t, t, atol=1e-9)
+    for values, expected in ((found.q, q), (found.qd, q + 1), (found.tau, q + 2)):
+        np.testing.assert_array_equal(values, expected)
+
+
+def test_rows_of_two_arms_with_unknown_names_are_an_error(tmp_path):
+    """If rows are of two arms and no joint name identifies one of them, the names in the log are asked for."""
+    state = {"position": [0.1, 0.2], "velocity": [0.3, 0.4], "effort": [0.5, 0.6]}
+    log = [{"time": 0.01 * k, "name": [f"{'lr'[k % 2]}_{x}" for x in "ab"]} | state for k in range(40)]
+    path = tmp_path / "x.jsonl"
+    path.write_text("\n".join(map(json.dumps, log)))
+    mapping = {
+        "columns": {"t": "time"},
+        "joints": {
+            x: {"columns": {"q": f"position[{k}]", "qd": f"velocity[{k}]", "tau": f"effort[{k}]"}}
+            for k, x in enumerate(JOINTS)
+        },
+    }
+    with pytest.raises(
+        LogError, match="got joint states of l_a, l_b and of r_a, r_b, expected shoulder, elbow"
+    ):
+        read_logs(path, JOINTS, mapping)
+    for joint, name in zip(JOINTS, ("r_a", "r_b"), strict=True):
+        mapping["joints"][joint]["name"] = name
+    (found,) = read_logs(path, JOINTS, mapping)
+    np.testing.assert_allclose(found.t, 0.01 + 0.02 * np.arange(20), atol=1e-9)
+
+
 def test_no_column_of_another_joint_is_offered(tmp_path):
     joints = tuple(str(k) for k in range(6))
     names = {"q": "position_{joint}", "qd": "velocity_{joint}", "tau": "effort_{joint}"}
@@ -840,7 +912,8 @@ def test_output_of_ros2_topic_echo_is_read(tmp_path):
     np.testing.assert_allclose(log.t - log.t[0], 0.01 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.q[:, 1], -0.02 * np.arange(50), atol=1e-9)
     np.testing.assert_allclose(log.tau[:, 0], 5.0 + 0.1 * np.arange(50), atol=1e-9)
-    # the first message, received twice, is no header
+    # In files with a header, a repeated first line begins a new recording. The output of this command has no header:
+    # its first line is a message, which may be received twice. The file is still one recording.
     lines = joint_states()
     (tmp_path / "log.csv").write_text("\n".join([lines[0], *lines]) + "\n")
     assert len(read_logs([tmp_path / "log.csv"], ("a", "b"))) == 1

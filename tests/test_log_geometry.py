@@ -157,7 +157,7 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
 
 
 def test_two_reversed_joints_are_not_taken_for_a_third(shared):
-    """The error names both reversed joints, not the single correction that fits best and concerns the torque only."""
+    """The error names both reversed joints, although the best single correction reverses the torque of one joint."""
     arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
     wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
     error = told(arm, wrong)
@@ -201,7 +201,8 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     write_logs(tmp_path / "log.csv", [log], arm.chain.joint_names)
     error = told(arm, log)
     lines = re.findall(r"'gravity: \[(.*?)\]'", error)
-    # for rpr on a ceiling, an equivalent reading with a joint of opposite sense may be listed first
+    # The error may list several corrections. Only its directions of gravity are tested: for rpr on a ceiling, it may
+    # first advise a joint of opposite sense, which explains the torques equally well.
     assert lines, error
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
@@ -224,7 +225,10 @@ def test_compensated_gravity_is_called_so(arm, part):
 
 
 def test_another_unit_is_offered_as_gain(arm):
-    """Torques in another unit get a gain. It has the relative error of the URDF's masses, which determine gravity."""
+    """For torques in another unit, the error advises a gain for each joint, within a factor of 2 of the true gain.
+
+    Gains are found from gravity torques, so their relative errors are the errors of the masses in the URDF.
+    """
     log = recorded(arm, 6)
     error = told(arm, replace(log, tau=log.tau / 0.003))
     gains = list(map(float, re.findall(r"gain: ([\d.e-]+)", error)))
@@ -311,7 +315,10 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
-    """Torque columns that contain another signal are one finding without a line of advice, since none would help."""
+    """Torque columns that contain another signal give one finding, which advises the user to check the columns.
+
+    It has no settings line, since none would correct them. A finding that is an error names the option to accept it.
+    """
     log, rng = recorded(arm, 18), np.random.default_rng(18)
     other = log.tau.std(axis=0) * lfilter([0.2], [1, -0.98], rng.standard_normal(log.tau.shape), axis=0)
     tau = {
@@ -330,9 +337,9 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
 
 
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
-    """In a log with too little motion, reversed joints are not searched: a remark states the small motion.
+    """A log with too little motion is not tested for faults such as a reversed joint: a remark states the small motion.
 
-    Friction before sliding determines such torques, and wrong hypotheses would explain them better.
+    Its torques are mostly friction before sliding, which a wrong hypothesis may explain better than the right one.
     """
     log = recorded(arm, 18)
     small = replace(log, q=log.q[0] + 0.002 * (log.q - log.q[0]), qd=0.002 * log.qd)
@@ -364,7 +371,10 @@ def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
 
 @pytest.mark.parametrize("joint", [0, 1])
 def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
-    """The derivatives of positions are used in place of velocities that are wrong for no known reason."""
+    """If velocities of a joint contradict its positions, the checks of geometry use derivatives of the positions.
+
+    Here the velocities are 1.5 times too large, or noise. A warning names them, and a reversed joint is still found.
+    """
     log, rng = recorded(arm, 21), np.random.default_rng(21)
     noise = rng.normal(size=len(log.t)) * log.qd[:, joint].std()
     for velocity in (1.5 * log.qd[:, joint], noise):
@@ -377,7 +387,11 @@ def test_wrong_velocities_of_one_joint_do_not_prevent_the_tests(arm, joint):
 
 
 def test_the_sense_of_a_joint_is_more_likely_than_an_exchange_that_explains_little_more(arm):
-    """An exchange of columns may explain errors of the friction model better, by less than wrong hypotheses do."""
+    """A reversed joint is listed before exchanged columns, even if the cost of exchanged columns is somewhat lower.
+
+    Exchanged columns may also explain errors of the friction model. The reversed joint is omitted if it lowers the cost
+    only a little. Costs are relative to the unchanged log.
+    """
     order, _, _, _, sense, *_ = kinds_of_faults(arm.chain)
     present = Hypothesis.unchanged(arm.chain)
     sign = np.ones_like(present.scale)
@@ -415,7 +429,10 @@ def test_training_refuses_it_unless_it_is_accepted(arm):
 
 
 def test_a_line_keeps_what_the_mapping_states(arm):
-    """An advised line keeps the gain and the sense that the mapping already states, multiplied by the correction."""
+    """Advised gains and signs are the values in the mapping times the correction.
+
+    Here the correction is -1: the sign -1 becomes 1, the gain 14.2 becomes -14.2.
+    """
     joint = arm.chain.joint_names[1]
     mapping = LogMapping.model_validate({"joints": {joint: {"gain": 14.2, "sign": -1}}})
     error = told(arm, flipped(recorded(arm, 8), 1, True, False), mapping)
@@ -439,9 +456,9 @@ def test_a_slow_arm_with_right_torques_is_not_refused(arm):
 
 
 def test_gravity_along_all_axes_is_called_compensated(tmp_path):
-    """Without gravity torques in a log, compensated gravity is reported, not a direction of gravity.
+    """A log without gravity torques is reported as compensated gravity, not as gravity along the joint axes.
 
-    Both axes are horizontal, so that gravity along the axes would give the same torques.
+    Both explain the log: the axes of both joints are parallel, and gravity along them would cause no torques.
     """
     rows = (
         ("shoulder", "revolute", "base", "0 0 0", "0 1 0", -3, 3, 2),
@@ -462,14 +479,14 @@ def test_factors_of_torques_that_differ_are_stated_per_joint(robots, tmp_path):
     assert "--accept torque-unit" in error
     # the ratio of both gains is determined by the coupling of the joints
     assert gains[1] / gains[0] == pytest.approx(37 / 11, rel=0.05)
-    # the common factor is determined by the masses of the URDF
+    # the common factor of both gains follows only from the URDF's masses, so it is right only within a factor of 2
     np.testing.assert_allclose(np.log(gains * [37.0, 11.0]), 0.0, atol=np.log(2))
 
 
 def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
-    """If the magnitude of one torque is logged, the error names it, instead of gains of all joints.
+    """If the torque of one joint is logged without its sign, the error names this joint and advises no gains.
 
-    Such gains would lower the residual a little.
+    Gains of all joints would lower the torque residual a little, but they are not the cause.
     """
     arm = load_arm(shared / "logs" / "airbot" / "airbot.urdf")
     (log,) = read_logs(shared / "logs" / "airbot" / "ga_N12T25.parquet", arm)
@@ -482,9 +499,9 @@ def test_magnitudes_of_a_torque_are_not_explained_by_factors(shared):
 
 @pytest.mark.parametrize("of_all", [False, True])
 def test_torques_that_were_logged_as_magnitudes_are_named(arm, of_all):
-    """Torques that are logged as magnitudes are named, of one joint or of all joints.
+    """If torques of one joint or of all joints are logged as magnitudes |tau|, the error names these joints.
 
-    The torque of each named joint has the less frequent sign in more than a tenth of the samples.
+    Joints whose true torque has one sign in at least nine tenths of the samples are not named.
     """
     log = recorded(arm, 14)
     share = np.minimum((log.tau > 0).mean(axis=0), (log.tau < 0).mean(axis=0))
@@ -559,9 +576,9 @@ def hysteresis(q, breakaway):
 
 @pytest.mark.parametrize("seed", [0, 1, 5])
 def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_path):
-    """Exchanged joints are named although friction has a hysteresis of 0.05 rad.
+    """Exchanged joints are named although friction has a hysteresis: bristles slip at a displacement of 0.05 rad.
 
-    The hysteresis is 1.5 % of the torque in both orders of the joints.
+    The bristles cause torques of 0.3 standard deviations of the joint's torque, which must not be taken as a delay.
     """
     arm = load_arm(shutil.copy(robots / "two_link.urdf", tmp_path))
     log = recorded(arm, seed, noise=0.005)
@@ -577,7 +594,8 @@ def test_presliding_hysteresis_does_not_hide_exchanged_joints(seed, robots, tmp_
 def test_presliding_hysteresis_does_not_change_a_zero_offset(arm, seed, angle):
     """The zero of a joint is named to 0.1 rad although its friction has a hysteresis of 0.05 rad.
 
-    If the model had no hysteresis, an offset wrong by 0.4 rad would compensate friction, or none would be found.
+    If the friction model had no hysteresis, the offset would be wrong by 0.4 rad, as it would compensate friction, or
+    would not be found.
     """
     log = recorded(arm, seed, pick_and_place, noise=0.01)
     log = replace(log, tau=log.tau + 0.4 * log.tau.std(axis=0) * hysteresis(log.q, 0.05))
@@ -593,7 +611,10 @@ def lifted(arm):
 
 
 def test_a_lift_whose_position_runs_the_other_way_is_named(lift):
-    """A vertical slide of opposite sense is found by its limits and friction, as its gravity torque is the same."""
+    """A vertical prismatic joint with the opposite sign of its position is found by its position limits and friction.
+
+    Its gravity force does not depend on the position, and so does not show the sign.
+    """
     log = lifted(lift)
     assert check_logs([log], lift).errors == ()
     assert "'joints: {slide: {sign: -1, gain: -1}}'" in told(lift, flipped(log, 0, True, False))

@@ -1,4 +1,4 @@
-"""Logs in the forms of public simulators and robot drivers are read with their original values by a drafted mapping."""
+"""Suggested mappings read the original values from logs in the formats of public simulators and robot drivers."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ STATES = [
 
 
 def documents(names):
-    """Return {name of a form: JSON document}; all documents contain the same recording."""
+    """Return {layout: JSON document}: the same recording in six layouts that the reader accepts."""
     stamps = [{"sec": int(t), "nanosec": round(t % 1 * 1e9)} for t in T.tolist()]
     order = [2, 0, 3, 1]
     points = [

@@ -283,9 +283,10 @@ def test_degrees_are_refused(case):
 
 
 def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
-    """Encoder counts and speeds in units of 0.229 rpm match no common unit by chance, and no slow clock is reported.
+    """Encoder counts and speeds in units of 0.229 rpm (0.024 rad/s) are reported as numbers of an unknown unit.
 
-    With the mapping that states these units, the log is read in rad and rad/s.
+    They match no common unit, and the ratio 0.024 of dq/dt to qd is not reported as a slow clock. The log is
+    read correctly with a mapping that states the counts, and replaces qd by dq/dt (`velocity: differentiated`).
     """
     log = swing()
     registers = replace(
@@ -412,7 +413,10 @@ def test_what_never_changes_in_any_trajectory_is_said():
 
 
 def test_noise_of_a_joint_at_rest_is_no_motion():
-    """Noise of the encoder and of the velocities of a joint at rest is no error, although no motion explains it."""
+    """Noise at a joint at rest is not reported as a contradiction of velocities and derivatives of positions.
+
+    The only remark is that the joint is at rest.
+    """
     rng, length = np.random.default_rng(0), len(swing().t)
     noisy = changed(q={1: 0.5 + 1e-6 * rng.normal(size=length)}, qd={1: 1e-4 * rng.normal(size=length)})
     notes = check([noisy], JOINTS, ("revolute", "revolute"))

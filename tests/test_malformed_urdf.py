@@ -27,7 +27,8 @@ REFUSED = {
     "quadrotor_namespaced_root": r":7: got <robot> in the namespace 'http://drake.mit.edu'",
 }
 
-# accepted files: joints of the default chain (a space in a name as "_"), codes of warnings on robot and on arm
+# Accepted files, as {name: (joints, codes of the warnings of `read_urdf`, codes of the warnings of `make_arm`)}. The
+# joints are of the default chain, with "_" for a space in a name.
 READ = {
     "koch_limit_without_effort": (
         "joint_1 joint_2 joint_3 joint_4 joint_5 joint_6",
@@ -91,7 +92,8 @@ READ = {
 }
 
 
-# per file: numbers of joints, outputs, constants, joints that V depends on, and base parameters
+# Five numbers per file: joints, varying terms of M (outputs), constant terms of M, joints that V depends on, and base
+# parameters.
 FACTS = {
     "koch_limit_without_effort": (6, 18, 3, 5, 36),
     "so100_link_joint_same_name": (5, 12, 3, 4, 29),

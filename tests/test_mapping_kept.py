@@ -1,4 +1,7 @@
-"""A run stores the mapping of its logs and uses it to adapt and to reproduce the run; trained gains have intervals."""
+"""A run stores the column mapping of its logs, and uses it again when the run is adapted or reproduced.
+
+A torque gain in the mapping (joint torque per logged torque) may be trained; the run states its 95 % interval.
+"""
 
 import re
 import shlex
@@ -16,7 +19,7 @@ from spelgen.emission.build import build
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.render.run_facts import commands
 
-GAINS = np.array([1.6, 0.7, 1.4])  # true joint torque per logged torque, of joints 1 and 3
+GAINS = np.array([1.6, 0.7, 1.4])  # true joint torque per logged torque; joint 2 has none, 0.7 is not used
 SIDECAR = """torque: motor
 joints: {joint1: {gear: 1, gain: trained}, joint2: {gear: 1}, joint3: {gear: 1, gain: trained}}
 """

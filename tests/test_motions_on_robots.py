@@ -1,4 +1,4 @@
-"""`spelgen excite` for a robot: approach, ROS 2 message, and no contact with itself, the floor or boxes.
+"""Motions of `spelgen excite`: approach, ROS 2 message, and no contact of the arm with itself, the floor or boxes.
 
 The arm has spheres on its links and moves in a plane, so that exact distances follow from sines and cosines.
 """
@@ -52,7 +52,10 @@ def centres(q):
 
 
 def clearances(q):
-    """Return exact distances at q (..., 3), (..., 9) [m]: a-c, a-d, b-d; b, c, d to the floor; b, c, d to the wall."""
+    """Return nine exact distances of the spheres of links a (base), b, c and d at q (..., 3) [rad], (..., 9) [m].
+
+    They are a to c, a to d, b to d; then b, c and d to the floor; then b, c and d to the wall.
+    """
     b, c, d = np.moveaxis(centres(q), -2, 0)
     own = [np.linalg.norm(x, axis=-1) - BASE - RADIUS for x in (c, d)]
     own.append(np.linalg.norm(d - b, axis=-1) - 2 * RADIUS)
@@ -65,7 +68,10 @@ def to_floor(centre):
 
 
 def to_wall(centre):
-    """Return the distance of spheres from the face of the wall, which is the only side within reach."""
+    """Return the distance [m] of the surfaces of spheres from the front of the wall, the plane x = 1 m.
+
+    centre: centres of the spheres in the vertical plane, (..., 2) [m]. The arm reaches no other side of the wall.
+    """
     return 1.0 - centre[..., 0] - RADIUS
 
 

@@ -1,4 +1,7 @@
-"""The error about a fault of one recording of several names it, and advises no line, which would apply to all."""
+"""If one of several recordings has a fault, the error names this recording.
+
+A settings line would apply to all recordings: the error advises none, or one for the case that all have the fault.
+"""
 
 from dataclasses import replace
 

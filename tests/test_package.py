@@ -111,9 +111,10 @@ def canonical(name: str) -> str:
 
 
 def test_every_package_is_pinned_by_hash():
-    """The pinned requirements contain each dependency of the package, with hashes.
+    """Pinned requirements with hashes contain each dependency of the package.
 
-    `make demo` installs these, Pinocchio and CasADi (for C), and no other extra.
+    requirements.txt, which `make demo` installs, has the mandatory dependencies, Pinocchio and CasADi (for C code), but
+    no other extra; requirements-tools.txt has all extras.
     """
     demo, tools = pinned("requirements.txt"), pinned("requirements-tools.txt")
     assert demo.items() <= tools.items()

@@ -65,7 +65,10 @@ def test_pages_have_no_console_messages_requests_or_overflow(browser, pages, wid
 
 
 def test_titles_and_numbers_of_tables_are_not_broken_on_a_phone(browser, pages):
-    """A title of a list is as wide as the list, and a number is on one line, whatever the length of its label."""
+    """On a narrow screen, a table is shown as a list of labels and numbers. Its title is as wide as the table.
+
+    A number stays on one line, also with a long label (the name of its column).
+    """
     browser.open(pages[0], width=400)
     cells = "[...document.querySelectorAll('td.n[data-head]')]"
     browser.run(f"{cells}.forEach(x => (x.dataset.head = 'least squares with memory + observer'))")
@@ -102,7 +105,7 @@ def test_the_arm_is_printed_and_reported_missing_without_scripts(browser, pages)
     plain = pages[0].with_name("plain.html")
     text = pages[0].read_text(encoding="utf-8")
     plain.write_text(text.replace("script-src 'sha256", "script-src 'sha512"), encoding="utf-8")
-    # the content security policy allows only scripts whose digest it names, so that no script runs
+    # The content security policy allows only scripts with the stated digest, which is now wrong: no script runs.
     browser.open(plain)
     assert browser.run(shown) == ["block", "none", "none"]
 
@@ -136,7 +139,8 @@ def test_the_arm_fills_its_frame(browser, pages):
         browser.open(path)
         left, right, top, bottom = browser.run(EXTENT)
         assert 0.0 < left < right < 1.0 and 0.0 < top < bottom < 1.0
-        # the frame shows the whole motion, and is not much larger
+        # The frame has room for the whole motion; the arm at its current position extends over more than 30 % of the
+        # width or height.
         assert max(right - left, bottom - top) > 0.3
 
 

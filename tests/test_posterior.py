@@ -1,4 +1,8 @@
-"""Intervals of the posterior of torque fits agree with simulated arms, and with sampled parameters."""
+"""Posterior intervals of torque fits contain the true parameters of simulated arms.
+
+Posterior standard deviations, such as of M and of torques, equal the spread over models with parameters that are
+sampled from the posterior.
+"""
 
 import json
 import pickle
@@ -44,7 +48,10 @@ from tests.test_closed_form import drawn
 
 @pytest.mark.parametrize("robot", ["two_link", "rpr", "six_dof", "followed", "gantry"])
 def test_base_parameters_are_the_exact_ones(robots, tmp_path, robot):
-    """Base parameters of fits have the names and combinations of the exact ones: the report matches both by name."""
+    """Base parameters of fits are the same combinations, under the same names, as in `identify`.
+
+    Reports compare the values of both by name.
+    """
     urdf = robots / f"{robot}.urdf"
     if robot in ("followed", "gantry"):
         urdf = tmp_path / f"{robot}.urdf"
@@ -138,15 +145,17 @@ def test_intervals_contain_the_truth_if_errors_are_correlated_longer_than_the_fi
             for interval, value in zip(intervals, base_values(true), strict=True):
                 result.append(abs(interval.value - value) / interval.half)
     print(np.quantile(ratios, (0.9, 0.95, 1)), np.quantile(ratios_by_posterior, (0.9, 0.95, 1)))
-    # intervals are wide enough, and not much too wide
+    # Reported intervals contain at least 95 % of the true values (ratio below 1) and are not much too wide (above 0.4).
+    # All errors are below 1 / 0.9 half widths. At least one interval from the posterior covariance is too narrow.
     assert 0.4 < np.quantile(ratios, 0.95) < 1.0
     assert np.max(ratios_by_posterior) > 1.0 > 0.9 * np.max(ratios)
 
 
 def test_least_squares_counts_friction_that_changes_during_a_log(robots):
-    """Intervals of least squares include changes of friction during a log.
+    """Intervals of least squares include changes of friction during a log, here from 0.8 to 1.2 Nm in a minute.
 
-    Coulomb friction rises by half in a minute; the variance of its mean is a tenth of the variance during the log.
+    A jackknife over ten blocks gives the standard error of the mean: the standard deviation of the ten block means,
+    divided by sqrt(10).
     """
     arm = load_arm(robots / "rpr.urdf").chain
     q, qd, qdd = smooth_motion(3, 60.0, np.random.default_rng(0))
@@ -155,12 +164,12 @@ def test_least_squares_counts_friction_that_changes_during_a_log(robots):
     found = least_squares(arm, [DynamicsSamples("rising", q, qd, qdd, tau)])
     of_ten = (
         1.15 * np.linspace(0.82, 1.18, 10).std(ddof=1) / np.sqrt(10)
-    )  # 1.15: factor of Student's t relative to the normal distribution
+    )  # 1.15: 97.5 % quantile of Student's t (9 degrees of freedom) divided by the quantile of the normal distribution
     interval = next(x for x in found.intervals if x.name == "coulomb3")
     assert interval.low < 1.0 < interval.high
     assert interval.std == pytest.approx(
         of_ten, rel=0.4
-    )  # with the standard deviation of constant friction it would be 0.018
+    )  # 0.044 Nm; if friction were assumed to be constant, interval.std would be 0.018 Nm
 
 
 @pytest.fixture(scope="module")
@@ -175,9 +184,10 @@ def fitted(robots):
 
 
 def test_standard_deviations_agree_with_sampled_parameters(fitted):
-    """Standard deviations of M, g, torques and drives agree with models whose parameters are sampled.
+    """The stated standard deviations of M, g, torques and armatures equal their spread over 300 sampled models.
 
-    Parameters are sampled from a small multiple of the posterior covariance.
+    The parameters of these models are sampled from the posterior. Here its covariance is multiplied by 1e-6, so that
+    all quantities are linear in the parameters, as the stated standard deviations assume.
     """
     result, _ = fitted
     posterior, shrink = result.posterior, 1e-3

@@ -1,4 +1,7 @@
-"""The results of a prepared model equal the model's; its derivatives and steps are correct."""
+"""A prepared model (with precomputed constants of its parameters) has the same results as the model.
+
+Its derivatives equal finite differences, and its integration steps converge with order four.
+"""
 
 import numpy as np
 import pytest

@@ -68,7 +68,7 @@ def test_kan_outputs_depend_only_on_their_own_joints(robot, tmp_path):
 def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
     """M of spel has the zeros, constants and relations of the derived structure.
 
-    Its networks depend on all joints, as in the paper.
+    Its networks depend on all joints, as in the paper (Wang, Chen and Ding, Sci Rep 15:33179, 2025).
     """
     model = random_model(robot, tmp_path, seed=1, preset=preset)
     for weight in model.mass.network.parameters():
@@ -86,9 +86,10 @@ def test_spel_keeps_zeros_constants_and_relations(robot, preset, tmp_path):
 @pytest.mark.parametrize("part", ["mass.network", "potential", "input_network"])
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_networks_read_rotation_matrices(net, part, tmp_path):
-    """Networks of phnode equal the paper's, evaluated layer by layer on rotation matrices.
+    """Networks of phnode equal the networks of Wang, Chen and Ding (2025), computed here layer by layer.
 
-    Inputs: entries of R (3, 3) per turning joint and of r (3,) per sliding joint, without the constant entries.
+    Their inputs are entries of the rotation matrix R (3, 3) of a revolute joint: cos q and sin q, without constant and
+    repeated entries. For a prismatic joint they are the scaled position and 0. part: network; net: its type.
     """
     owner = random_model("rpr", tmp_path, seed=5, design=replace(load_design("phnode"), net=net))
     model, encoding = owner.get_submodule(part), owner.encoding
@@ -114,9 +115,10 @@ def test_networks_read_rotation_matrices(net, part, tmp_path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("robot", ["rpr", "six_dof"])
 def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset, tmp_path):
-    """The emitted module equals the port-Hamiltonian system on rotation matrices, eq. 15 and 18 of the paper.
+    """The emitted module, with one axis per joint, equals the port-Hamiltonian system with three axes per joint.
 
-    That system has three axes per joint and automatic derivatives; the emitted module has one axis per joint.
+    That system (lie_group.py) is eq. 15 and 18 of Wang, Chen and Ding (Sci Rep 15:33179, 2025) on rotation matrices,
+    with automatic derivatives. Its velocities and forces about the two axes that the joint lacks are zero.
     """
     design = NETWORKS if preset == "hybrid" else None
     model = random_model(robot, tmp_path, seed=6, preset=preset, design=design)
@@ -138,9 +140,10 @@ def test_reduced_model_is_the_port_hamiltonian_system_on_rotations(robot, preset
 
 @pytest.mark.parametrize("net", ["mlp", "kan"])
 def test_phnode_is_its_three_axis_model_held_by_bearings(net, tmp_path):
-    """The kinetic energy of phnode equals the paper's H = 1/2 p^T M^-1 p over three axes per joint.
+    """phnode equals the three-axis model of Wang, Chen and Ding (2025) if each joint moves only along or about z.
 
-    For motion only along z, the z entries of p are the momentum of the emitted module.
+    That model has H = 1/2 p^T M^-1 p + V with three momenta per joint, p (3 n,). For velocities only in z, as if
+    bearings held the other axes, the z entries of p are the momenta of phnode, and -dH/dq are their rates.
     """
     model = frictionless(
         random_model("six_dof", tmp_path, seed=7, design=replace(load_design("phnode"), net=net))

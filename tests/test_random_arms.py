@@ -75,7 +75,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Facts:
-    """Facts on a structure, by spelgen or by Pinocchio: entries of M, V, outputs, constants, base parameters."""
+    """Facts on the structure of an arm with n joints: derived by spelgen, or measured with Pinocchio.
+
+    entries: per entry of M, "zero", "constant" or "varying", and the joints that it depends on. potential: joints that
+    V depends on. outputs_from: (n,); item k is the number of varying terms of M that depend on none of the first k
+    joints. constants: number of constant terms.
+    """
 
     entries: tuple[tuple[str, tuple[int, ...]], ...]
     potential: tuple[int, ...]
@@ -85,9 +90,9 @@ class Facts:
 
 
 def measured(arm: DrawnArm, *, inertials: bool, rng: np.random.Generator) -> Facts:
-    """Return the facts by Pinocchio at random configurations.
+    """Return the facts on the structure of an arm (see `Facts`) from M and V of Pinocchio at random configurations.
 
-    inertials: with the inertial values of the URDF; otherwise random ones.
+    inertials: True for the inertial values of the URDF, False for random values at each configuration.
     """
     reading = Reading(arm)
     n = len(arm.joints)
@@ -144,7 +149,7 @@ def _count(sizes: np.ndarray) -> int:
 
 
 def told(structure: Structure) -> Facts:
-    """Return the facts by spelgen's derivation."""
+    """Return the facts that spelgen derived (see `Facts`), for the comparison with the result of `measured`."""
     n = len(structure.joints)
     return Facts(
         entries=tuple((entry.kind, entry.joints) for entry in structure.entries),
@@ -193,7 +198,10 @@ def test_values_are_those_of_pinocchio(tmp_path, drawn):
 
 
 def test_rational_rotations_keep_the_zeros_of_half_right_angles():
-    """Rotations by multiples of 45 degrees, which have no rational cosine, keep their zero entries exactly."""
+    """`exact_rotation`, a rational approximation, keeps the zero entries of a rotation exactly.
+
+    Roll, pitch and yaw are multiples of 45 degrees. The cosine of 45 degrees, sqrt(1/2), is not rational.
+    """
     for tilt in product(range(8), repeat=3):
         rotation = rotation_from_rpy([k * pi / 4 for k in tilt])
         found = exact_rotation(rotation)

@@ -84,7 +84,10 @@ def test_words_with_the_inertials_of_the_file(robots):
 
 
 def test_two_turns_about_one_line():
-    """If joint 2 turns against joint 1 about the same line, M21 = -M22, with this reason."""
+    """If the axes of joints 1 and 2 lie on the same line with opposite directions, M21 = -M22.
+
+    The stated reason is that the joints are coaxial.
+    """
     over = tuple(tuple(Fraction(x) for x in row) for row in ((1, 0, 0), (0, -1, 0), (0, 0, -1)))
     arm = chain([("revolute", STRAIGHT, (0, 0, 0)), ("revolute", over, (0, 0, 0.5))])
     told = {fact.statement: fact.reason for fact in facts(arm, derive(arm))}

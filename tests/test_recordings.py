@@ -1,4 +1,7 @@
-"""Recordings of benchmarks are made from clones at their commits, and no content of a source can be executed."""
+"""Recordings of benchmarks are made from clones of git repositories, at the commits that recordings.py states.
+
+Pickled files of a repository cannot call functions.
+"""
 
 import io
 import pickle
@@ -23,9 +26,9 @@ def git(*arguments, folder):
 
 
 def test_a_source_is_read_at_its_commit(tmp_path, monkeypatch, shared):
-    """A source is read at its commit: a later commit of the clone has no effect.
+    """A source of recordings is read at its stated commit: a later commit in the clone has no effect.
 
-    The generated URDF equals the URDF in the reference data, byte for byte.
+    The URDF that is written for the recordings equals the URDF in the reference data, byte for byte.
     """
     source = recordings.SOURCES["xmate3"]
     clone = tmp_path / "clones" / source.repository.name

@@ -45,7 +45,10 @@ def test_structure_is_the_known_one(shared, assume):
 
 @pytest.mark.parametrize("assume", ["kinematics", "inertials"])
 def test_statements_and_reasons_hold_by_numbers(shared, assume):
-    """Each statement about a reference arm holds numerically, and so does each reason; none is omitted."""
+    """Each statement of `facts` about a reference arm (shared/arms) holds numerically, and so does its reason.
+
+    The statements name all zero and constant entries of M. Reasons are tested if the URDF has all inertials.
+    """
     reasons = set()
     for name, _, arm, structure in reference_arms(shared, assume):
         told = facts(arm, structure)
@@ -191,7 +194,10 @@ CHECKS: dict[str, Check] = {
 
 
 def holds(seen: Seen, fact: Fact) -> bool:
-    """Return True if a fact's reason is one of CHECKS and holds for the arm."""
+    """Return True if the table `CHECKS` has a test for the text `fact.reason`, and the arm passes this test.
+
+    seen: axes and masses of the arm at random configurations, by Pinocchio. fact: statement on M or V, with a reason.
+    """
     about = [int(digit) for digit in re.findall(r"\d", fact.statement)]
     named = [int(number) for number in re.findall(r"\d+", fact.reason)]
     some = r"joints? \d+(?:, \d+)*(?: and \d+)?"

@@ -22,7 +22,11 @@ DECORATION = """<gazebo reference="nobody"><sensor type="camera"><rate>abc</rate
 
 @pytest.fixture
 def odd(robots, tmp_path, monkeypatch):
-    """Return a function that writes rpr.urdf with additional elements, and its settings file, and returns the path."""
+    """Return a function that writes rpr.urdf and its settings file, and returns the path of the URDF.
+
+    Its arguments are `more`, XML that is added at the end of the URDF, such as further links, and `sidecar`, the text
+    of the settings file.
+    """
     monkeypatch.chdir(tmp_path)
 
     def write(more="", sidecar=""):
@@ -58,7 +62,10 @@ def test_unneeded_defects_are_warnings_at_most(odd, more, sidecar, codes):
 
 @pytest.mark.parametrize("group", ["simulation", "tracking"])
 def test_settings_with_errors_are_not_copied(odd, tmp_path, group):
-    """Settings with an error are refused: no as-built arm is written, and a comparison does not accept the arm."""
+    """Two functions that copy the settings file of an arm refuse an unknown key in the settings group `group`.
+
+    `as_built` writes no URDF of a perturbed arm, and `arm_inputs` (for a comparison of models) does not copy the arm.
+    """
     urdf = odd(sidecar=f"{group}: {{lenght: 1}}")
     expected = f"{group}: unknown key 'lenght'"
     with pytest.raises(SettingsError, match=expected):

@@ -1,6 +1,6 @@
 """Hostile URDF files are refused or built by `inspect` and `build` within 10 s and 1 GB each.
 
-Seconds refer to the reference in time_bounds.py.
+The 10 s are processor time of the reference machine in time_bounds.py.
 """
 
 from __future__ import annotations
@@ -213,9 +213,10 @@ def test_is_refused_or_built_in_bounds(server, tmp_path, name):
 
 
 def run_in_bounds(server: subprocess.Popen, *arguments: str, folder: Path) -> tuple[str, list[str]]:
-    """Run a command in the server; return its exit code and lines of stderr.
+    """Run a command of spelgen, such as `build`, in `folder`; return its exit code and its lines on stderr.
 
-    Asserts that processor time and memory are within the bounds.
+    The process `server` (see SERVER) has imported spelgen and forks for each command, which saves the time of imports.
+    Asserts that the command uses at most `SECONDS` of processor time and `MEGABYTES` of memory.
     """
     told = folder.parent / f"{folder.name}-{arguments[0]}.stderr"
     print(json.dumps([str(folder), str(told), *arguments]), file=server.stdin, flush=True)

@@ -58,9 +58,9 @@ def test_rotors_count_by_the_square_of_their_gear(robots):
 
 
 def test_a_telescope_moves_its_second_stage_twice():
-    """The second stage of a telescope moves three times as fast as the first stage, so M = m1 + 9 m2.
+    """Stage 2 of a telescope slides on stage 1 and mimics it with the factor 2, so its velocity is (1 + 2) qd.
 
-    Stage 2 mimics stage 1 with the factor 2, and slides on it.
+    M is therefore m1 + 3^2 m2, plus the rotor inertia times the gear ratio squared: 2 + 9 * 5 + 0.5 * 2^2.
     """
     first = body(kind="prismatic", rotation=SIDEWAYS, inertia=point(2))
     second = body("b", "prismatic", parent=0, multiplier=Fraction(2), inertia=point(5))
@@ -137,8 +137,9 @@ def test_a_negative_mass_is_refused():
         pinocchio_model(negative, Settings())
 
 
-# A lift with mimic joints: stage 2 slides twice as far as stage 1, and rod 2 of the pendulum on it turns against
-# rod 1. The leader of the mimic finger is no coordinate of the arm, so the finger is locked at its offset.
+# A lift with mimic joints. Stage 2 slides on stage 1, twice as far as stage 1 on the base. A pendulum of two rods is on
+# stage 2: rod 2 rotates on rod 1, in the opposite direction to rod 1. Finger 2 mimics the joint `grip`, which is no
+# coordinate of the arm, so `grip` is locked at 0 and finger 2 at its offset.
 LIFT = """<robot name="lift"><link name="base"/>
   <joint name="low" type="prismatic"><parent link="base"/><child link="stage1"/><axis xyz="0 0 1"/>
     <limit lower="0" upper="1" effort="10" velocity="1"/><dynamics damping="2" friction="0.5"/></joint>

@@ -54,7 +54,8 @@ MODIFIED = {
         (0.088, RIGHT, 0, 0, False),
     ],
 }
-# per link, in its DH frame: mass, centre of mass, and (xx, yy, zz) or (xx, xy, xz, yy, yz, zz); same sources
+# per link, in its DH frame: mass [kg], centre of mass [m], and inertia about it [kg m^2], (xx, yy, zz) or (xx, xy, xz,
+# yy, yz, zz); from the sources in the settings files
 INERTIALS = {
     "two_link": 2 * [(1, (-0.5, 0, 0), (0.6, 0.6, 1))],
     "rpr": [
@@ -123,7 +124,10 @@ def test_no_file_but_the_urdf_is_needed(robot):
 
 
 def test_it_moves_according_to_its_dh_table(robot):
-    """The pose of the last DH frame relative to the last joint's frame is the same at all positions."""
+    """The URDF of a robot moves as the published DH table of the robot states.
+
+    The last frame of the DH table has the same pose relative to the URDF's last joint frame (by Pinocchio) at all q.
+    """
     model = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     data = model.createData()
     tools = []
@@ -162,7 +166,10 @@ def test_three_parallel_joints_save_outputs():
 
 @pytest.mark.parametrize(("robot", "other"), [("panda", "panda_erd"), ("ur10e", "ur10e_official")])
 def test_its_joints_are_where_the_manufacturers_file_has_them(robot, other, shared):
-    """All joints after the first are at the poses of the manufacturer's URDF, whose base link is rotated."""
+    """Each joint has the same pose relative to the preceding joint as in the manufacturer's URDF.
+
+    The first joint is not compared, since the base link of the manufacturer's URDF is rotated.
+    """
     ours = pin.buildModelFromUrdf(str(ROBOTS / f"{robot}.urdf"))
     theirs = pin.buildModelFromUrdf(str(shared / "arms" / f"{other}.urdf"))
     for joint in range(2, ours.njoints):

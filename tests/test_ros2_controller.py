@@ -43,9 +43,10 @@ def started(arm, **parameters):
 
 
 def torques(model, q, qd, qdd, friction_of=None):
-    """Return the torques of the torch model; friction states result from sliding at ``friction_of``.
+    """Return the torques (n,) [Nm, N] of the inverse dynamics of the torch model at q, qd and qdd, (n,) each.
 
-    friction_of: velocities (n,); None: joints that have not moved.
+    friction_of: velocities (n,) at which the joints slid before, which determine the friction states; None: the joints
+    have not moved.
     """
     states = [torch.as_tensor(x, dtype=torch.float64) for x in (q, qd, qdd)]
     moved_at = states[1] * 0 if friction_of is None else torch.as_tensor(friction_of)
@@ -53,7 +54,10 @@ def torques(model, q, qd, qdd, friction_of=None):
 
 
 def circle(t, start=START):
-    """Return a smooth reference motion at time t [s]: position, velocity and acceleration, (2,) each."""
+    """Return a sinusoidal reference motion of the two joints at time t [s]: q [rad], qd and qdd, (2,) each.
+
+    start: positions of the joints at t = 0, (2,) [rad], at which the motion starts from rest.
+    """
     sign, w = np.array([1.0, -1.0]), 2.0
     return (
         start + 0.4 * sign * (1 - np.cos(w * t)),
@@ -142,12 +146,13 @@ def test_a_preceding_controller_is_tracked(arm):
     controller.call("chain", 1)
     q, _, _ = simulated.run(controller, 1.0, lambda t: controller.write(*circle(t)))
     assert np.abs(q - [circle(k * PERIOD)[0] for k in range(len(q))]).max() < 5e-4
-    # after the last write, the interfaces' values are used for one cycle only
+    # Values that the preceding controller writes are used for one cycle only: without new values, joints are damped.
     _, qd, _ = simulated.run(controller, 1.5)
     assert controller.text("state") == "damping: no reference within reference_timeout"
     assert np.abs(qd[0]).max() > 0.3
     assert np.abs(qd[-1]).max() < 1e-3
-    # only positions are written; references on the topic are ignored
+    # The preceding controller may write only positions: velocities and accelerations are NaN here. The reference on the
+    # topic, 1 rad away, is ignored in chained mode. It counts after this mode, and is too far away.
     controller.reference(simulated.q + 1.0)
     controller.write(simulated.q, [np.nan] * 4)
     controller.update(simulated.q, simulated.qd)
@@ -218,7 +223,8 @@ def test_states_that_are_not_finite_end_in_damping(arm, mode, bad):
     controller.update(START, qd)
     before = controller.text("state")
     tau = controller.update([bad, START[1]], qd)
-    # the controller damps at the last valid position of the joint, with valid velocities
+    # The torques are the gravity at the last valid position plus M times the acceleration -5 qd, which damps the
+    # velocities. Velocities that are not finite count as zero.
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], -5 * qd), rtol=1e-12)
     tau = controller.update(START, [bad, -0.1])
     np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0.5]), rtol=1e-12)
@@ -233,7 +239,7 @@ def test_a_state_that_stays_invalid_is_latched_until_the_next_activation(arm):
     for _ in range(int(0.1 / PERIOD) + 2):
         tau = controller.update([np.nan, np.nan], [np.nan, np.nan])
         np.testing.assert_allclose(tau, torques(arm[0], START, [0, 0], [0, 0]), rtol=1e-12)
-    # after the next valid state, the controller damps at this state
+    # after the next valid state, gravity and the damping acceleration -5 qd are computed from this state
     tau = controller.update(START + np.array([0.01, 0.02]), [0.1, -0.2])
     expected = torques(arm[0], START + np.array([0.01, 0.02]), [0, 0], [-0.5, 1.0])
     np.testing.assert_allclose(tau, expected, rtol=1e-12)

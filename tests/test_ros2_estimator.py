@@ -32,7 +32,10 @@ LOAD = f"""<link name="load"><inertial><origin xyz="{" ".join(map(str, CENTER))}
 
 
 def arm_in(folder, *, loaded=False):
-    """Return the UR10e, with a load if `loaded`; both arms have the tip link of the arm without load."""
+    """Return the UR10e; its URDF and settings are copied to `folder`.
+
+    loaded: if True, the URDF has an additional link, the load, whose frame is the frame of the link wrist_3.
+    """
     text = (ROBOTS / "ur10e.urdf").read_text()
     (folder / "ur10e.urdf").write_text(text.replace("</robot>", LOAD) if loaded else text)
     shutil.copy(ROBOTS / "ur10e.yaml", folder)
@@ -40,7 +43,7 @@ def arm_in(folder, *, loaded=False):
 
 
 def levels(arm):
-    """Return the noise levels of an accurate fit of an arm."""
+    """Return noise levels of the live estimator for an accurate model: torque noise of 0.2 % of the effort limits."""
     effort = np.array([c.effort for c in arm.chain.coordinates])
     noise = BlockNoise(white=2e-3 * effort, disturbance=2e-3 * effort, time_constant=np.ones(N))
     ones = np.ones(N)

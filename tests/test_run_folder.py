@@ -184,7 +184,7 @@ def test_an_interruption_before_the_record_leaves_no_files(start, tmp_path, monk
 def test_a_full_disk_is_reported_with_the_file(start, tmp_path):
     """If the disk is full, the error names the file, and the run is unchanged.
 
-    A limit of 2000 bytes per file fails in the same way.
+    The test simulates the full disk by a limit of 2000 bytes per file, above which a write fails in the same way.
     """
     run = trained(start, tmp_path / "run")
     before = weights(run)

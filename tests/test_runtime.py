@@ -96,12 +96,19 @@ def test_hidden_units_are_shared_in_proportion_to_outputs():
 
 
 def entries(f1, f2, c1):
-    """Return M (..., 3, 3) from functions f1, f2 and a constant c1, like `mass_entries` of an emitted module."""
+    """Return M (..., 3, 3), like `mass_entries` of an emitted module.
+
+    M11 is f1, M21 f1 - 2 f2, M22 c1, M31 0, M32 f2 and M33 3 f2. f1, f2: values (...) of two functions of q at a batch
+    of states. c1: constant.
+    """
     return symmetric([f1], [f1 - 2 * f2, c1], [0, f2, 3 * f2])
 
 
 def residual_terms(joints=JOINTS, size: float = 0.0, *, networks: bool = True) -> ResidualTerms:
-    """Return residual terms whose parameters are normal random numbers of this standard deviation."""
+    """Return residual terms with normal random parameters of standard deviation `size`.
+
+    networks: whether networks for M and V are added to the functions of single joints.
+    """
     generator, parts = torch.Generator().manual_seed(0), {}
     if networks:
         scales = [(1.0, 1.0, 1.0)] * 2
@@ -123,7 +130,10 @@ def test_residual_terms_are_a_gradient_and_vanish_outside_the_range():
     assert (pose.friction > 0).all()
 
     def added(at: Tensor) -> Tensor:
-        """Return the residual Lagrangian 1/2 qd^T R qd - V of the terms, summed over states."""
+        """Return the Lagrangian 1/2 qd^T R qd - V of the residual terms, summed over 50 states.
+
+        R is the residual term of the mass matrix, V of the potential. at: positions q, (50, 3); qd is not varied.
+        """
         mass = terms.at(at, weights).mass
         return 0.5 * torch.einsum("ti,tij,tj->", qd, mass, qd) - terms.energy(terms.at(at, weights)).sum()
 
@@ -266,7 +276,7 @@ def test_a_standalone_module_contains_the_definitions_that_it_uses():
 
 
 def test_a_thin_module_is_short_and_shows_the_entries():
-    longest = {"hybrid": 120, "spel": 100}  # largest number of lines of a thin module of rpr
+    longest = {"hybrid": 120, "spel": 100}  # maximum lines of a module of rpr that imports spelgen.runtime
     for robot in SIX:
         for preset in PRESET_NAMES:
             lines = built(robot, preset=preset)[0].splitlines()
@@ -288,9 +298,10 @@ def test_values_are_in_units(tmp_path):
 
 
 def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
-    """Return Cholesky factors of inertial parameters `ten` (bodies, 10), rounded as in modules of the first release.
+    """Return upper triangular factors C, with the pseudo-inertias C C^T of bodies, as in modules of the first release.
 
-    They had ten digits, and six for link3 of rpr, whose inertia is at the limit of physical consistency.
+    ten: inertial parameters, (bodies, 10). They are rounded to ten digits, as those modules stated them. Link 3 of rpr
+    had six digits, since its inertia is at the limit of physical consistency.
     """
     digits = [6 if (robot, index) == ("rpr", 2) else 10 for index in range(len(ten))]
     rounded = [[float(f"{x:.{k}g}") for x in row] for row, k in zip(ten.tolist(), digits, strict=True)]
@@ -299,10 +310,11 @@ def factors_of_first_stage(ten: Tensor, robot: str) -> Tensor:
 
 
 def weights_of_first_stage(bodies):
-    """Return the parameters of the bodies of the first release, for 0.01 added to each of its parameters.
+    """Return the log-Cholesky parameters with which the current bodies equal bodies of the first release.
 
-    The first release had lower triangular Cholesky factors of the pseudo-inertia, relative to the nominal ones. With
-    0.01 added, their diagonal entries are exp(0.01), and their other entries 0.01. bodies: a `BodyChain`.
+    In the first release, the pseudo-inertia was L T T^T L^T with the lower triangular factor L of the nominal
+    pseudo-inertia. All parameters are 0.01 here: the lower triangular T has exp(0.01) on the diagonal and 0.01 below
+    it. bodies: `InertialParameters`, which have upper triangular factors instead.
     """
     nominal = bodies.factors @ bodies.factors.mT
     entries = 0.01 * torch.ones(4, 4).double().tril(-1)
@@ -312,10 +324,11 @@ def weights_of_first_stage(bodies):
 
 
 def rotation_inputs(joint_types, axes):
-    """Return (joint, index, sign, constant) per input of the first release's networks.
+    """Return (joint, index, sign, constant) for each input of the networks of the first release.
 
-    The input equals sign * (current input `index`) + constant, and depends on `joint`. The first release had nine
-    inputs per rotation.
+    The input equals sign * (current input `index`) + constant. joint: index of the position (0 to n - 1) or of the
+    velocity (from 2 n) that it depends on. Inputs of a revolute joint were the nine entries of its rotation matrix, now
+    cos q and sin q. axes: number of velocity inputs per joint (0: none), of which only the last one is not zero.
     """
     n, inputs = len(joint_types), []
     for joint, kind in enumerate(joint_types):
@@ -329,9 +342,10 @@ def rotation_inputs(joint_types, axes):
 
 
 def network_of_first_stage(network, inputs, generator):
-    """Give a network the parameters that make it equal to a network of the first release.
+    """Set the parameters of `network` so that it equals a network of the first release, which had other inputs.
 
-    That network read nine numbers per rotation, and 0.01 was added to each of its parameters.
+    The parameters of that network are random numbers from `generator`, plus 0.01: the change of all parameters with
+    which the numbers of the first release were recorded. inputs: result of `rotation_inputs`.
     """
     sensitivity = network.mask0[0].flatten()
     for index, weight in enumerate(network.weights):
@@ -350,7 +364,8 @@ def network_of_first_stage(network, inputs, generator):
             weight.zero_()
             for (joint, now, sign, constant), column in zip(inputs, drawn.unbind(1), strict=True):
                 if sign:
-                    # basis functions at -x equal the basis functions at x in reverse order
+                    # The grid of the KAN's Gaussians is symmetric about 0: at the input -x, they have the values that
+                    # they have at x in reverse order.
                     weight[:, now] += column.flip(-1) if grid and sign < 0 else column * (1 if grid else sign)
                 elif grid:
                     bumps = torch.exp(-((constant / (2 / 3) - network.grid) ** 2))
@@ -363,9 +378,10 @@ def network_of_first_stage(network, inputs, generator):
 
 @pytest.mark.parametrize("case", json.loads(NUMBERS.read_text()))
 def test_numbers_equal_those_of_the_first_release(case, tmp_path):
-    """Models give the numbers of the first release, for equal seeds and equal changes of their parameters.
+    """M and the forward and inverse dynamics equal the numbers that modules of the first release gave.
 
-    Modules of the first release were made by templates.
+    Those modules had other parameters and network inputs. The functions above convert their parameters: random ones of
+    the same seed, to each of which 0.01 is added.
     """
     robot, preset, _ = case.split()
     design = load_design("closed-form") if preset == "closed-form" else None
@@ -431,7 +447,10 @@ def test_every_parameter_has_a_kind():
 
 @pytest.mark.parametrize("preset", ["closed-form", "minimal"])
 def test_invalid_states_are_refused_with_a_remedy(preset):
-    """All methods refuse arrays, another precision and inconsistent shapes, with advice."""
+    """The methods of a model refuse NumPy arrays, tensors that are not float64, and inconsistent shapes.
+
+    The error states the expected type or shape.
+    """
     model = build(arm_of("rpr"), preset)
     q = draw(5, 3)
     for call in (model.inverse_dynamics, model.forward_dynamics):

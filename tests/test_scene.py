@@ -16,7 +16,10 @@ from spelgen.templates import json_data
 
 
 def frames(links, q):
-    """Return the rotation (3, 3) and position (3,) of each link at q, by the algorithm of the page's script."""
+    """Return the rotation (3, 3) and position (3,) [m] of each link at q (n,), in the frame of the root link.
+
+    The JavaScript that draws the arm in HTML pages uses the same algorithm. links: links of the arm's `scene`.
+    """
     placed = []
     for link in links:
         rotation, position = placed[link.parent] if link.parent >= 0 else (np.eye(3), np.zeros(3))

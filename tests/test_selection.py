@@ -1,4 +1,7 @@
-"""Acceptance of residual terms, friction effects and figures: each test fails without the criterion it names."""
+"""Selection of residual terms and friction effects, noise estimates and errors in reports.
+
+Each test fails without the criterion or the formula that it names.
+"""
 
 import re
 from dataclasses import replace
@@ -57,14 +60,19 @@ def samples(missing: torch.Tensor, q: torch.Tensor) -> ResidualSamples:
 
 
 def data(correlation_length: float, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return correlation lengths (2,), recording numbers (T,), and torque standard deviations (2,) of one recording."""
+    """Return correlation lengths (2,), recording numbers (count,) and torque standard deviations (2,) for two joints.
+
+    The correlation length [samples] and the standard deviation, 4 Nm, are equal for both joints. All samples are of
+    recording 0.
+    """
     return torch.full((2,), correlation_length), torch.zeros(count).long(), torch.full((2,), 4.0).double()
 
 
 def test_a_function_is_selected_by_held_out_blocks(hybrid):
-    """A function is selected by held-out blocks: a residual that is constant in each block selects no function of q.
+    """A function of q is selected only if it lowers the torque residual in blocks that were held out of its fit.
 
-    Joint 1 moves slowly through its range once, so that q is different in each block.
+    The residual here is a random constant in each of ten blocks. Joint 1 moves through its range once, so each block
+    has its own q: a function of q explains the residual of the fitted blocks, but not of others. None is selected.
     """
     levels = torch.randn(10, 1, generator=torch.Generator().manual_seed(3)).double()
     missing = levels.repeat_interleave(200, dim=0) * torch.tensor([[1.0, 0.0]]).double()
@@ -74,7 +82,7 @@ def test_a_function_is_selected_by_held_out_blocks(hybrid):
 
 
 def test_samples_next_to_a_held_out_block_are_not_fitted(hybrid):
-    """Gaps are left on both sides of held-out blocks: a residual that is constant across borders selects no function.
+    """Held-out blocks have gaps on both sides: a residual that is constant across their borders selects no function.
 
     Otherwise the half of a constant segment on one side of a border would predict the half on the other side.
     """
@@ -91,7 +99,9 @@ def test_samples_next_to_a_held_out_block_are_not_fitted(hybrid):
 def test_a_function_must_lower_the_error_of_the_last_half(hybrid):
     """A function that is fitted to the first half must also lower the error in the last half.
 
-    With 0.45 of the torque in the last half, it would raise the error there (refused); with 0.75 it lowers the error.
+    The residual torque of joint 1 is sin(q) in the first half. In the last half it has another amplitude a: a * sin(q).
+    The fitted function, sin(q), changes the relative squared error of the last half from a^2 to (1 - a)^2. This is
+    larger for a = 0.45 (not selected) and smaller for a = 0.75 (selected).
     """
     t = torch.linspace(0, 200, 4000).double()
     q = torch.stack([torch.sin(t), torch.zeros_like(t)], dim=1)
@@ -137,10 +147,14 @@ def test_an_error_reduction_in_one_of_ten_blocks_is_not_significant(hybrid):
 
 
 def test_a_block_without_torque_does_not_prevent_selection():
-    """A block at rest without torque does not prevent the selection, although a function has a small error there."""
+    """A block at rest without torque does not prevent the selection of a function.
+
+    The function has a small error in this block, where the error without the function is zero.
+    """
     squares, missed = torch.full((10,), 100.0), torch.full((10,), 10.0)
     squares[3], missed[3] = 0.0, 1e-9
-    # the error falls to a tenth in nine of ten blocks
+    # g = (before - after) / (before + after) is 90 / 110 in nine blocks and 0 in the block at rest; its mean, 0.74, is
+    # equivalent to the error reduction 2 g / (1 + g) = 0.85 of all blocks
     assert selection.significant_reduction(squares, missed) == pytest.approx(0.85, abs=0.01)
 
 
@@ -241,9 +255,10 @@ def test_intervals_of_correlated_errors_are_wider():
 
 @pytest.mark.parametrize("correlation", [1.0, 5.0])
 def test_the_first_noise_is_that_of_least_squares(correlation):
-    """The initial noise is the residual of least squares per joint, corrected for its degrees of freedom.
+    """The initial noise of a joint is s, with s^2 = c RSS / (T - c p) of a least-squares fit to its torques.
 
-    Joint 1 has three parameters of its own, joint 2 none; with correlated errors fewer samples are independent.
+    RSS: sum of squared residuals of T samples. p: number of parameters that affect the joint, 3 for joint 1 and 0 for
+    joint 2. correlation: c, number of correlated samples that count as one independent error.
     """
     draw = torch.Generator().manual_seed(0)
     count, deviations = 400, torch.tensor([0.5, 0.01]).double()
@@ -282,9 +297,10 @@ def test_a_dead_zone_of_a_servo_must_be_significant(monkeypatch):
 
 
 def test_the_regularizer_towards_the_urdf_equals_its_definition(robots, monkeypatch):
-    """The regularizer towards the URDF equals its definition in the documentation.
+    """The regularizer is `urdf_weight` times the sum of two mean squared differences between model and URDF.
 
-    It is the weight times the mean squared differences of M's variation and of gravity, relative to their magnitudes.
+    They are the differences of the variation M(q) - mean M, whitened with the URDF's mean M (here the identity), and of
+    the gravity torque, divided by its RMS value (here 2 Nm). The URDF's variation and gravity torque are zero here.
     """
     draw = torch.Generator().manual_seed(0)
     mass = torch.randn(50, 2, 2, generator=draw).double()
@@ -321,9 +337,10 @@ def test_the_cost_of_a_torque_fit_has_the_prior_in_it():
 
 
 def test_noise_is_at_most_the_largest_error():
-    """The estimated noise is at most `max_error`: 2 Nm at joint 1, although the residual is 5 Nm.
+    """The noise estimate limits the RMS residual of a joint to `max_error`, 2 Nm here.
 
-    Joint 2 has a residual of 1 Nm, below its `max_error`. Each noise is multiplied by sqrt(correlation length).
+    Joint 1 has 5 Nm, which becomes 2 Nm; joint 2 has 1 Nm. The results are then multiplied by sqrt(5), since 5
+    correlated samples (the correlation length) count as one independent error.
     """
     columns = torch.tensor([[5.0, 5.0], [10.0, 10.0], [2.0, 2.0]]).double()
     estimator = torque_problem.NoiseEstimator(50, *columns)
@@ -333,7 +350,7 @@ def test_noise_is_at_most_the_largest_error():
 
 
 def test_noise_is_estimated_per_joint():
-    """The noise of a joint is proportional to the root of its own squared residual."""
+    """The noise of a joint is proportional to the RMS residual of this joint, and independent of other joints."""
     estimator = torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double())
     noise = [estimator.estimate(torch.tensor(x).double()) for x in ([2.0, 8.0], [20.0, 80.0])]
     torch.testing.assert_close(noise[0][1], 2 * noise[0][0])
@@ -341,9 +358,10 @@ def test_noise_is_estimated_per_joint():
 
 
 def test_noise_is_corrected_for_degrees_of_freedom():
-    """The noise is corrected for the degrees of freedom of the fit.
+    """The squared residual is divided by the degrees of freedom: independent errors minus parameters, at least 1.
 
-    With ten independent errors, the squared residual is divided by 6 for four parameters, by 1 for twenty parameters.
+    With 50 samples and a correlation length of 5 there are ten independent errors. The divisor is 10 without
+    parameters, 6 for four parameters, and 1 for twenty parameters.
     """
     estimator, squares = (
         torque_problem.NoiseEstimator(50, torch.full((2,), 5.0).double(), torch.ones(2).double()),
@@ -355,9 +373,10 @@ def test_noise_is_corrected_for_degrees_of_freedom():
 
 
 def test_no_step_of_a_servo_joint_raises_its_cost():
-    """A step of a servo joint that raises the joint's cost is not taken.
+    """In a fit of servo parameters, a Levenberg-Marquardt step that raises the cost of a joint is rejected.
 
-    The residual of each of two joints is arctan(10 x): from x = 0.3 a Gauss-Newton step goes far beyond zero.
+    The residual of each of two joints is arctan(10 x), with one parameter x per joint. From x = 0.3, a Gauss-Newton
+    step goes far beyond the minimum x = 0.
     """
     seen = []
 
@@ -431,9 +450,10 @@ def test_a_friction_state_must_lower_the_residual_in_most_blocks():
 
 
 def test_the_occam_factor_of_bristle_fractions():
-    """The Occam factor of bristle fractions is the log ratio of prior to posterior standard deviations, per joint.
+    """-2 log(Occam factor) of a joint's bristle fractions is log det of prior minus log det of posterior covariance.
 
-    Of two joints with two elements each, samples narrow one fraction of joint 2 to a tenth.
+    Two joints have two fractions each. The posterior standard deviation of one fraction of joint 2 is a tenth of the
+    prior's, so the result is 2 log(10) for joint 2; the other fractions have their prior's, so it is 0 for joint 1.
     """
     rigid = SimpleNamespace(
         names=lambda group: ["fractions"],

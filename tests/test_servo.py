@@ -130,7 +130,8 @@ def test_joints_get_the_laws_that_they_have(fitted):
         laws = fitted.model.friction.prepare()
     assert laws.stribeck[0] < 0.15 * TRUTH.coulomb[0]
     assert float(laws.stribeck[1]) == pytest.approx(TRUTH.stribeck[1], rel=0.3)
-    # friction / kp is compared as a curve over velocity, as model and simulator have different Stribeck formulas
+    # Friction is divided by kp, since the logs determine only this ratio. It is compared at four velocities and not by
+    # its parameters, as model and simulator have different Stribeck formulas.
     speeds = torch.tensor([0.05, 0.1, 0.2, 0.4]).double()
     with torch.no_grad():
         dry = laws.dry(speeds[:, None].expand(-1, 2), torch.zeros(4, 2).double())
@@ -154,7 +155,7 @@ def test_intervals_count_correlated_errors_once():
         found.append(float(step))
     assert np.mean(told) == pytest.approx(
         np.var(found), rel=0.15
-    )  # the variance would be a fiftieth if all errors of a window were independent
+    )  # the jackknife variance `told` would be a fiftieth if the 50 equal errors of a window were independent
 
 
 def test_blocks_of_intervals_are_whole_motions():
@@ -229,12 +230,17 @@ def test_reported_intervals_cover_the_truth(fitted):
             # tolerance for the different Stribeck curves: only the simulator's falls as a Gaussian
             assert joint[what]["value"] == pytest.approx(truth, rel=0.03 if k == 0 else 0.04), what
             assert joint[what]["low"] < truth < joint[what]["high"], what
-    # small gravity of the elbow does not separate dry friction from a dead zone
+    # The dry friction of the shoulder (joint 0) is determined. The elbow carries a small gravity load, under which dry
+    # friction and a dead zone cause the same position errors: only their sum, static_error, is determined there. The
+    # summary names dry/kp of the elbow as not determined.
     assert told[0]["dry"]["determined"] and "dry/kp of elbow" in servo_summary(fitted.record.servo).text
 
 
 def test_every_ratio_that_is_open_is_named():
-    """A dead zone that the logs do not determine is named, also if the dry friction of its joint is determined."""
+    """`servo_summary` lists each quantity that the logs do not determine, such as a ratio to kp or a dead zone.
+
+    Here it lists the half dead zone of the elbow, although the elbow's dry friction is determined.
+    """
     sure = {"value": 0.1, "low": 0.09, "high": 0.11, "determined": True}
     joint = {"joint": "elbow", "kp": {"value": 20.0}, "dry": sure, "dead_zone": sure | {"determined": False}}
     text = servo_summary({"joints": [joint], "delay": {"value": 0.01, "half": 0.001}, "rms": [0.002]}).text
@@ -263,16 +269,18 @@ def servo_values(q):
 
 
 def test_the_posterior_of_a_servo_fit_contains_the_truth(fitted, arm):
-    """Intervals of a servo fit contain the true values, also if the URDF's masses are 20 % wrong.
+    """At least 90 % of the 95 % intervals of servo fits contain the true values, also with wrong masses in the model.
 
-    One fit has the URDF of the simulated arm; the other has wrong masses, and its logs other servos.
+    Two fits are tested. The first (`fitted`) starts from the true masses. The second starts from masses that are 20 %
+    too large, and its logs are simulated with other servos.
     """
     other = Servos((10.0, 6.0), (0.5, 0.6), (0.02, 0.02), (0.08, 0.1), delay=0.015)
     heavy = spelgen.build(arm, "closed-form")
     with torch.no_grad():
         heavy.bodies.raw[:, -1] += np.log(1.2)
     held, q = [], np.random.default_rng(0).uniform(-1.5, 1.5, (4, 2))
-    # ten short logs, since the time of a fit depends on the duration of its windows and not on their number
+    # Ten logs of 2 s instead of one of 20 s give short windows, since a window ends with its log. All windows are
+    # simulated in one batch, so the time of a fit depends on the length of the windows, not on their number.
     second = spelgen.fit(heavy, servo_logs(10, 2.0, other, seed=4))
     for fit, servos in ((fitted, TRUTH), (second, other)):
         posterior, kp = fit.posterior, np.array(servos.kp)
@@ -308,7 +316,9 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             stated = posterior.drives[name][k]
             value, high = joint[ratio]["value"], joint[ratio]["high"]
             assert stated.value == pytest.approx(value)
-            # not equal: the record has the interval of the logarithm, and for the lag includes 3 % of the delay
+            # The upper ends of the intervals in the posterior and in the record (config.json) differ: the interval in
+            # the record is symmetric in the logarithm of the value. Both include a model error of 3 %. For the lag,
+            # kd/kp + delay, this is 3 % of the lag in the record, and 3 % of kd/kp in the posterior.
             assert 0.5 < (stated.high - value) / (high - value) < 1.05
     with pytest.raises(RunError, match="got intervals of torques, expected a fit to logs with torques"):
         posterior.torque(*np.zeros((3, 1, 2)))
@@ -328,7 +338,7 @@ def test_the_posterior_of_a_servo_fit_names_what_is_open(fitted):
             "ur10e",
             (tuple(range(6)),),
             {("armature", 0), ("armature", 1)},
-        ),  # the identifiable ratios agree with those for motors of this arm in Khalil and Dombre, ch. 12
+        ),  # as for motors in Khalil and Dombre, ch. 12: armature/kp of joints 0 and 1 is not identifiable
         ("sliders", ((0,), (1,)), {("armature", 0), ("armature", 1)}),
     ],
 )
@@ -415,7 +425,10 @@ def test_incompatible_models_and_logs_are_reported(arm, logs, robots):
 
 
 def moved(model, seconds, count=1):
-    """Simulate logs of a model in which the commands of both joints jump at the same time, with small steps."""
+    """Simulate `count` logs of a model, in which the commands of both joints jump every 0.5 s at the same time.
+
+    seconds: duration of a log [s]. The integration step is 2.5 ms; the logs have one sample per 20 ms.
+    """
     with torch.no_grad():
         model.raw_armature.copy_((torch.tensor(TRUTH.armature) / model.armature).log())
         model.servo.delay.fill_(TRUTH.delay)

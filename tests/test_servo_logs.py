@@ -176,7 +176,8 @@ def test_normalised_positions_declared_as_degrees_are_found_by_their_steps(arm, 
     warning = f"positions within -100..100: right as deg, {UNLESS_NORMALISED}"
     accepted = changed(wrong, accepted=lambda x: ("normalised",), repairs=lambda x: (warning,))
     report = spelgen.check_logs(accepted, arm)
-    # if the error is accepted, the warning of the file's reader is reported in its place
+    # With 'accept: [normalised]' in the settings there is no error. The warning of the file reader, that the positions
+    # may be normalised, is then reported; otherwise the error replaces it.
     assert not report.errors and any(warning in x.message for x in report.findings)
 
 
@@ -188,7 +189,8 @@ def test_degrees_of_encoders_and_rounded_degrees_are_no_normalised_positions(arm
 
 
 def test_commands_in_radians_beside_positions_in_degrees_are_an_error_with_the_line(arm, logs):
-    # the mapping states degrees for positions and commands: commands in rad, converted too, are nearly constant
+    # The mapping states degrees for positions and commands. Commands in rad are therefore multiplied by pi / 180, too,
+    # and are nearly constant.
     small = changed(logs, u=lambda x: np.radians(x.u))
     errors = [str(error) for error in spelgen.check_logs(small, arm).errors]
     assert len(errors) == 1
@@ -218,7 +220,10 @@ def test_a_unit_of_servos_that_is_stated_wrongly_is_named_with_the_line(arm, log
 
 
 def only_rows(x, column, rows, value):
-    """Return a log without velocities, with the position of one joint replaced in some rows."""
+    """Return a copy of the log `x` in which `value` replaces the positions q[rows, column] of joint `column`.
+
+    value: position [rad], or a function that returns it from all positions (T,) of the joint. The velocities are dq/dt.
+    """
     q = x.q.copy()
     q[rows, column] = value(q[:, column]) if callable(value) else value
     return replace(x, q=q, qd=np.gradient(q, x.t, axis=0), mapping=LogMapping(input="position"))
@@ -280,11 +285,15 @@ def opposite(log, k):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_position_errors_show_senses_and_order_of_servos(arm, seed):
-    """Position errors u - q of servos are proportional to torques: their gravity part shows wrong senses and order."""
+    """Joints with the opposite sign, or in the wrong order, are found in logs of servos without torques.
+
+    The position error u - q of a servo is proportional to its torque, and its gravity part shows both faults.
+    """
     logs = [replace(x, mapping=LogMapping(input="position")) for x in servo_logs(1, 20.0, seed=seed)]
     assert not spelgen.check_logs(logs, arm).errors
     (error,) = map(str, spelgen.check_logs([opposite(x, 1) for x in logs], arm).errors)
-    # gravity of this arm determines the relative sense of its two joints only
+    # Gravity torques of this arm are the same if both joints are reversed. They determine the sense of one joint
+    # relative to the other, but not which joint is reversed.
     assert "elbow: {sign: -1}" in error and "--accept joint-sense" in error
     exchanged = changed(logs, q=lambda x: x.q[:, ::-1], qd=lambda x: x.qd[:, ::-1], u=lambda x: x.u[:, ::-1])
     (error,) = map(str, spelgen.check_logs(exchanged, arm).errors)

@@ -1,6 +1,7 @@
-"""An interrupted fit of servos resumes to the same bytes, and a run of other logs or another model is refused.
+"""An interrupted and resumed servo fit writes the same model and baselines as an uninterrupted fit, byte for byte.
 
-test_run_folder.py kills a training at each of its writes.
+A run of other logs or of another model is not resumed. Only interruptions by the user are tested here;
+test_run_folder.py tests a process that is killed at any of its writes.
 """
 
 import json
@@ -25,7 +26,10 @@ from spelgen.fitting.train import train
 
 @pytest.fixture(scope="module", autouse=True)
 def few_steps():
-    """Limit outer iterations to two steps: the equality of resumed fits does not depend on their number."""
+    """Limit each minimization in a fit to two Levenberg-Marquardt steps, to save time.
+
+    A resumed fit equals an uninterrupted fit for any number of steps.
+    """
     with pytest.MonkeyPatch.context() as patch:
         for module in (objective, laws):
             patch.setattr(module, "TUNING", replace(module.TUNING, steps=2, joint_steps=2))

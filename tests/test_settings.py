@@ -31,7 +31,10 @@ def urdf(tmp_path, monkeypatch):
 
 
 def told(path):
-    """Return the text of the errors of a settings file, after each group of keys is read."""
+    """Return the text of the errors of a settings file, which must have errors.
+
+    Errors of a group that only one step uses (`OF_A_STEP`) are raised when the group is read, so each group is read.
+    """
     with pytest.raises(SettingsError) as error:
         settings = load_settings(path)
         for group in OF_A_STEP:
@@ -321,7 +324,7 @@ def test_a_mapping_may_have_a_file_of_its_own(tmp_path, monkeypatch):
 
 
 def test_units_in_settings_have_the_spellings_of_headers(urdf):
-    """A unit that a draft recognises in a header is also a unit of a setting, with the same meaning."""
+    """Units in settings may have the same spellings as units in the header of a log file, such as Degrees or N*m."""
     units = "units: {t: seconds, q: Degrees, qd: 0.5 °/s, tau: N*m}"
     logs = load_settings(urdf(f"logs:\n  {units}\n  joints: {{a: {{units: {{q: 2 cm, tau: kN}}}}}}\n")).logs
     assert logs.units.model_dump(exclude_none=True) == {"t": "s", "q": "deg", "qd": "0.5 deg/s", "tau": "Nm"}
@@ -358,7 +361,7 @@ def test_a_list_of_boxes_is_refused_with_an_example(tmp_path):
 
 @pytest.mark.parametrize("name", ["rpr", "scara", "panda", "ur10e"])
 def test_a_starter_file_states_the_defaults(robots, tmp_path, name):
-    """The file that `init` writes has the default values, both as written and with all comments activated."""
+    """The settings file that `init` writes states the defaults, also if its commented-out settings are uncommented."""
     urdf = tmp_path / "arm.urdf"
     urdf.write_bytes((robots / f"{name}.urdf").read_bytes())
     assert CliRunner().invoke(app, ["init", str(urdf)]).stdout == f"wrote {tmp_path}/arm.yaml\n"

@@ -272,9 +272,10 @@ class TestIntegration:
             np.testing.assert_allclose(states[k + 1], end, atol=1e-9)
 
     def test_no_reversal_goes_unseen_between_the_stages_of_a_step(self):
-        """A reversal of velocity within an integration step is not skipped; the error is only the smoothing width.
+        """A reversal of velocity within one integration step is detected: the final velocity is right within 1e-4 m/s.
 
-        A slider moves against friction so fast that it passes the narrow jump of friction within one step.
+        The reversal is so fast that the slider crosses the jump of dry friction at zero velocity within one step. Dry
+        friction is 1 N before and 3 N after the reversal, smoothed over 1e-3 m/s.
         """
         settings = Settings.model_validate(
             {

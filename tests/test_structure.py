@@ -44,7 +44,10 @@ def test_rpr_has_the_structure_of_the_paper(robots):
 
 
 def test_a_planar_chain_separates_shared_functions():
-    """The outputs of a planar 3R arm are separate functions of q2, q3 and q2 + q3, although M_11 is their sum."""
+    """The outputs (functions f_j of q in M) of a planar 3R arm are functions of q2, q3 and q2 + q3, one of each.
+
+    The entry M_11 contains only a sum of all three; they are separated with the help of the other entries of M.
+    """
     structure = derive(planar(3))
     assert [output.joints for output in structure.outputs] == [(2,), (1,), (1, 2)]
     assert len(structure.constants) == 3
@@ -52,9 +55,9 @@ def test_a_planar_chain_separates_shared_functions():
 
 @pytest.mark.parametrize("robot", COUNTS)
 def test_smallest_form_is_exact(robots, robot):
-    """M equals the sum over outputs and constants, times their matrices.
+    """M(q) = sum_j f_j(q) B_j + sum_k c_k A_k for outputs f_j, constants c_k, and matrices B_j, A_k of the structure.
 
-    Values of outputs and constants are the weighted entries of M that the structure states.
+    The values of f_j and c_k are computed from M: as the weighted sums of its entries that the structure states.
     """
     loaded = load_arm(robots / f"{robot}.urdf")
     structure = derive(loaded.chain)
@@ -69,16 +72,19 @@ def test_smallest_form_is_exact(robots, robot):
 
 
 def test_factors_are_exact_fractions(robots):
-    """Factors in M are exact fractions: by eq. 20 of the paper, M_11 of two_link has twice the function of M_21."""
+    """Factors of the outputs in M are exact fractions: two_link has M_11 = 2 f(q) + constant, M_21 = f(q) + constant.
+
+    The factor 2 is in eq. 20 of Wang, Chen and Ding, Sci Rep 15:33179, 2025.
+    """
     structure = derive(load_arm(robots / "two_link.urdf").chain)
     assert structure.outputs[0].basis == ((0, 0, Fraction(2)), (1, 0, Fraction(1)))
 
 
 @pytest.mark.parametrize(("joints", "seed"), [(6, 0), (7, 1), (8, 2), (10, 3)])
 def test_generic_arms_follow_the_formula(joints, seed):
-    """An arm with random geometry has n(n+1)/2 - 1 outputs and one constant.
+    """M of an arm with n joints and random geometry has n(n+1)/2 - 1 varying terms (outputs) and one constant term.
 
-    All entries of M except M_nn vary, with one linear relation between them.
+    All entries of the lower triangle vary independently, except M_nn, which is constant.
     """
     structure = derive(random_arm(joints, seed))
     assert (len(structure.outputs), len(structure.constants)) == (joints * (joints + 1) // 2 - 1, 1)
@@ -88,9 +94,10 @@ def test_generic_arms_follow_the_formula(joints, seed):
 
 
 def test_edo_by_singular_values(shared):
-    """Joints 1-3 of edo have eleven outputs: eleven singular values of samples of M are not zero.
+    """Eleven of edo's outputs (functions f_j of q in M) depend on joints 1-3: the changes of M with them have rank 11.
 
-    The eleventh is only 1e-10 of the first: with their tolerance, the reference data count ten.
+    The reference data (../shared/arms) count ten: the eleventh singular value of sampled changes of M is only 1e-10 of
+    the first, below the tolerance of the reference data.
     """
     joints = [f"joint_{k}" for k in range(1, 7)]
     arm = make_arm(read_urdf(shared / "arms" / "edo.urdf"), joints=joints)
@@ -101,6 +108,7 @@ def test_edo_by_singular_values(shared):
     sizes = np.linalg.svd(changes, compute_uv=False)
     sizes /= sizes[0]
     assert sizes[9] > 1e-2
-    # the eleventh singular value is far above rounding errors, and just below the tolerance of the reference data
+    # The eleventh singular value of the changes of M is far above rounding errors, so the exact rank is 11. It is just
+    # below the tolerance of the reference data, which therefore count ten.
     assert 1e-11 < sizes[10] < 1e-9
     assert sizes[11] < 1e-15

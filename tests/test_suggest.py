@@ -1,4 +1,4 @@
-"""A mapping that is suggested from column names reads the log with its original values."""
+"""A log that is read with the mapping suggested from its column names has the values that were written, in SI units."""
 
 import csv
 import subprocess
@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.errors import LogError
+from spelgen.logs.arm_mapping import log_source
 from spelgen.logs.formats import log_files
 from spelgen.logs.read import read_logs
 from spelgen.logs.suggest import suggest_mapping
@@ -47,7 +48,7 @@ def written(path, head, rows):
 def require_same(found, rtol=1e-9, qd=QD):
     for values, expected in ((found.q, Q), (found.qd, qd), (found.tau, TAU)):
         np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-9)
-    # the tolerance is the resolution of a double at 1.7e9 s
+    # some logs have times of about 1.7e9 s, where doubles have a spacing of 2.4e-7 s; the tolerance is four times this
     np.testing.assert_allclose(found.t - found.t[0], T, atol=1e-6)
 
 
@@ -108,7 +109,10 @@ def test_names_of_columns_may_be_in_any_character_set_of_spreadsheets(scara, tmp
 def test_a_state_of_positions_and_velocities_is_recognised_by_its_values(
     scara, tmp_path, form, state, torque
 ):
-    """A draft assigns the last half of a state [q; qd] to the velocities; its names do not state them."""
+    """A suggested mapping assigns the first half of a state [q; qd] to positions and the last half to velocities.
+
+    The column names (x0 to x7) do not distinguish both halves, so the values determine the assignment.
+    """
     if form == "matrices":
         path = tmp_path / "log.npz"
         np.savez(path, **{"t": T, state: np.column_stack([Q, QD]), torque: TAU})
@@ -129,7 +133,10 @@ def test_matrices_of_two_arms_are_refused(scara, tmp_path, form):
 
 
 def test_units_and_clocks_in_the_middle_of_names(scara, tmp_path):
-    """A unit may precede a number, and a stamp may be called nanos; torques of disturbances are not torques."""
+    """A unit in a column name may precede the joint number (load_0.1%_0); times may be two columns, one of nanoseconds.
+
+    Columns of disturbance torques (DistTrq) are not suggested as joint torques.
+    """
     head = ["stamp_seconds", "stamp_nanos", *(f"q{k}/°" for k in range(4))]
     head += [f"{name}_{k}" for name in ("speed", "load_0.1%", "DistTrq") for k in range(4)]
     whole = np.floor(1.7e9 + T)
@@ -157,7 +164,11 @@ def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
 
 
 def test_times_that_fall_are_called_so(scara, tmp_path):
-    """The error about the time that remains does not advise to make a recording of each row."""
+    """If times decrease from row to row, such as remaining times, the error states this and advises `sample_rate`.
+
+    If times decrease at a few rows only, a recording starts at each of them, and another error advises a column with
+    the number of the recording. This advice would be wrong here: each row would be a recording.
+    """
     head = ["t", *(f"{x}_{joint}" for x in ("q", "qd", "tau") for joint in scara.chain.joint_names)]
     path = written(tmp_path / "log.csv", head, np.column_stack([T[::-1], Q, QD, TAU]))
     with pytest.raises(LogError, match=r"got times that fall from .*write 'sample_rate: HZ'"):
@@ -170,7 +181,10 @@ def test_times_that_fall_are_called_so(scara, tmp_path):
 
 @pytest.mark.parametrize("file", ["struct.mat", "flat.mat", "dict.npy"])
 def test_files_of_matlab_and_pickles_are_converted_by_the_printed_command(scara, tmp_path, file):
-    """The command converts structs and dicts, too; a pickle only with a warning. MATLAB 7.3 files are HDF5."""
+    """The error about a MATLAB or pickled file prints a command that converts it, also from a struct or dict.
+
+    It warns of pickles, which may execute code. For files of MATLAB 7.3, which are HDF5, it advises h5py.
+    """
     arrays = {"t": T, "q": Q, "qd": QD, "tau": TAU}
     if file == "dict.npy":
         np.save(tmp_path / file, arrays, allow_pickle=True)
@@ -208,7 +222,8 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
         LogError, match=r"no positions .*join files with a signal each .*merge\(pandas.read_csv"
     ):
         suggest_mapping(path, scara.chain.joint_names)
-    with pytest.raises(LogError, match="or write their names under 'logs'"):  # and not: rename effort to q
+    # the error must not advise to rename the columns of effort to q
+    with pytest.raises(LogError, match="or write their names under 'logs'"):
         read_logs(path, scara)
 
 
@@ -249,9 +264,10 @@ PUBLIC = {
 
 @pytest.mark.parametrize("source", PUBLIC)
 def test_of_several_signals_of_a_quantity_the_measured_one_of_the_joints_is_taken(scara, tmp_path, source):
-    """If a log has several signals of a quantity, the mapping takes the measured one of the joints.
+    """If a log has several signals of a quantity, the suggested mapping selects the measured signal of the joints.
 
-    Column names are from public recordings; set points, tool forces and estimates have similar names.
+    The other signals are set points, tool forces and estimates, with similar names. The column names are from public
+    recordings.
     """
     clock, *measured, others = PUBLIC[source]
     names = [*measured, *others.split()]
@@ -363,7 +379,7 @@ def test_units_are_found_anywhere_in_a_name(scara, tmp_path, form):
     [("kgf.cm", 0.0980665), ("kg·cm", 0.0980665), ("N cm", 0.01), ("N·m", 1.0), ("mN-m", 1e-3)],
 )
 def test_units_of_torques_are_products(scara, tmp_path, unit, factor):
-    """Units of torques are recognised with any sign between their factors."""
+    """Units of torques are read with a dot, a hyphen, a space or a centred dot between force and length."""
     (tmp_path / "arm.urdf").write_text(
         scara.robot.path.read_text().replace('type="prismatic"', 'type="revolute"')
     )
@@ -455,7 +471,7 @@ def test_the_command_writes_the_mapping_and_uses_it(robots, tmp_path):
 
 
 def test_words_for_commands_in_names_of_joints_are_not_commands(scara, tmp_path):
-    """A servo's measured positions are found if its joints are named by words for commands."""
+    """Measured positions of a servo (q_target) are not confused with commands if a joint is named "target" or "set"."""
     text = (scara.robot.path).read_text()
     names = ["d", "target", "e", "set"]
     for k, name in enumerate(names):
@@ -495,7 +511,7 @@ NAMES = {
 
 @pytest.mark.parametrize("form", NAMES)
 def test_joints_are_found_by_the_distinct_parts_of_their_names(scara, tmp_path, form):
-    """Columns with a joint's name, or with the part that distinguishes it, belong to the joint in any order."""
+    """Columns are assigned to joints by name, not by order: by the joint's name or the part that distinguishes it."""
     names, *patterns = NAMES[form]
     text = scara.robot.path.read_text()
     for k, name in enumerate(names):
@@ -515,7 +531,10 @@ def test_joints_are_found_by_the_distinct_parts_of_their_names(scara, tmp_path, 
 
 @pytest.mark.parametrize("place", ["names", "line below the header"])
 def test_units_may_differ_between_joints(scara, tmp_path, place):
-    """Units in names, or in a line below the header, are drafted for each joint: a SCARA has degrees and mm."""
+    """The suggested mapping has units per joint, from column names or from a line below the header.
+
+    For example, the positions of a SCARA are in degrees at turning joints and in mm at the sliding joint.
+    """
     types = scara.chain.joint_types
     factors = np.array([180 / np.pi if kind == "revolute" else 1e3 for kind in types])
     units = [("deg", "deg/s", "Nm") if kind == "revolute" else ("mm", "mm/s", "N") for kind in types]
@@ -670,6 +689,34 @@ def test_minutes_of_a_clock_are_converted(scara, tmp_path):
     require_same(suggested(path, scara)[0])
 
 
+def test_velocities_per_minute_are_converted(scara, tmp_path):
+    """Velocities in rad/min and in mm/min, a unit of feed rates, are converted with the factor of their unit."""
+    units, factors = ["rad per min", "rad/min"] * 2, np.full(4, 60.0)
+    slider = log_source(scara).joint_types.index("prismatic")
+    units[slider], factors[slider] = "mm/min", 60e3
+    head = ["t", *(f"q{k}" for k in range(4)), *(f"qd{k} [{x}]" for k, x in enumerate(units))]
+    rows = np.column_stack([T, Q, factors * QD, TAU])
+    path = written(tmp_path / "log.csv", [*head, *(f"tau{k}" for k in range(4))], rows)
+    require_same(suggested(path, scara)[0])
+
+
+@pytest.mark.parametrize("index", [T, (1e9 * T).astype("datetime64[ns]")])
+def test_an_index_of_pandas_without_a_name_is_the_clock(scara, tmp_path, index):
+    """The first column of a CSV needs no name if its values are times: pandas writes an index so."""
+    head = ["", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = [[x, *row] for x, row in zip(index, np.column_stack([Q, QD, TAU]), strict=True)]
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+@pytest.mark.parametrize("gripper", [0, 1])
+def test_columns_of_a_free_base_at_rest_are_omitted(scara, tmp_path, gripper):
+    """States of MuJoCo with a free base: the base has seven positions and six velocities, a gripper one of each."""
+    signals = {"qpos": (7, Q), "qvel": (6, QD), "qfrc_actuator": (6, TAU)}
+    log = {x: np.pad(values, ((0, 0), (base, gripper))) for x, (base, values) in signals.items()}
+    np.savez(tmp_path / "log.npz", time=T, **log)
+    require_same(suggested(tmp_path / "log.npz", scara)[0])
+
+
 def test_exponents_of_fortran_are_read(scara, tmp_path):
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = [[f"{x:.15E}".replace("E", "D") for x in row] for row in np.column_stack([T, Q, QD, TAU])]
@@ -678,7 +725,10 @@ def test_exponents_of_fortran_are_read(scara, tmp_path):
 
 @pytest.mark.parametrize("text", ["missing", "#DIV/0!", "nan(ind)", "1.#INF"])
 def test_texts_for_no_value_are_gaps(scara, tmp_path, text):
-    """A text for a missing value is an error, which states the setting that omits such rows."""
+    """A cell with a text such as "#DIV/0!" for an absent value is an error that states the setting `dropouts: dropped`.
+
+    With this setting such rows are omitted.
+    """
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
     rows = np.column_stack([T, Q, QD, TAU]).tolist()
     rows[5][3] = text

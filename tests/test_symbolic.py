@@ -1,4 +1,4 @@
-"""Exact polynomials of M and V prove the derived structure and equal Pinocchio."""
+"""Exact polynomials of M(q) and of the potential energy V(q) confirm the structure that spelgen derives for an arm."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,11 @@ ROBOTS = ["two_link", "rpr", "scara", "six_dof", "ur10e", "panda"]
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_spans_of_coefficients_agree_with_the_structure(robots, robot):
-    """Outputs, constants and relations of the structure agree with the coefficients of the exact polynomials."""
+    """The derived structure agrees with exact polynomials of M(q) and of the potential energy V(q).
+
+    M = sum_j f_j(q) B_j + sum_k c_k A_k has as many functions f_j (outputs) and constants c_k as the rank of the
+    polynomials' coefficients. The zero entries of M, and the joints that each entry, each f_j and V depend on, agree.
+    """
     arm = load_arm(robots / f"{robot}.urdf").chain
     _assert_agrees(derive(arm), polynomials(arm), len(arm.coordinates))
 
@@ -45,7 +49,11 @@ def _assert_agrees(structure, poly: Polynomials, n: int) -> None:
 
 
 def _coefficient_vectors(poly: Polynomials, n: int) -> dict:
-    """Return {(joints, exponents of a monomial): {index of an entry of M: coefficient of the monomial}}."""
+    """Return the coefficients of all monomials of M: {(joints, exponents): {index of an entry of M: coefficient}}.
+
+    exponents: of all variables of `poly`. joints: tuple of the coordinates, 0..n-1, whose cosine, sine or distance is
+    in the monomial. index: of the entry in the lower triangle of M, row after row.
+    """
     vectors: dict = {}
     for index, key in enumerate(triangle(n)):
         for exponents, coefficient in poly.mass[key].terms():
@@ -68,9 +76,10 @@ def _joints_of(polynomial, n: int) -> set[int]:
 
 
 def test_two_link_is_the_papers_equation_20(robots):
-    """The polynomials of two_link are eq. 20 of the paper: M = [[J1 + 5 J2 + 4 m(q), J2 + 2 m(q)], [J2 + 2 m(q), J2]].
+    """M of two_link is [[7/2 + 2 f, 5/4 + f], [5/4 + f, 5/4]] with f = cos(q2) / 2, as derived by hand.
 
-    Each link is 1 m long, with its centre of mass in the middle.
+    M has the form of eq. 20 of Wang, Chen and Ding, Sci Rep 15:33179, 2025. Each link is 1 m long and has 1 kg and
+    1 kg m^2 at its centre of mass in the middle.
     """
     true = polynomials(load_arm(robots / "two_link.urdf").chain, inertials=True)
     assert {key: str(value) for key, value in true.mass.items()} == {

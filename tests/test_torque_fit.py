@@ -66,7 +66,11 @@ def emitted(tmp_path_factory):
 
 
 def recorded(model, seconds, noise, seed=0):
-    """Return samples of a smooth random motion with the model's torque and noise, relative to the torque."""
+    """Return samples at 100 Hz of a smooth random motion with the model's torque, to which noise is added.
+
+    seconds: duration [s]. noise: standard deviation of the noise, relative to the standard deviation of each joint's
+    torque. seed: of motion and noise.
+    """
     rng = np.random.default_rng(seed)
     q, qd, qdd = smooth_motion(model.n, seconds, rng)
     with torch.no_grad():
@@ -131,9 +135,10 @@ def test_the_prior_shares_what_joints_share():
 
 
 def test_the_prior_shares_each_element_of_bristles():
-    """The prior covariance of bristle fractions has a common part of all joints for each element of the bristles.
+    """The prior of bristle fractions is the sum of two Gaussian terms: one per joint, and one common to all joints.
 
-    Different elements are independent. Shown for three elements at two joints.
+    The fractions of bristle k at joints i and j have the covariance 2.0^2, plus 0.5^2 if i = j. Different bristles are
+    independent.
     """
     prior = GaussianPrior(fractions=0.5, shared_fractions=2.0)
     found = prior_covariance(prior, {"fractions": torch.zeros(2, 3)}, {"fractions": "fractions"})
@@ -182,7 +187,8 @@ def test_prior_widths_maximize_the_marginal_likelihood():
         covariance[3:23, 3:23] = torch.from_numpy(posterior)
         prior = updated(prior, guess, away, covariance)
     assert prior.offset == pytest.approx(best, rel=1e-4)
-    # a common offset of all armatures does not count, as the prior has a common factor
+    # An offset from the prior mean that all armatures share does not widen the prior of single armatures: the prior has
+    # a separate width for a common factor of all armatures.
     assert prior.armature < 1e-4
     away[:3] = torch.tensor([0.3, -0.3, 0.0])
     assert updated(prior, guess, away, covariance).armature == pytest.approx(0.3)
@@ -191,9 +197,10 @@ def test_prior_widths_maximize_the_marginal_likelihood():
 
 
 def test_the_widths_of_bodies_are_those_of_a_t_distribution(robots):
-    """The prior of the bodies is a Student-t distribution with the scale of maximum marginal likelihood.
+    """The prior of the bodies' inertial parameters is a Student-t distribution, scaled by maximum marginal likelihood.
 
-    One link with a large error neither widens the prior of other links, nor keeps its initial value.
+    If the initial inertial parameters of one link have a large error, the prior becomes wider for this link, so that
+    the link does not keep its initial values, but not for other links.
     """
     rigid, widths = ParameterVector(build(robots / "six_dof.urdf", "closed-form")), GaussianPrior()
     prior, bodies = ParameterPrior.of(rigid, widths), rigid.mask("bodies")
@@ -270,9 +277,10 @@ def with_unit_error(urdf, mass, center, path):
     ids=["right", "masses in mg", "centres in mm"],
 )
 def test_a_fit_is_as_good_as_least_squares_for_any_urdf(emitted, robots, tmp_path, mass, center, replaced):
-    """A fit has no larger error than least squares, for any inertials of the URDF.
+    """The test error of a fit is at most 2 % larger than the error of least squares, for any inertials of the URDF.
 
-    A fit with a larger error, as for inertials in other units, is repeated from ridge regression and reports it.
+    A fit with a significantly larger error than ridge regression, here for masses in mg, is repeated with the result of
+    the regression as initial values, and a note states this.
     """
     true = emitted["rpr"][0].Model()
     urdf = with_unit_error(robots / "rpr.urdf", mass, center, tmp_path / "rpr.urdf")
@@ -290,7 +298,8 @@ def test_a_fit_is_as_good_as_least_squares_for_any_urdf(emitted, robots, tmp_pat
 def test_torques_that_no_bodies_have_are_named(emitted, monkeypatch):
     """Torques that no physically consistent bodies can cause, here by a negative inertia at a joint, give a warning.
 
-    Ridge regression explains these torques, so two more fits follow, with noise bounded by its held-out error.
+    Ridge regression has a smaller held-out error than the fit; the warning states this error. Before the warning, the
+    fit is repeated twice, with the regression's held-out error as upper bound of the torque noise.
     """
     bounds, staged_fit = [], torque_fit._staged_fit
 
@@ -367,9 +376,9 @@ def test_held_out_errors_of_ridge_regression_are_those_of_refits(emitted, robots
 
 
 def test_steps_of_bodies_are_linear_in_their_parameters_and_stay_consistent(emitted):
-    """Steps of bodies are straight lines in inertial parameters, and end before bodies become inconsistent.
+    """A solver step of bodies is a straight line in their inertial parameters: twice the step is twice the change.
 
-    Twice the step changes the parameters twice as much.
+    Large steps are shortened, so that the bodies remain physically consistent.
     """
     bodies = drawn(emitted["rpr"][0], seed=1, deviation=0.3).bodies
     raw = bodies.raw.detach().clone()
@@ -405,9 +414,10 @@ def test_friction_compensation_by_a_drive_is_found(emitted):
 
 
 def test_a_spring_in_a_motion_that_does_not_return_is_no_compensation(emitted):
-    """A spring is not mistaken for friction compensation of a drive.
+    """A spring is not mistaken for friction compensation of a drive, although both give torques along the velocity.
 
-    The joint turns once, in one direction, against the spring, so that torque and velocity have opposite signs.
+    The joint moves once, in one direction, from -1 to 1 rad, and a spring pulls it to 1 rad. The measured torque of the
+    spring is therefore negative during the whole motion, while the velocity is positive.
     """
     module = emitted["six_dof"][0]
     t = np.linspace(0.0, 12.0, 1200)
@@ -466,7 +476,10 @@ def test_friction_has_the_effects_that_samples_show(emitted, shown):
 
 @pytest.mark.parametrize(("joints", "used"), [(1, False), (6, True)])
 def test_saturation_is_used_if_several_joints_show_it(emitted, joints, used):
-    """Saturation of friction is used if the joints show it together, and at no joint if a single joint shows it."""
+    """Saturation of friction with speed is fitted if all six joints of an arm show it, and not if one joint does.
+
+    At a single joint, saturation may explain another error of the model.
+    """
     module = emitted["six_dof"][0]
     true, found = drawn(module, seed=2, deviation=0.3), module.Model()
     true.friction.raw_saturation.data[:joints] += 1.0
@@ -476,7 +489,11 @@ def test_saturation_is_used_if_several_joints_show_it(emitted, joints, used):
 
 
 def test_compensation_belongs_to_the_input(emitted):
-    """Friction compensation by a drive is part of the input torque, not of friction."""
+    """Friction compensation k qd of a drive is added to the input torque; `friction_torque` does not change.
+
+    `inverse_dynamics` returns a torque that is smaller by k qd, and `forward_dynamics` and `port_hamiltonian_rhs` add
+    k qd to the torque that they get.
+    """
     model = drawn(emitted["six_dof"][0], seed=2)
     q, qd, qdd = (torch.rand(5, 6, dtype=torch.float64) for _ in range(3))
     tau, friction = model.inverse_dynamics(q, qd, qdd), model.friction_torque(q, qd)
@@ -549,7 +566,11 @@ def write(path, samples, arm):
 
 @pytest.fixture(scope="module")
 def run(emitted, robots, tmp_path_factory):
-    """Return the folder of a `spelgen train` run of a closed-form module, the true model, and the arguments."""
+    """Return the folder of a `spelgen train` run, the model of its logs, and the arguments of the command.
+
+    The run is in the subfolder `run`. It has a closed-form module of two_link, fitted to two logs of 5 s whose torques
+    are from a model with other parameters.
+    """
     folder = tmp_path_factory.mktemp("closed_form_run")
     module, arm = emitted["two_link"]
     true = drawn(module, seed=4, deviation=0.2)
@@ -742,7 +763,8 @@ def test_two_seconds_of_a_real_arm_beat_least_squares(shared, tmp_path):
     fit_torque(model, dynamics_samples([long[: int(np.searchsorted(long.t, long.t[0] + 2.0))]]))
     tests = ("19_12_23_free", "20_02_06_20sec_5harm")
     samples = dynamics_samples([read_logs([folder / f"{x}.parquet"], names)[0] for x in tests], pauses=True)
-    # for comparison: the best simple prior has an nMSE of 0.057, averaged over nine recordings
+    # For comparison: with the best of several simpler priors in place of the prior of `fit_torque`, the mean nMSE over
+    # nine test recordings was 0.057.
     assert np.mean([nmse(model, sample) for sample in samples]) < 0.03
 
 
@@ -859,7 +881,11 @@ def test_nominal_friction_is_limited_to_the_torque(emitted, robots):
 
 
 def test_a_joint_that_stands_still_keeps_its_friction(robots):
-    """A joint at rest keeps its nominal friction, as its constant torque does not bound friction."""
+    """A joint that rests in all samples keeps its nominal friction, which is right here.
+
+    `limit_friction` limits the nominal friction of moving joints to the standard deviation of their torque. At rest the
+    torque varies only by noise, which has no information on friction.
+    """
     true, model = (build(robots / "scara.urdf", "closed-form") for _ in range(2))
     sample = recorded(true, 10.0, 0.0)
     q, qd, qdd = (column * [1.0, 1.0, 0.0, 1.0] for column in (sample.q, sample.qd, sample.qdd))

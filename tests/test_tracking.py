@@ -35,9 +35,10 @@ def changed(settings, tracking=None, **protocol):
 
 @pytest.fixture(scope="module")
 def recordings(loaded):
-    """Return settings, simulated motions and logs under the softest and the hardest controller, over whole periods.
+    """Return settings, motions and logs of an arm that tracks sines under the softest and the hardest controller.
 
-    The motions are pairs of the desired path and the true states.
+    The motions are a list of (desired path, recording with the true states), the softest controller first, over one
+    period of the sines (8 s). The logs are the result of `track`, divided into training and test. loaded: the arm.
     """
     ends = min(loaded.settings.tracking.bandwidths), max(loaded.settings.tracking.bandwidths)
     settings = changed(loaded.settings, {"bandwidths": ends}, trajectories=2)
@@ -51,9 +52,10 @@ def recordings(loaded):
 
 
 def test_the_protocol_is_the_papers(loaded):
-    """The settings have the simulation of the paper: six PID controllers on sines of 30 degrees at 1/8 Hz.
+    """The settings state the simulation of Wang, Chen and Ding (Sci Rep 15:33179, 2025).
 
-    There are 24,000 samples at 500 Hz, 70 % of them for training; the controller has 125 Hz.
+    Six PID controllers at 125 Hz track sines of 30 degrees at 1/8 Hz. There are 24,000 samples at 500 Hz, 70 % of them
+    for training.
     """
     protocol, motion = loaded.settings.simulation, loaded.settings.tracking
     assert (protocol.sample_rate, motion.control_rate, motion.frequency) == (500, 125, 1 / 8)
@@ -202,7 +204,10 @@ def test_motors_behind_gears_get_their_share_and_a_passive_joint_none():
 
 
 def test_the_arm_is_held_against_its_weight_from_the_start(loaded):
-    """Without gains and without a sine, the controller's initial torque keeps the arm at rest under gravity."""
+    """The controller's initial torque balances gravity: without feedback, an arm at its desired position stays at rest.
+
+    The amplitude of the desired sines and the feedback gains are zero.
+    """
     friction = make_friction(loaded.chain, loaded.settings)
     engine = arm_dynamics(loaded.chain, loaded.settings, friction)
     still = sines(np.full(N, 0.4), 0.0, 0.125, np.zeros(N), np.arange(50) / 125)
@@ -241,9 +246,9 @@ def test_every_joint_whose_range_is_too_small_is_reported():
 
 
 def test_by_default_an_arm_is_controlled(shared):
-    """By default, simulated arms are under a controller.
+    """By default, simulated arms move under a controller.
 
-    One of the two arms would fall within a second, the other would be stopped by friction at once.
+    Without a controller, one of the two arms (no friction) would fall within a second; friction would stop the other.
     """
     for name in ("kinova_gen3_7dof_2f85", "kuka_iiwa14_lbrstack"):
         loaded = load_arm(shared / "arms" / f"{name}.urdf")

@@ -51,7 +51,7 @@ QUICK = Rollout(epochs=6, momentum_steps=20, **ADAMW)
 
 
 def quick(**changed) -> Rollout:
-    """Return the options `QUICK` with changes; with another optimizer than AdamW, its options are omitted."""
+    """Return the options `QUICK` with changes; batch and learning_rate are omitted for optimizers other than AdamW."""
     options = QUICK.model_dump(exclude_unset=True) | changed
     if options["optimizer"] != "adamw":
         options = {name: x for name, x in options.items() if name not in ("batch", "learning_rate")}
@@ -198,7 +198,7 @@ def test_stiff_friction_gets_more_substeps():
 
 
 def test_training_finds_the_true_parameters():
-    """Training a user's own model, without a specification, finds the true parameters."""
+    """Training finds the true parameters of a user's own model class, which no specification of spelgen describes."""
     model = Model()
     result = fit(model, motions(), quick(epochs=15, momentum_steps=200))
     assert result.status == "finished"
@@ -359,9 +359,10 @@ def test_early_stop_and_time_limit(module, logs, tmp_path):
 
 
 def until_a_signal(module: Path, logs: Path, folder: Path) -> None:
-    """Train until a signal stops the training; write the status of the run to the file `told` next to the run folder.
+    """Train in a child process until a signal stops it; write the result's status, such as "interrupted", to a file.
 
-    The function is the target of a child process.
+    The file `told` is next to the run folder `folder`, and also gets the process's stderr. module: file of the emitted
+    module. logs: file of the training logs.
     """
     # the tests may run with SIGINT ignored, which the process inherits
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -563,7 +563,10 @@ def refusal(path):
 
 
 def test_lengths_friction_and_reductions_that_are_implausible_are_named(robots, tmp_path):
-    """A centre of mass outside the arm, friction above the effort limit, and unused reductions cause messages."""
+    """`load_arm` reports a centre of mass outside the arm, friction above the effort limit, and ignored reductions.
+
+    Gear reductions in the URDF are used only if the settings have `torque: motor`; a message states that they are not.
+    """
     text = (robots / "two_link.urdf").read_text()
     codes = {x.code for x in load_arm(robots / "two_link.urdf").diagnostics}
     assert codes.isdisjoint({"millimetres", "friction-above-effort", "reduction"})

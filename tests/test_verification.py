@@ -46,7 +46,8 @@ def halved(weights):
     return tuple((row, column, value / Fraction(2)) for row, column, value in weights)
 
 
-# false statements about rpr, and a word of the check that must report each
+# {name: (function that makes a statement of the structure of `rpr` false, word in the check that must report it)};
+# rpr: arm with a revolute, a prismatic and a revolute joint; "V|potential": either word
 LIES = {
     "a zero that is none": (lambda s: entry(s, 2, 0, "zero"), "M31"),
     "a constant that varies": (lambda s: entry(s, 0, 0, "constant"), "M11"),

@@ -33,7 +33,7 @@ def wrong(text: str) -> list[str]:
 
 
 def documented(tree: ast.Module) -> set[ast.AST]:
-    """Return the constants of a syntax tree that are docstrings, of modules, classes, functions and names."""
+    """Return all constants of a syntax tree that are statements: docstrings, including strings after assignments."""
     return {x.value for x in ast.walk(tree) if isinstance(x, ast.Expr) and isinstance(x.value, ast.Constant)}
 
 
@@ -95,7 +95,10 @@ def test_pages(path):
 
 
 def test_docstrings_and_comments_do_not_get_worse():
-    """The counts of tests/words.py per package are bounds that only fall (`python tests/words.py --write`)."""
+    """The number of each unclear construction in a package, counted by tests/words.py, is at most its stored bound.
+
+    The bounds, in tests/golden/words.json, are only lowered (`python tests/words.py --write`).
+    """
     bounds = words.bounds()
     rows = [(package, *each) for package, counter in words.counts().items() for each in counter.items()]
     exceeded = {

@@ -1,4 +1,4 @@
-"""Commands with their defaults lead from a URDF to an evaluation, for the robots here and for arms of others."""
+"""Commands with their defaults lead from a URDF to an evaluation, for robots/ and for published URDFs in ../shared."""
 
 import json
 import re
@@ -51,7 +51,8 @@ def run_workflow(urdf, folder, settings, monkeypatch, judged=True):
 @pytest.mark.parametrize("name", OWN)
 def test_every_command_works_for_the_robots_here(name, robots, tmp_path, monkeypatch):
     settings = yaml.safe_load((robots / f"{name}.yaml").read_text())
-    # simulated inputs as in the settings, but for a shorter time
+    # The simulation is shorter than in the robot's settings, and without a tracking controller. If the settings have
+    # `inputs`, only the number of trajectories is reduced to two; otherwise `SHORT` replaces all simulation settings.
     settings.pop("tracking", None)
     driven = "inputs" in settings["simulation"]
     settings["simulation"] = settings["simulation"] | {"trajectories": 2} if driven else SHORT

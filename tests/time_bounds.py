@@ -13,7 +13,10 @@ REFERENCE = 0.04  # [s] duration of ``_loop`` on the reference machine
 
 
 def in_time(seconds: float, bound: float) -> bool:
-    """Return True if ``seconds`` of processor time are less than ``bound`` seconds of the reference machine."""
+    """Return True if a duration is below a bound, with the bound multiplied by `slowness` on a slower machine.
+
+    seconds: measured processor time [s]. bound: largest processor time on the reference machine [s].
+    """
     return seconds < bound or seconds < bound * slowness()
 
 

@@ -67,20 +67,20 @@ def texts(path: Path) -> list[tuple[int, str]]:
 
 
 def constructions(text: str) -> Counter[str]:
-    """Return the number of occurrences of each construction that occurs."""
+    """Return {name: number of matches in a text} of the wordings in `CONSTRUCTIONS`; counts of zero are omitted."""
     found = {name: len(list(pattern.finditer(text))) for name, pattern in CONSTRUCTIONS.items()}
     return Counter({name: count for name, count in found.items() if count})
 
 
 def files() -> list[tuple[str, Path]]:
-    """Return the package and the path of each file; this file is omitted, as its table consists of the words."""
+    """Return (package, path) of each checked file; this file is omitted, as it contains all counted constructions."""
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py"))]
     kept = [path for path in paths if path != Path(__file__) and "golden" not in path.parts]
     return [(path.parent.relative_to(ROOT).as_posix(), path) for path in kept]
 
 
 def counts() -> dict[str, Counter[str]]:
-    """Return the number of each construction per package."""
+    """Return {package: {name: number of matches}} of `CONSTRUCTIONS` in all docstrings and comments of the package."""
     found: dict[str, Counter[str]] = {}
     for package, path in files():
         for _, text in texts(path):
@@ -93,7 +93,11 @@ def bounds() -> dict[str, dict[str, int]]:
 
 
 def lowered(found: dict[str, Counter[str]], old: dict[str, dict[str, int]]) -> dict[str, dict[str, int]]:
-    """Return the bounds of counts, each lowered to the current count; bounds of zero are omitted."""
+    """Return bounds {package: {name: count}}, each the smaller of the old bound and the current count.
+
+    found: current counts per package, of the names in `CONSTRUCTIONS`. old: old bounds. A count above its old bound
+    does not raise the bound. Bounds of zero are omitted, since no bound means zero.
+    """
     smaller = {
         package: {name: min(found.get(package, Counter())[name], count) for name, count in row.items()}
         for package, row in old.items()

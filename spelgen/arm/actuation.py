@@ -54,12 +54,17 @@ class Drives(NamedTuple):
 
 @dataclass(frozen=True)
 class Actuation:
-    """Nonzero entries of the input matrix G (n, n) of an arm, and diagnostics; ``joints`` is the number n of joints.
+    """Nonzero entries of the input matrix G (n, n) of an arm, joint torques per logged torque, and diagnostics.
 
-    A motor that drives several joints couples them: it has an entry, joint torque per motor torque, for each of its
-    joints. If the logs contain motor torques, these entries are part of G and are stored in ``entries``. If the logs
-    contain joint torques, G is the identity for the driven joints. The entries of coupling motors are then stored in
-    ``couplings``; they are used only for the motor speeds (see `drives`).
+    Motors are coupled if several of them drive the same joints, as in a differential.
+
+    - Logs with motor torques: ``entries`` has the entries of all motors, joint torque per motor torque, and
+      ``couplings`` is empty.
+    - Logs with joint torques: ``entries`` has a 1 on the diagonal of G for each driven joint. ``couplings`` has the
+      joint torques per motor torque of coupled motors. The torques of the model do not depend on ``couplings``, but
+      `drives` computes the motor speeds from them.
+
+    joints: number n of joints.
     """
 
     joints: int
@@ -82,9 +87,9 @@ class Actuation:
     def drives(self) -> Drives:
         """Return G (n, n), joint torques per logged torque, and C (n, n), motor speeds per joint velocity."""
         torques = self.matrix()
-        # With logged joint torques, the input matrix G is the identity for coupled joints. The motor speeds need the
-        # couplings: in `torques`, a copy of G, the rows of coupled joints are replaced by the couplings (joint torques
-        # per motor torque).
+        # With logged joint torques, the input matrix G is the identity for coupled joints, but the motor speeds depend
+        # on the couplings (joint torques per motor torque). `torques` is therefore a copy of G in which the rows of
+        # coupled joints are replaced by the couplings. Its transpose gives the motor speeds (see `motor_speeds`).
         for coupling in self.couplings:
             torques[coupling.row] = 0.0
         for coupling in self.couplings:
@@ -127,8 +132,7 @@ def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) ->
         direct = [InputEntry(k, k, "fixed", 1.0) for k, name in enumerate(joints) if name in driven]
         return Actuation(len(joints), tuple(direct), remarks, couplings)
     coupled = {entry.row for entry in couplings}
-    # Joints that are driven by several motors are omitted here: their entries of G, which include the gear ratios, are
-    # in `couplings`.
+    # Joints of coupled motors are omitted here: their entries of G, which include the gear ratios, are in `couplings`.
     geared = [
         _geared(robot, settings, name, k)
         for k, name in enumerate(joints)
@@ -183,7 +187,7 @@ def _geared(robot: Robot, settings: Settings, name: str, index: int) -> InputEnt
     """
     joint = settings.joint(name)
     gear = joint.gear if "gear" in joint.model_fields_set else _reduction(robot, name)
-    # An unknown gear ratio is trained: a ratio of 1 is not assumed.
+    # An unknown gear ratio is trained; 1 is only its initial value. A fixed ratio of 1 would be an assumption.
     if gear is None:
         return InputEntry(index, index, "gain", 1.0)
     return InputEntry(index, index, "gain" if joint.gain == "trained" else "fixed", gear)

@@ -185,8 +185,9 @@ def _require_small(robot: Robot, chain: ChainChoice) -> None:
     if moving > largest:
         do = "choose fewer with --joints or --tip"
         raise ArmError(f"{moving} joints", file=robot.source, expected=f"at most {largest}", do=do)
-    # `following` is the number of mimic joints of the chain, which are separate bodies in the derivation: the number of
-    # joints with a leader in the chain, minus the joints of the chain, which are their own leaders.
+    # `following` is the number of mimic joints of the chain, which are separate bodies in the derivation. The sum
+    # counts all joints whose leader is in the chain. A joint of the chain is its own leader and is counted, too: the
+    # number of these joints is subtracted.
     following = sum(x.leader.name in chain.names for x in leaders(robot).values()) - moving
     if following > most_followers:
         got = f"{following} joints that follow others by <mimic>"
@@ -302,8 +303,8 @@ def _locked_remarks(following: Mapping[str, Leader], locked: Sequence[UrdfJoint]
     # One remark lists all locked joints, because a humanoid robot has about thirty locked joints.
     outside = [joint for joint in locked if joint.moves and joint.mimic is None]
     if outside:
-        # If 0 is outside its limits, the real joint is never at 0, and the inertia of the real arm differs from the
-        # model.
+        # The model locks each of these joints at 0. A joint whose limits exclude 0 is never there on the real arm,
+        # which therefore has another inertia than the model: the remark states this.
         limits = [joint.safe_limits or (0.0, 0.0) for joint in outside]
         names = ", ".join(
             repr(joint.name) + (" (0 is outside its limits)" if low > 0 or high < 0 else "")
@@ -366,10 +367,10 @@ def _are_parallel(axis: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _parallel_beside(frame: Frame, moved: Sequence[MovingJoint], axis: np.ndarray) -> list[str]:
-    """Return the names of revolute joints in ``moved`` that are parallel to ``axis`` and have a given parent body.
+    """Return the names of moving revolute joints that are parallel to a locked joint and have the same parent body.
 
-    frame: frame of a link of the parent body; for the root link the result is []. axis: direction (3,) in the frame of
-    the body.
+    frame: pose of the locked joint's parent link in its body. axis: direction (3,) of the locked joint in this body.
+    moved: moving joints of the arm. If the parent link belongs to the fixed base, the result is [].
     """
     # Column 2 of `rotation` is the z axis of the joint's frame, which is the axis of the joint, in the parent body.
     beside = [x.body for x in moved if x.body.parent == frame.body >= 0 and x.body.joint_type != "prismatic"]

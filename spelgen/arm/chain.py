@@ -147,8 +147,9 @@ def _usable(robot: Robot, name: str) -> UrdfJoint:
 def _longest(robot: Robot) -> ChainChoice:
     """Return the longest chain of joints from the root to a tip, without the joints of grippers.
 
-    1. If the last joint is a jaw of a gripper, it is omitted. The jaws are the last joints of all longest chains, and
-       the joints that mimic the last joint. There must be at least two, all prismatic and with the same parent link.
+    1. If the last joint is a jaw of a gripper, it is omitted. Candidates for jaws are the last joints of all longest
+       chains, and the joints that mimic the last joint. They are jaws if there are at least two, all prismatic and with
+       the same parent link; otherwise no joint is omitted.
     2. If there are no jaws and several chains are the longest, the chain with effort limits of all joints is returned.
        Raises ArmError if no chain, or more than one, has these limits.
     """

@@ -73,9 +73,10 @@ class AngleRounding:
         return offset, rotation_from_rpy(angles) if any(angles) else None
 
     def tensor(self, link: UrdfLink, inertial: Inertial) -> np.ndarray:
-        """Return the inertia tensor (3, 3) [kg m2] in the inertial frame as exact fractions of the numbers in the URDF.
+        """Return the inertia tensor (3, 3) [kg m2] in the inertial frame; each number of the URDF is an exact fraction.
 
-        Products of inertia below 1e-12 times the largest moment of inertia become 0, unless rounding is disabled.
+        Unless rounding is disabled, products of inertia below 1e-12 times the largest moment of inertia are first set
+        to 0.
         """
         xx, xy, xz, yy, yz, zz = inertial.tensor
         if self.tolerance:
@@ -137,10 +138,12 @@ class Frame(NamedTuple):
 
     Attributes:
         body: index of the body of the link, -1 for the root link.
-        rotation, position: rotation (3, 3) and position (3,) [m] of the link in the frame of this body, as fractions.
-        composed: float64 rotation (3, 3) of the link relative to the start of its segment, from which `rotation` is
-            approximated. A segment starts at the root or at a body with a revolute joint. A prismatic joint does not
-            rotate: its body continues the segment. All rotations within a segment are therefore constant.
+        composed: float64 rotation (3, 3) of the link relative to the start of its segment. A segment starts at the root
+            or at a body with a revolute joint. A prismatic joint does not rotate: its body continues the segment. All
+            rotations within a segment are therefore constant.
+        rotation: rotation (3, 3) of the link in the frame of its body, an exactly orthogonal matrix of fractions. It is
+            a rational approximation of `composed`, converted to the frame of the body (see `Placement._in_body`).
+        position: position (3,) [m] of the link in the frame of its body, as fractions.
     """
 
     body: int
@@ -159,9 +162,10 @@ class Placement:
     def __init__(self, root: str, rounding: AngleRounding) -> None:
         self.frames = {root: Frame(-1, np.eye(3), IDENTITY, ZERO)}
         self._rounding = rounding
-        # A segment starts at the root (body -1) or at a body with a revolute joint; bodies with prismatic joints
-        # continue the segment. `_segments[body + 1]` has a pair for each body from the start of the segment to this
-        # body: the rotation relative to the start of the segment in float64, and its rational approximation.
+        # A segment is a part of the tree within which all rotations are constant. It starts at the root (body -1) or at
+        # a body with a revolute joint; a prismatic joint does not rotate, so its body continues the segment.
+        # `_segments[body + 1]` is a tuple with one pair for each body from the start of the segment to this body: the
+        # rotation of the body relative to the start of the segment in float64, and its rational approximation.
         self._segments: list[tuple[_Rotation, ...]] = [((np.eye(3), IDENTITY),)]
 
     def lock(self, joint: UrdfJoint, value: float) -> None:
@@ -195,8 +199,9 @@ class Placement:
         rotation = self._in_body(frame.body, aligned)
         body = len(self._segments) - 1
         if joint.type == "prismatic":
-            # A prismatic joint does not rotate: the product of the rotations before and after it is constant and is
-            # approximated as a whole, so the body continues the segment of its parent.
+            # A prismatic joint does not rotate, so its body continues the segment of its parent (see `_segments`). The
+            # product of the rotations before and after the joint is constant. It gets one rational approximation,
+            # because the product of two approximations would not have its zeros.
             segment = self._segments[frame.body + 1]
             self._segments.append((*segment, (aligned, segment[-1][1] @ rotation)))
             composed = frame.composed
@@ -249,8 +254,9 @@ class Placement:
                 already.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components are set to 0 in the joint's frame (above) and in the body's frame: a rounding error in either
-        # frame would make a zero entry of M nonzero.
+        # Tiny components are set to 0 in the joint's frame (above) and in the body's frame (`moved`): a rounding error
+        # in either frame would make a zero entry of M nonzero. `moved` is used only if its components in the joint's
+        # frame are unchanged: otherwise the zeros in the two frames contradict each other.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 

@@ -15,7 +15,8 @@ Matrix = tuple[Vector, ...]
 class GeometryTuning:
     """Tolerances with which rounded numbers of a URDF are replaced by exact values, such as 1.5708 by pi/2."""
 
-    # [rad, 1] A change of an angle, or of a component of a unit axis, by at most this number is not reported.
+    # [rad, 1] If rounding to an exact value changes an angle, or a component of a unit axis, by at most this number,
+    # the change is not reported.
     notable: float = 1e-9
     # [1] An element of a rotation matrix below this bound is a rounding error and is replaced by 0. A product of
     # inertia is replaced by 0 if its ratio to the largest moment of inertia is below this bound.
@@ -56,7 +57,8 @@ def rounded_angle(angle: float, tolerance: float) -> float:
     if tolerance == 0.0:
         return angle
     # {divisor: tolerance [rad]}: special angles are multiples of pi / divisor, as found in the URDFs of 189 arms. The
-    # tolerance of pi/12, pi/8 and pi/5 is small: angles of 0.26, 0.39 and 0.63 rad also occur that are not rounded.
+    # tolerance of pi/12, pi/8 and pi/5 is small, because URDFs also contain angles of exactly 0.26, 0.39 and 0.63 rad,
+    # which are close to these fractions of pi and must not be rounded to them.
     limits = {2: tolerance, 12: 2e-5, 8: 2e-5, 5: 2e-5}
     for divisor, limit in limits.items():
         step = pi / divisor
@@ -172,10 +174,10 @@ def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: floa
 
 
 def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
-    """Return a rational rotation (3, 3) about the coordinate axis 0, 1 or 2.
+    """Return a rational approximation (3, 3) of a rotation about the coordinate axis 0, 1 or 2.
 
-    cosine, sine: cosine and sine of the angle in float64, both multiplied by the same positive factor, which need not
-    be 1. error: largest error of an element.
+    cosine, sine: cosine and sine of the angle in float64. Both may have a common positive factor, because only their
+    ratio and signs are used. error: upper bound of the errors of the elements if two such rotations are multiplied.
     """
     # The angle is split into exact quarter turns and a remainder: only the remainder is approximated, so that the
     # approximations of 45 and 135 degrees differ by exactly a right angle. The remainder is in [-`eighth`, pi/2 -

@@ -44,7 +44,7 @@ def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preproces
     except (LogError, np.linalg.LinAlgError):
         return fitted
     fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
-    # For the friction model without bristles, parameters and statistics of the identification are recorded. For the
-    # friction model with bristles, only the parameters are recorded.
+    # Parameters are recorded for both friction models, because predictors are made from them. The statistics of the
+    # identification are recorded only for the model without bristles.
     parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
     return {**fitted, **fits["parameters"].to_dict(), **parameters}

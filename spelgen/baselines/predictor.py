@@ -81,20 +81,22 @@ def _stepper(
     is_force = isinstance(dynamics, PortHamiltonian)
 
     def forces(pose: MotionEquations, qd: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-        """Return M qdd in W windows, (W, n) [Nm, N]: all forces, including the disturbance of `_stepper`.
+        """Return M qdd in W windows, (W, n) [Nm, N]: the sum of all forces, including the constant ``disturbance``.
 
-        A disturbance that is an acceleration is multiplied by M. pose: mass matrix and forces at the positions q. qd,
-        tau: (W, n). z: friction state.
+        A disturbance that is an acceleration is multiplied by M. pose: mass matrix and forces at the positions q. qd:
+        velocities, (W, n). tau: joint torques, (W, n). z: friction state.
         """
         added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
-        """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`); step: (W, 1) [s].
+        """Return the state after one step of the Rosenbrock method ROS2 (see `roll_out_stiff`) in W windows.
 
-        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]], with D = d
-        friction / d qd. If friction has a state z, which depends on q, K is the derivative of friction with respect to
-        q; otherwise K = 0.
+        The approximate Jacobian of (qd, qdd) with respect to (q, qd) is A = [[0, 1], [-M^-1 K, -M^-1 D]]. Friction
+        opposes the motion: M qdd contains -friction. D >= 0 is the derivative of friction with respect to qd. If
+        friction has a state z, which depends on q, K >= 0 is its derivative with respect to q; otherwise K = 0.
+
+        state: q, qd, (W, n), and z. tau: torques, (W, n) [Nm, N]. step: (W, 1) [s].
         """
         q, qd, z = state
         pose = pose_at(q)
@@ -117,8 +119,9 @@ def _stepper(
             solution = torch.linalg.lu_solve(factors, pivots, right).squeeze(-1)
             return velocity + h * solution, solution
 
-        # ROS2 for u' = F(u) with the approximate Jacobian A and h = GAMMA * step: the next state is u + step (3 k1 +
-        # k2) / 2, where (1 - h A) k1 = F(u) and (1 - h A) k2 = F(u + step k1) - 2 k1.
+        # Rosenbrock method of order 2 (ROS2 of Verwer et al., 1999) for u' = F(u), u = (q, qd), with the approximate
+        # Jacobian A of F and h = GAMMA * step. The next state is u + step (3 k1 + k2) / 2, where (1 - h A) k1 = F(u)
+        # and (1 - h A) k2 = F(u + step k1) - 2 k1.
         v1, a1 = solve(qd, forces(pose, qd, tau, z))
         q2, qd2 = q + step * v1, qd + step * a1
         second = pose_at(q2)
@@ -174,9 +177,9 @@ class PredictorTuning:
     # [1] A number of steps is accepted if twice as many steps change the predicted velocities by less than this
     # fraction of their RMS error. With this value, the integration error changes the reported errors by about 0.1 %.
     tolerance: float = 5e-2
-    # [1] `tolerance` is multiplied by the RMS error, or by this fraction of the RMS change of velocity in the windows
-    # if it is larger. Without this bound, an exact model, with an error of zero, would need the largest number of
-    # steps.
+    # [1] Bound for models with nearly no error: in the criterion of `tolerance`, the RMS error is at least this number
+    # times the RMS change of velocity in the windows. Without the bound, an exact model, whose RMS error is zero, would
+    # need the largest number of steps.
     least_error: float = 2e-5
     # [1] Number of windows from which the number of integrator steps is chosen.
     probed_windows: int = 16

@@ -1,1 +1,1 @@
-"""The derived structure of an arm for users: facts as sentences with reasons, closed forms, numerical verification."""
+"""The derived structure of an arm for users: facts with geometric reasons, formulas of M and V, numerical checks."""

@@ -51,11 +51,13 @@ class Axes:
         # of a configuration. If it is not an identity, the random numbers of one configuration satisfy it by chance
         # with a probability of about d / 1e6.
         configurations = [_configuration(arm, generator) for _ in range(2)]
-        # Exact fractions: directions (2, n, 3) and twists (2, n, 6) of the axes of the n joints.
+        # Unit vectors (2, n, 3) and twists (2, n, 6) of the axes of the n joints at the two random configurations, as
+        # exact fractions.
         self._directions, self._twists = map(np.array, zip(*configurations, strict=True))
-        # The mass balance of the last body is tested if its joint is revolute and its inertials are known. In all other
-        # cases its ten inertial parameters are set to 1: since none of the ten is zero, all attributes about the last
-        # body are False.
+        # The four attributes of this class (`centred` to `without_inertia`) are tests of the inertial parameters of the
+        # last body. They are true only if certain parameters are zero or equal. If the joint is not revolute, or if the
+        # inertial parameters are unknown, all ten are set to 1: since none of them is zero, all four attributes are
+        # then False.
         last = arm.bodies[-1]
         inertia: tuple[Fraction, ...] = (Fraction(1),) * 10
         if assume == "inertials" and last.inertia is not None and last.joint_type == "revolute":
@@ -100,14 +102,15 @@ class Axes:
     def keep_offset(self, slider: int, hinge: int) -> bool:
         """Return True if all points that the prismatic joint ``slider`` carries keep their distances from a plane.
 
-        The plane is fixed to the child link of ``hinge``, a revolute joint nearer to the root. It contains the axis of
-        ``hinge`` and is parallel to the axis of ``slider``. If the relation is true, the entry of M in the row of
-        ``slider`` and the column of ``hinge`` is constant. Reason: if only ``hinge`` rotates, the velocity of a point
-        along ``slider`` is proportional to the signed distance of the point from the plane. If the two axes are
-        parallel, this velocity is zero for any such plane.
+        The plane contains the axis of the revolute joint ``hinge``, which is nearer to the root; it is parallel to the
+        axis of ``slider`` and moves with the child link of ``hinge``. Let d be the signed distance of a point from the
+        plane, and a the angle between both axes. If only ``hinge`` moves, at 1 rad/s, the velocity of the point along
+        ``slider`` is d sin(a). The entry (slider, hinge) of M is the sum of mass times d sin(a) over these points: it
+        is constant if all d are constant, and zero for parallel axes.
         """
-        # A revolute joint between `hinge` and `slider` can turn the axis of `slider`, which is then not parallel to
-        # any plane that is fixed to the child link of `hinge`.
+        # The plane must be fixed to the child link of `hinge`. A revolute joint between `hinge` and `slider` can turn
+        # the axis of `slider`, and thereby the plane: for such an arm the relation is not tested, and the result is
+        # False.
         if not all(self.prismatic[hinge + 1 : slider]):
             return False
         later = [joint for joint in range(hinge + 1, len(self.prismatic)) if joint != slider]

@@ -160,8 +160,9 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
         groups.setdefault(unit, {})[symbol] = leading
     total = []
     for unit, parameters in groups.items():
-        # The function of a group with a single parameter keeps its coefficients: the coefficients are lengths of the
-        # arm, which users recognise. The function of several parameters is divided by its first coefficient.
+        # A group contains the parameters whose functions are proportional. If it has only one parameter, the function
+        # keeps its coefficients: they are lengths of the arm, which users recognise. Otherwise, the function is divided
+        # by its first coefficient.
         factor = abs(next(iter(parameters.values()))) if len(parameters) == 1 else fmpq(1)
         symbols = weighted_sum({symbol: value / factor for symbol, value in parameters.items()})
         total.append(symbols * weighted_sum({function: value * factor for function, value in unit}))

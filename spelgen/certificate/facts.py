@@ -95,9 +95,9 @@ class _Sentences:
         # The entries of M whose value has no known geometric reason are listed last, after the explained ones.
         for reason, group in sorted(groups.items(), key=lambda item: item[0] is None):
             if reason is not None and self.axes is not None:
-                # A reason names one joint of an entry and has a placeholder for the other joint (see `zero_reason`,
-                # `balance_reason`). The placeholder is replaced by the joint of the column if it is revolute, otherwise
-                # by the joint of the row.
+                # The text of a reason names one joint of the entry: a prismatic joint of the column, otherwise the
+                # joint of the row. The placeholder in the text is replaced by the other joint, the row's joint in the
+                # first case and the column's joint in the second case. (See `zero_reason` and `balance_reason`.)
                 prismatic = self.axes.prismatic
                 joints = sorted({entry.row if prismatic[entry.column] else entry.column for entry in group})
                 reason = reason.format(axes=axes_in_words(joints), joints=joints_in_words(joints))
@@ -226,13 +226,14 @@ def balance_reason(axes: Axes, entry: MassEntry) -> Reason:
 def equality_reason(axes: Axes, entries: Sequence[tuple[int, int]]) -> Reason:
     """Return the geometric reason why entries in one row of M are equal or opposite; None if no reason is found.
 
-    Let c be the joint of the row. There are two possible reasons:
+    Let c be the joint of the row. The entry (c, k) of M is the generalised momentum of joint c if joint k moves at unit
+    velocity. There are two possible reasons:
 
-    - The joints of the columns are coaxial or, if prismatic, parallel. Each of these joints gives the bodies from c
-      to the tip the same velocity field, up to its sign.
+    - The joints of the columns are coaxial or, if prismatic, parallel. At unit velocity, each of these joints gives the
+      bodies from c to the tip the same velocities, up to the sign.
     - Joint c is the last joint, its body is dynamically balanced about the axis of c (see `Axes`), and the joints of
-      the columns are revolute and parallel. The entries then depend only on the angular velocities, which are equal up
-      to sign.
+      the columns are revolute and parallel. The entries then depend only on the angular velocities of the body, which
+      are equal up to the sign.
 
     entries: (row, column) of each entry, counted from 0.
     """

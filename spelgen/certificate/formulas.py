@@ -138,7 +138,7 @@ class Formulas:
 
     @property
     def written(self) -> tuple[Formula, ...]:
-        """The formulas with an expression, of entries of M or of V; a formula with too many terms has no expression."""
+        """The formulas of entries of M and of V that have an expression: all except for those with too many terms."""
         return tuple(row for row in self.rows if row.expression is not None)
 
     @property
@@ -242,8 +242,9 @@ class _Writer:
         polynomials = {}
         total = self._expansion.context.from_dict({})
         for base in self.base:
-            # Each base parameter contains an inertial parameter, its first one, that occurs in no other base parameter.
-            # The coefficient of this inertial parameter in M or V is the coefficient of the base parameter.
+            # The first inertial parameter in the definition of a base parameter (with the index `base.index`) occurs in
+            # no other base parameter. In M or V, the base parameter therefore has the same coefficient as this inertial
+            # parameter.
             polynomial = self._writer.reduced(self._expansion.polynomial(element, base.index))
             # V is determined up to a constant: constant terms are omitted.
             if entry == "V":
@@ -252,9 +253,9 @@ class _Writer:
             total += rational(base.value or Fraction(0)) * polynomial
         if not self._at_urdf_values:
             return polynomials
-        # These formulas need to be valid only for the inertials of the URDF. A monomial may occur with several base
-        # parameters. If the sum of coefficient times URDF value over the base parameters is zero, the monomial is
-        # removed.
+        # These formulas need to be valid only for the inertials of the URDF. The same monomial may occur with several
+        # base parameters. If its terms (coefficient times the URDF value of the base parameter) add up to zero, the
+        # monomial does not affect M or V and is removed.
         remaining = set(total.monoms())
         for name, polynomial in polynomials.items():
             terms = {monomial: value for monomial, value in polynomial.terms() if monomial in remaining}

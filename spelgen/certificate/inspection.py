@@ -91,7 +91,7 @@ class Inspection:
         }
 
     def text(self) -> str:
-        """Return the result as text for a terminal: joints, kinds of entries of M, functions to learn, facts."""
+        """Return text for a terminal: tables of joints and entries of M, learned functions, facts on M, V, remarks."""
         is_fixed = self.structure.assume == "inertials"
         trusted = "the URDF's inertial values" if is_fixed else "any inertial values"
         heading = f"{printable(self.arm.name)}: structure for {trusted}"
@@ -125,7 +125,8 @@ class Inspection:
 
     def _input_matrix(self) -> dict[str, object]:
         n = len(self.structure.joints)
-        # The JSON object contains all entries of G; `actuation.entries` has only the nonzero entries.
+        # The JSON object contains all entries of the input matrix G (joint torques per input torque);
+        # `actuation.entries` has only its nonzero entries.
         values = {(entry.row, entry.column): (entry.kind, entry.value) for entry in self.actuation.entries}
         entries = []
         for row, column in product(range(n), repeat=2):
@@ -163,7 +164,7 @@ class Inspection:
         return text
 
     def _input_needs(self) -> str:
-        """Return a text for users about the input matrix G, the position servos and the passive joints of the model."""
+        """Return a text on the model's inputs: "motor torques, gear known at joints 1-3, gear trained at joint 4"."""
         needs = ["fixed"]
         if self.input == "position":
             needs = [self._servo_needs()]
@@ -217,7 +218,7 @@ class Inspection:
         outputs, constants = len(structure.outputs), len(structure.constants)
         mass = f"{counted(outputs, 'output')} and {counted(constants, 'constant')}"
         mass += f" make all {len(structure.entries)} entries"
-        # If M is constant, its model has no outputs, so there are no sets of joints to list.
+        # Outputs are the learned functions of q in M. A constant M has no outputs, and no sets of joints are listed.
         if counts:
             groups = [f"{count} of {joints_in_ranges(joints)}" for joints, count in counts.items()]
             mass += f": {'; '.join(groups)}"

@@ -121,14 +121,15 @@ def with_random_inertias(arm: Chain, rng: np.random.Generator) -> Chain:
 
 
 def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tuple[float, float]]:
-    """Return {quantity, such as "masses and inertias": two relative differences between readings of the URDF}.
+    """Return two relative differences between readings of the URDF per quantity: {quantity: (first, second)}.
 
-    The quantities are "axes of the joints" and "masses and inertias", compared at random configurations. The first
-    number is the largest difference between Pinocchio and spelgen without rounding of angles, such as 1.5708 to pi/2.
-    The second number is the largest difference between spelgen with and without rounding. Both are relative to the
-    values without rounding. Raises the exceptions of Pinocchio, and ValueError if the file has changed.
+    The quantities are "axes of the joints" (twists) and "masses and inertias" (M and gravity torques at random
+    positions, because M contains all masses and inertias). The first number is the largest difference between Pinocchio
+    and spelgen without rounding of angles, such as 1.5708 to pi/2. The second number is the largest difference between
+    spelgen with and without rounding. Both are relative to the values without rounding. Raises the exceptions of
+    Pinocchio, and ValueError if the file has changed or if a mass is negative.
 
-    robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random configurations.
+    robot: the URDF. arm: the chain that spelgen has derived from it. seed: seed of the random positions.
     """
     dynamics = _pinocchio_dynamics(robot, arm)
     q = np.random.default_rng(seed).uniform(-1.0, 1.0, (6, len(arm.coordinates)))
@@ -182,12 +183,14 @@ def _arm_dynamics(arm: Chain) -> PinocchioDynamics:
 
 
 def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the values of the two compared quantities for the B moving bodies of an arm at S positions q, (S, n).
+    """Return two quantities by which Pinocchio's and spelgen's model of an arm are compared, at S positions q, (S, n).
 
     "axes of the joints", (S, 6, B): twists of the joints for unit velocities, in the root frame. "masses and inertias",
-    (S, B, B + 1): M of the B joints, mimic joints included as independent joints, then the gravity torque as the last
-    column. The diagonal entries of M are doubled (upper triangle plus its transpose). This has no effect, because each
-    entry is compared relative to its own magnitude.
+    (S, B, B + 1): M of the joints of the B moving bodies, which are the n coordinates and the mimic joints as
+    independent joints; the last column is the gravity torque. The diagonal entries of M are doubled, in both models.
+    Differences are compared relative to the magnitude of the same entry, so the factor of 2 cancels.
+
+    dynamics: one of the two models. arm: chain with the names of the bodies.
     """
     model, data = dynamics.model, dynamics.data
     columns = [model.joints[model.getJointId(body.name)].idx_v for body in arm.bodies]
@@ -195,7 +198,8 @@ def _compared_values(dynamics: PinocchioDynamics, arm: Chain, q: np.ndarray) -> 
     for configuration in dynamics.configuration(q):
         # For a single joint Pinocchio returns a vector in place of a matrix: it is reshaped.
         axes.append(pin.computeJointJacobians(model, data, configuration).reshape(6, -1)[:, columns])
-        # Pinocchio computes only the upper triangle of M. The sum of both triangles doubles the diagonal entries.
+        # Pinocchio computes only the upper triangle of M. The sum of both triangles doubles the diagonal entries, in
+        # both models that are compared (see the docstring): this is not corrected.
         upper = np.triu(pin.crba(model, data, configuration))
         mass = upper + upper.T
         gravity = pin.computeGeneralizedGravity(model, data, configuration)

@@ -228,8 +228,10 @@ def _entries(structure: Structure, samples: numeric_samples.NumericSamples) -> I
 def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples) -> _DerivedFact:
     """Return the fact that M = sum_k c_k A_k + sum_j f_j(q) B_j with the fewest terms (minimal form), and its test.
 
-    c_k are constants, f_j functions (outputs), A_k and B_j constant matrices. Each f_j must depend only on its own
-    joints, the c_k on no joint, and the remainder of M must be zero. `_ranks` tests that no form has fewer terms.
+    c_k are constants, f_j learned functions of q (outputs), A_k and B_j constant matrices. Each c_k and f_j is computed
+    from sampled M as a weighted sum of entries. The test: this value of f_j must change only if one of its own joints
+    moves, the value of c_k must not change, and M minus the sum must be zero. `_ranks` tests that no form has fewer
+    terms.
     """
     n = len(structure.joints)
     remainder = samples.mass
@@ -239,30 +241,32 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
         values = samples.mass @ (functional * samples.scale)
         remainder = remainder - values[..., None] * row_of(term.basis, n) / samples.scale
         # A term of the minimal form is a function f_j(q) or a constant c_k. Its value is a weighted sum of the entries
-        # of M, with the weights `functional`. `changes`, (n,): largest change of the value if one joint moves. It is
-        # divided by the sum of |weight| times scale over the entries, because rounding errors are proportional to this
-        # sum.
+        # of M, with the weights `functional`; `samples.scale` has the magnitude of each entry. `changes`, (n,): largest
+        # change of the value if one joint moves, divided by the sum of |weight| times magnitude over the entries.
+        # Rounding errors of the value are proportional to this sum.
         changes = np.abs(values[1:] - values[0]).max(axis=1) / (np.abs(functional) @ samples.scale)
-        # A term may change if one of its own joints moves; the minimal form is wrong only if another joint changes the
-        # term.
+        # A term may change if one of its own joints, `term.joints`, moves: these changes are replaced by zero. The
+        # minimal form is correct only if all other changes are zero up to rounding errors.
         changes[list(term.joints)] = 0.0
         name = f"an output of {joints_in_ranges(term.joints)} with others" if term.joints else "a constant"
         magnitudes.append((f"change of {name}", float(changes.max()), False))
     magnitudes.append(("remainder of M", float(np.abs(remainder).max(initial=0.0)), False))
-    # The tolerance for rounding errors is larger than for other facts: the fractions in `functional` are rounded to
-    # floats.
+    # The tolerance for rounding errors is larger than for other facts: the weights `term.functional` are exact
+    # fractions in the derivation and are rounded to floats here.
     derived = f"outputs: {len(structure.outputs)}, constants: {len(structure.constants)}, which give M"
     return _DerivedFact("smallest form", derived, magnitudes, rounding=1e-6)
 
 
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
-    """Yield facts about numbers of terms of M, each of which must be equal to the rank of a matrix from `samples`.
+    """Yield facts about the number of terms in the minimal form of M, each with the matrix rank that it must equal.
 
-    Outputs are the terms that vary with q, constants the other terms; all terms are linearly independent. A matrix has
-    one column per entry of M. A change of M is its difference if one joint moves to another random position.
+    M is a sum of terms: outputs are the functions f_j(q), constants the terms c_k, each times a constant matrix. All
+    terms are linearly independent. The matrices have one column per entry of M and rows from `samples`: M at random
+    positions q, or the change M(q') - M(q), with q' equal to q except for one joint, which is at another random
+    position.
 
-    1. The number of outputs must be the rank of all changes of M, one row per configuration and moved joint.
-    2. The number of outputs and constants must be the rank of M itself, one row per configuration.
+    1. The number of outputs must be the rank of all changes of M, one row per position and moved joint.
+    2. The number of outputs and constants must be the rank of M itself, one row per position.
     3. For each k, the number of outputs that depend on any of the first k joints must be the rank of the changes of M
        for which one of these joints moves.
     """
@@ -271,14 +275,15 @@ def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Ite
     yield _rank("outputs", changes.reshape(-1, width), outputs)
     together = outputs + len(structure.constants)
     yield _rank("outputs and constants together", samples.mass[0], together)
-    # For each k, as many outputs as possible do not depend on the first k joints. The rank of a matrix shows for each k
-    # that the derivation has found the largest possible number.
+    # In the minimal form, the number of outputs that do not depend on the first k joints is the largest possible one,
+    # for each k. The ranks below prove this.
     counts, magnitudes = [str(outputs)], []
     for first in range(1, len(structure.joints)):
         without = structure.outputs_from(first)
         counts.append(str(without))
-        # The outputs are linearly independent functions of q. The number of outputs that depend on any of the first k
-        # joints must therefore equal the rank of the changes of M due to these joints.
+        # If one of the first k joints moves, M changes only by the outputs (functions f_j in the minimal form of M)
+        # that depend on any of these joints. They are linearly independent, so their number is the rank of these
+        # changes of M.
         name = f"outputs before joint {first + 1}"
         magnitudes += _rank(name, changes[:first].reshape(-1, width), outputs - without).magnitudes
     yield _DerivedFact("outputs without the first 0, 1, ... joints", ", ".join(counts), magnitudes)

@@ -63,7 +63,7 @@ def excite(
 ) -> None:
     """Propose an excitation trajectory for identification.
 
-    Collisions with itself and the surroundings are avoided if the URDF has collision geometry.
+    Collisions of the arm with itself and its surroundings are avoided if the URDF has collision geometry.
     """
     from spelgen.excitation.design import excite as design_motion
 

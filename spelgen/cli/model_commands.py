@@ -114,9 +114,9 @@ def export(
 ) -> None:
     """Export a trained model to other tools. Each export is compared with the model before it is written.
 
-    urdf: the rigid bodies; for models with networks in M, the rigid bodies with the nearest dynamics. mjcf: rigid
-    bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a colcon package of
-    the C header and source. casadi, onnx, torch: a file for each function.
+    urdf: the rigid bodies; for models with networks in M, rigid bodies that are fitted to M and gravity torque of the
+    model. mjcf: rigid bodies, drives and friction for MuJoCo. c: a C99 header and source without dependencies. ros2: a
+    colcon package of the C header and source. casadi, onnx, torch: a file for each function.
     """
     from spelgen.exporting.export import export as export_run
     from spelgen.exporting.exported import format_by_extension, require_fitting

@@ -68,7 +68,7 @@ def argument(metavar: str, text: str, default: object = ...) -> Declared:
 
 
 def output_option(metavar: str, text: str, default: object = None) -> Declared:
-    """Return the option `-o` of a command, the output file or folder; `metavar` is its value in the help."""
+    """Return the declaration of the option `-o` for an output file or folder; `metavar`: placeholder in the help."""
     return option(metavar, text, "-o", "--output", default=default)
 
 

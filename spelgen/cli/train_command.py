@@ -189,7 +189,9 @@ def _outcome(fit: Fit) -> tuple[str, str]:
     progress = fit.checkpoint
     if fit.status == "out of time" and isinstance(config, WindowConfig):
         reason = f": max_minutes={config.max_minutes or 0:g} is over"
-    # The number of epochs is printed only for fits with the rollout objective: other fits have no epochs.
+    # Only fits with the rollout objective have epochs; the sentence with their number is made below. For all other
+    # fits, the printed result is the summary of a fit of position servos, the number of steps if there are no
+    # validation windows, and otherwise `fit.result` (torque nMSE or validation loss).
     if not isinstance(config, Rollout):
         from spelgen.fitting.servo.report import servo_summary
 

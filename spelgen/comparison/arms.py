@@ -102,7 +102,10 @@ def _is_file(preset: str) -> bool:
 
 
 def _contradictions(comparison: Comparison, folder: Path) -> Iterator[tuple[Location, str, str]]:
-    """Yield (location in the YAML file, error, advice) for each unknown preset and for each absent file."""
+    """Yield (location, error, advice) for each unknown preset and for each file of an arm that does not exist.
+
+    The location is the sequence of keys from the root of the YAML file, such as ("arms", "iiwa", "urdf").
+    """
     for number, preset in enumerate(comparison.presets or ()):
         if preset not in PRESET_NAMES and not _is_file(preset):
             yield ("presets", number), f"unknown preset {preset!r}", suggestion(preset, PRESET_NAMES)
@@ -142,7 +145,8 @@ class ArmInputs(ComparedArm):
         trajectories. Otherwise they are fold ``number`` of a cross-validation with random folds. The seed is fixed: all
         models are tested on the same trajectories.
         """
-        # A job contains only the paths of the URDF and the logs: each worker process loads the files itself.
+        # Arm and logs are loaded here and not by the caller: a worker process calls this method for a job, and a job
+        # has only the paths of the URDF and the logs.
         arm = self.load()
         train = read_logs(self.data, arm, self.mapping, "train")
         test = []

@@ -1,6 +1,6 @@
 """Results of a model on the simulated protocol of Wang, Chen and Ding, Sci Rep 15:33179 (2025).
 
-The results are losses, numbers of parameters and outputs, and the error of M.
+The results are losses, the number of parameters, the number of outputs (learned functions of M), and the error of M.
 """
 
 import statistics

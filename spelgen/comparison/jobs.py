@@ -37,11 +37,12 @@ Errors = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True)
 class RunResult:
-    """Figures of a finished run.
+    """Results of a finished run.
 
     seconds: duration of the training [s]. parameters: number of trained parameters that the model uses. errors:
-    {measure: {predictor: error}}; the first measure ranks the models. sizes: further figures of the model of a
-    simulated arm, see `simulated_figures`; {} for logs of the user.
+    {measure: {predictor: error}}; the first measure ranks the models. sizes: {label: number} of the model of a
+    simulated arm, such as its numbers of network outputs, inputs and parameters (see `simulated_figures`); {} for logs
+    of the user.
     """
 
     arm: str
@@ -96,8 +97,8 @@ class Job(Group):
     def folder(self) -> Path:
         """Run folder. Its name ends with a hash of all inputs of the run: other inputs give another folder.
 
-        The inputs are logs, URDF, settings, design, options and version of spelgen. Paths of files do not affect the
-        hash.
+        The inputs are the logs (path, size and modification time), the content of URDF, settings and design, the
+        options and the version of spelgen.
         """
         protocol = self.protocol.model_dump_json(exclude={"seeds", "published"})
         options = self.model_dump_json(exclude={"design", "inputs", "protocol", "runs"})

@@ -114,7 +114,7 @@ def _ranking(medians: Mapping[str, Numbers], runs: Runs) -> Listing:
 
 
 def _medians(runs: Runs, measure: str) -> Numbers:
-    """Return {model or baseline: median error by ``measure``}; None for an error that is not finite."""
+    """Return {model or baseline: median error over seeds and splits}; None for an error that is not finite."""
     values: dict[str, list[float | None]] = {}
     for preset, of_preset in runs.items():
         for run in of_preset:
@@ -129,7 +129,11 @@ def _by_error(medians: Numbers) -> Numbers:
 
 
 def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFigures]) -> Listing:
-    """Return a table of the losses and the error of M of a simulated arm, and of published figures."""
+    """Return the table of the losses of the models of a simulated arm, their errors of M, and published figures.
+
+    The losses are squared prediction errors on training and test logs. medians: {measure: {preset: median}}. published:
+    {preset: figures of a publication}.
+    """
     rows, presets = dict(medians), next(iter(medians.values()))
     # Published figures are added as further rows. The cell of a preset that the publication does not evaluate is empty.
     records = {name: published[name].model_dump(exclude_none=True) for name in presets if name in published}
@@ -145,7 +149,7 @@ def _losses(medians: Mapping[str, Numbers], published: Mapping[str, PublishedFig
 
 
 def _sizes(runs: Runs) -> Listing:
-    """Return a table of the sizes of the models of a simulated arm, and of the time of a training step."""
+    """Return a table of the numbers of outputs, inputs and parameters of models, and of the time of a training step."""
     rows = {}
     for label in next(iter(runs.values()))[0].sizes:
         rows[label] = {name: _combined([run.sizes[label] for run in x], min) for name, x in runs.items()}

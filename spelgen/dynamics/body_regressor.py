@@ -67,18 +67,21 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
         q, qd, qdd: positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     count = len(chain.parents)
-    # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4), with T' the time
-    # derivative of its homogeneous transform T. `chain.forward` returns T times four given points; the columns of the
-    # identity as points give T itself.
+    # The kinetic energy of a body is 1/2 tr(T' J T'^T): linear in its pseudo-inertia J (4 x 4). T is the homogeneous
+    # transform of the body, T' its time derivative. `chain.forward` returns T times four given points: T itself if the
+    # points are the columns of the identity. `rises` is T'' minus the acceleration of gravity.
     pose = chain.forward(q, torch.eye(4 * count).to(q))
     rises = chain.accelerations(pose, qd) + applied(pose.jacobian.mT, qdd @ chain.ratios.mT)
     rises = torch.unflatten(rises, -1, (3, count, 4))
-    # Without mimic joints, `ratios` is the identity: the product would take a tenth of the time.
+    # Without mimic joints, `ratios` is the identity. The product with it would take a tenth of the time of this
+    # function and is omitted.
     identical = torch.equal(chain.ratios, torch.eye(count).to(chain.ratios))
     jacobian = pose.jacobian if identical else chain.ratios.mT @ pose.jacobian
     jacobian = torch.unflatten(jacobian, -1, (3, count, 4))
-    # `forces`, (..., B, 12, 10): the derivative of the inertial forces T'' J with respect to each inertial parameter.
-    # The product of Jacobian and `forces` takes half the time of the product of Jacobian and T'', (..., n, B, 4, 4).
+    # `forces`, (..., B, 12, 10): the derivative of the inertial force T'' J of each body, (3, 4), with respect to its
+    # ten inertial parameters; T'' is `rises`, (3, 4), J the pseudo-inertia, (4, 4). The product of `jacobian` and
+    # `forces` takes half the time of the other order, in which `jacobian` is first multiplied by T'', (..., n, B, 4,
+    # 4).
     forces = torch.unflatten(rises.transpose(-3, -2) @ _DERIVATIVES.to(q), -1, (4, 10)).flatten(-3, -2)
     rows: Tensor = jacobian.movedim(-2, -4).flatten(-2) @ forces
     return rows.transpose(-3, -2).flatten(-2)
@@ -140,7 +143,8 @@ def base_combinations(chain: BodyChain, motors: Tensor) -> tuple[tuple[str, ...]
     # Norm of each column after projection onto the orthogonal complement of all preceding columns.
     remainder = torch.linalg.qr(columns[:, order]).R.diagonal().abs()
     # A column is regarded as linearly dependent if its part orthogonal to all preceding columns is shorter than 1e-8
-    # times the column. Rounding errors are smaller than 1e-8.
+    # times the column, which exceeds rounding errors. For a column shorter than 1, the bound is 1e-8: a column that
+    # contains only rounding errors is then regarded as dependent, too.
     is_base = remainder > 1e-8 * columns[:, order].norm(dim=0).clamp(min=1.0)
     base = torch.tensor(order)[is_base]
     # The results of lstsq's default driver, gelsy, differ in the last digit from call to call. The driver gels needs

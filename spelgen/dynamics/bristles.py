@@ -36,12 +36,18 @@ class BristleReach:
         return int(self.values.shape[1])
 
     def of_drives(self, joints: np.ndarray) -> np.ndarray:
-        """Return C times ``joints``: drive positions or velocities, from joint positions or velocities (..., n)."""
+        """Return the positions of the drives, (..., n), from the positions ``joints`` of the joints, (..., n) [rad, m].
+
+        They are C times ``joints``, with the matrix C = `motors`. Velocities of the drives are computed from joint
+        velocities in the same way.
+        """
         return joints if self.motors is None else joints @ self.motors.T
 
 
 def reach_of(kinds: Sequence[str], motors: np.ndarray | None = None) -> BristleReach:
-    """Return the break-away displacements of K bristles for each of n joints, from the constant `BREAKAWAY`.
+    """Return the break-away displacements of K bristles for each of n joints, (n, K) [rad, m], with the matrix C.
+
+    The displacements are constants of the package per joint type (`BREAKAWAY`); they do not depend on C.
 
     kinds: type of each joint (revolute or prismatic), (n,). motors: matrix C, (n, n): the velocities of the drives are
     C qd; None: each drive moves its own joint.

@@ -39,7 +39,7 @@ def mimic_constraint(robot: Robot, coordinates: Sequence[str]) -> Constraint:
             offset[row] += multiplier * mimic.offset
             multiplier *= mimic.multiplier
             leader = mimic.joint
-        # The row of a locked joint in K is zero, so its position is constant.
+        # The row of a locked joint in `jacobian` is zero, so its position is constant.
         if leader in columns:
             jacobian[row, columns[leader]] = multiplier
     return Constraint(tuple(moving), jacobian, offset)

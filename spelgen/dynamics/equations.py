@@ -38,10 +38,10 @@ EquationsAt = Callable[[Tensor], MotionEquations]
 
 @runtime_checkable
 class OwnEquations(Protocol):
-    """Dynamics with a method that gives M, force and friction in fewer operations than the general `_of_dynamics`."""
+    """Dynamics with a method `equations_at`, which is faster than the general function `_of_dynamics`."""
 
     def equations_at(self, q: Tensor) -> MotionEquations:
-        """Return the equations of motion at positions q, (W, n) [rad, m], of W rollouts."""
+        """Return M, force and friction torque (`MotionEquations`) of W rollouts at positions q, (W, n) [rad, m]."""
 
 
 def equations_of(dynamics: object) -> EquationsAt:
@@ -62,11 +62,11 @@ def _of_model(model: PortHamiltonian, prepared: object, q: Tensor) -> MotionEqua
     pose = model.configuration(q, prepared)
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
+        """Return the friction torque, (W, n) [Nm, N], at the fixed positions q; qd, z: see `MotionEquations`."""
         return model.friction_torque(pose, qd, *known_past(model, z))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
+        """Return the force M qdd, (W, n) [Nm, N], at the fixed positions q; qd, tau, z: see `MotionEquations`."""
         return model.input_force(pose, qd, tau) - model.nonlinear_effects(pose, qd) - friction(qd, z)
 
     return MotionEquations(pose.mass, force, friction)
@@ -77,11 +77,11 @@ def _of_dynamics(dynamics: Any, q: Tensor) -> MotionEquations:
     mass = torch.as_tensor(dynamics.mass_matrix(q))
 
     def friction(qd: Tensor, z: Tensor | None) -> Tensor:
-        """Return the friction torque of W rollouts, (W, n) [Nm, N], at velocities qd and friction state z."""
+        """Return the friction torque, (W, n) [Nm, N], at the fixed positions q; qd, z: see `MotionEquations`."""
         return torch.as_tensor(dynamics.friction_torque(q, qd, *known_past(dynamics, z)))
 
     def force(qd: Tensor, tau: Tensor, z: Tensor | None) -> Tensor:
-        """Return the force M qdd of W rollouts, (W, n) [Nm, N], at velocities qd, inputs tau and friction state z."""
+        """Return the force M qdd, (W, n) [Nm, N], at the fixed positions q; qd, tau, z: see `MotionEquations`."""
         # `RigidDynamics` has no method that returns the force M qdd, so the acceleration qdd is multiplied by M.
         qdd = torch.as_tensor(dynamics.forward_dynamics(q, qd, tau, *known_past(dynamics, z)))
         return applied(mass, qdd)

@@ -47,8 +47,9 @@ class DriveFriction:
 
             viscous v + s (forward - backward)/2 + s^2 (forward + backward)/2,    s = tanh(v / smoothing_velocity)
 
-        The last two terms tend to `forward` and `backward` for large |v|. The torque is smooth, 0 at rest, and
-        dissipative: the torque of a drive times its velocity is not negative.
+        The sum of the last two terms, Coulomb friction, tends to `forward` > 0 for v >> 0 and to `backward` < 0 for v
+        << 0. The torque is smooth, 0 at rest, and dissipative: the torque of a drive times its velocity is not
+        negative.
 
         direction: factor s of the dry friction of each drive, from -1 to 1, (..., n), computed from the friction state;
         None: the tanh above.
@@ -75,8 +76,8 @@ def joint_friction(
         drives: {name of a joint: settings of its drive}; for other joints, <dynamics> of the URDF is used.
         smoothing_velocity, speeds: see ``DriveFriction``.
     """
-    # Settings of a drive replace the whole <dynamics> element of the URDF: both describe the same losses, so adding
-    # them would count the losses twice.
+    # The friction of a joint is taken from the settings of its drive, if there are any, otherwise from the <dynamics>
+    # element of the URDF. The two are not added: both describe the same friction, which would be counted twice.
     losses = []
     for joint in joints:
         if joint.name in drives:
@@ -133,6 +134,9 @@ class FrictionModel:
     ) -> np.ndarray:
         """Return the regressor of E effects, (T, n, E n): column e n + j is effect e of drive j per unit coefficient.
 
+        The order of the effects is the order of the property `effects`: armature, viscous friction, Coulomb friction
+        (with ``memory``: one effect per bristle), torque offset and, if enabled, Stribeck and polynomial friction.
+
         Args:
             qd, qdd: velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2] of the joints, (T, n).
             bent: deflections of K bristles per drive, divided by the break-away displacements, (T, n, K). None, if
@@ -141,7 +145,8 @@ class FrictionModel:
         """
         motors = np.eye(qd.shape[-1]) if motors is None else motors
         effects = self._effects(qd @ motors.T, qdd @ motors.T, bent)
-        # Power is equal on both sides of the gears, so the torque of drive j acts on joint i with the factor C_ji.
+        # C is `motors`. The velocities of the drives are C qd, and power is equal on both sides of the gears: the
+        # torque of drive j acts on joint i with the factor C_ji.
         columns: np.ndarray = effects[..., None, :, :] * motors.T[:, None]
         return columns.reshape(*qd.shape, -1)
 

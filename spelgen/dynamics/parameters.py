@@ -77,7 +77,7 @@ NamedTensors = Mapping[str, Tensor]
 
 
 def idle_residuals(model: object) -> list[str]:
-    """Return the names of the parameters of residual terms that are zero for all q (idle terms).
+    """Return the names of the parameters of idle residual terms. A term is idle if its value is zero for all q.
 
     The list is empty for a model without residual terms.
     """
@@ -94,7 +94,7 @@ def idle_residuals(model: object) -> list[str]:
 
 
 def used_parameter_count(model: nn.Module) -> int:
-    """Return the number of parameters of a model, without parameters of residual terms that are zero for all q."""
+    """Return the number of parameters of a model, without the parameters of idle residual terms (zero for all q)."""
     idle = idle_residuals(model)
     return sum(weights.numel() for name, weights in model.named_parameters() if name not in idle)
 
@@ -137,8 +137,9 @@ def _is_idle(network: MaskedNetwork | None) -> bool:
 def residual_torque(model: object, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
     """Return the torque of the residual terms of a model, (..., n) [Nm, N]; zeros for a model without them.
 
-    These terms are added to the mass matrix M and the potential energy V. q, qd, qdd: positions [rad, m], velocities
-    [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
+    It is the contribution of R(q), which is added to the mass matrix M, and of all terms that are added to the
+    potential energy V, including splines and torque ripple. The factor of friction is not included. q, qd, qdd:
+    positions [rad, m], velocities [rad/s, m/s] and accelerations [rad/s^2, m/s^2], (..., n).
     """
     if not isinstance(model, ResidualDynamics) or model.residuals is None:
         return torch.zeros_like(q)

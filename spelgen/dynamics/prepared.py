@@ -117,15 +117,15 @@ class PreparedModel:
         Args:
             q: positions, (..., n) [rad, m].
             qd: velocities, (..., n) [rad/s, m/s].
-            tau: inputs, (..., n).
+            tau: inputs, (..., n) [Nm, N]: joint torques, or motor torques if the model has an input matrix G.
             dt: duration of the time step [s].
-            z: friction state, (..., n, K) [rad, m], by default ``memory(qd)``.
+            z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: the state after a long motion at qd.
             substeps: number of Runge-Kutta steps.
         """
         z = self.memory(qd) if z is None else z
 
         def rhs(q: Tensor, speed: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            """Return the time derivatives qd and qdd of the state (q, qd), (..., n) each; ``speed`` is qd."""
+            """Return qd and qdd, (..., n), at q, ``speed`` = qd and friction state z under the constant inputs tau."""
             return speed, self.forward_dynamics(q, speed, tau, z)
 
         for _ in range(substeps):
@@ -143,9 +143,10 @@ class PreparedModel:
         Args:
             q: initial positions, (..., n) [rad, m].
             qd: initial velocities, (..., n) [rad/s, m/s].
-            tau: inputs, (steps, ..., n), each constant for dt.
+            tau: inputs, (steps, ..., n) [Nm, N], each constant for dt: torques as in `step`.
             dt: duration of a time step [s].
-            z: initial friction state, (..., n, K) [rad, m], by default ``memory(qd)``.
+            z: initial friction state of K bristles per joint, (..., n, K) [rad, m]; None: the state after a long motion
+                at qd.
             substeps: number of Runge-Kutta steps per time step.
         """
         states = [State(q, qd, self.memory(qd) if z is None else z)]
@@ -178,7 +179,7 @@ class PreparedModel:
         vars(plain).pop("forward_dynamics", None)
 
         def function(state: Tensor, tau: Tensor, z: Tensor) -> Tensor:
-            """Return d/dt of the state (q, qd), (2 n,), at the inputs tau (n,); if dt is given, the state after dt."""
+            """Return d/dt (q, qd), (2 n,), at inputs tau and friction state z; if dt is given, (q, qd) after dt."""
             position, speed = state.split(n)
             if dt is None:
                 return torch.cat([speed, plain.forward_dynamics(position, speed, tau, z)])

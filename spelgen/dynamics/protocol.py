@@ -61,7 +61,10 @@ class FrictionState(Protocol):
         """Number of bristles per joint."""
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return z, (..., n, elements) [rad, m], after a long motion at constant qd, (..., n) [rad/s, m/s]."""
+        """Return the friction state z after a long motion at constant velocities qd, (..., n) [rad/s, m/s].
+
+        z: deflections of the bristles of each joint, (..., n, elements) [rad, m].
+        """
 
     def memory_after(self, z: Tensor, displacement: Tensor) -> Tensor:
         """Return the friction state, (..., n, elements), after a displacement of the joints, (..., n) [rad, m].
@@ -131,16 +134,17 @@ def memory_along(dynamics: object, q: Tensor, qd: Tensor, z: Tensor | None = Non
 
 
 def known_past(dynamics: object, z: Tensor | None, direction: Tensor | None = None) -> tuple[Tensor, ...]:
-    """Return the friction arguments for a call of a method of `dynamics`, which follow the arguments (q, qd, ...).
+    """Return the friction arguments to pass to a method of `dynamics` after (q, qd, ...): (), (z,) or (z, direction).
 
-    The result is () if z is None or friction has no state; `direction` is then ignored, since it can be passed only
-    after z. The result is (z, direction) for a `RigidBodyDynamics` and a given direction, otherwise (z,).
+    The result is () if z is None or friction has no state. It is (z, direction) only for a `RigidBodyDynamics` with a
+    known direction, since other dynamics do not have the argument ``direction``; otherwise it is (z,).
 
     Args:
         dynamics: dynamics whose method is called.
         z: friction state of K bristles per joint, (..., n, K) [rad, m]; None: unknown.
-        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles; None:
-            computed from qd. A comparison with low-pass filtered torques needs the smooth sign after the same filter.
+        direction: smooth sign of the velocity, (..., n), the factor of dry friction of joints without bristles. A
+            comparison with low-pass filtered torques needs the smooth sign after the same filter. None: computed from
+            qd.
     """
     if z is None or not z.shape[-1] or not is_stateful(dynamics):
         return ()
@@ -154,8 +158,8 @@ class VelocityState:
 
     def __init__(self, dynamics: RigidDynamics) -> None:
         self.dynamics: Any = dynamics
-        # Rollouts also call `memory` and `memory_after`, the methods of the friction state, on the adapter. They are
-        # therefore copied from `dynamics`.
+        # Rollouts call `memory` and `memory_after`, which compute the friction state, on the adapter as on a trained
+        # model. The methods of `dynamics` become attributes of the adapter.
         self.elements = 0
         if is_stateful(dynamics):
             self.elements = dynamics.elements
@@ -169,7 +173,7 @@ class VelocityState:
         return q
 
     def momentum(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return qd, (..., n), in place of momenta."""
+        """Return qd, (..., n), in place of momenta: the state of these dynamics is (q, qd), not (q, p)."""
         return qd
 
     def velocity(self, q: Tensor, p: Tensor) -> Tensor:

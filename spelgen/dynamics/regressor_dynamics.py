@@ -156,7 +156,7 @@ class RegressorDynamics:
     def joint_torque(self, q: Tensor, qd: Tensor, qdd: Tensor, z: Tensor | None = None) -> Tensor:
         """Return the torques of all joints, passive ones included, (..., n) [Nm, N], that give the accelerations qdd.
 
-        z: friction state, (..., n, K) [rad, m]; None: unknown.
+        z: friction state, (..., n, K) [rad, m]; None: friction depends only on qd.
         """
         equations = self.equations_at(q)
         return applied(equations.mass, qdd) - equations.force(qd, torch.zeros_like(qdd), z)

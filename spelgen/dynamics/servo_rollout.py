@@ -27,8 +27,10 @@ from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
 class ServoDrives(NamedTuple):
     """Constants of an arm's drives for the rollouts of this module: servos, friction, torque offsets and bristles.
 
-    Constants of the n drives are (..., n). `reach` and `steepness` of the K bristles per drive are (K, ..., n): with
-    this layout, a rollout takes two thirds of the time that it takes with (..., n, K).
+    The last dimension of each constant has the n drives; dimensions before it, if any, are batch dimensions. The
+    friction of a drive is a parallel connection of K bristles: `reach` and `steepness` have one value per bristle in
+    the first dimension, (K, ..., n). With this layout, a rollout takes two thirds of the time that it takes with (...,
+    n, K).
     """
 
     servo: ServoConstants
@@ -128,7 +130,9 @@ def advanced(drives: ServoDrives, state: State, u: Tensor, load: Load, h: Tensor
     if load.coupled:
         momentum = applied(load.inertia, qd) + impulse
         # The inertia couples the joints, so the sliding bristles of one joint depend on the motion of all joints. The
-        # mean velocity of the step is found by fixed-point iteration; two iterations suffice.
+        # mean velocity of the step is found by two fixed-point iterations. Each iteration solves the coupled equations
+        # with the bristles as linear springs: `rise` is their change of force, and `secant` is `rise` divided by the
+        # velocity.
         for _ in range(2):
             rise = (bristle_stiffness * (moved_bristles(bent, velocity, reach) - bent)).sum(dim=0)
             secant = rise / torch.where(velocity == 0, 1.0, velocity)
@@ -146,20 +150,22 @@ def slipped(push: Tensor, slope: Tensor, strength: Tensor, z: Tensor, reach: Ten
 
     x solves slope x + sum_k strength_k (z_k(x) - z_k) = push, where z_k(x) = clip(z_k + x, -reach_k, reach_k) is the
     deflection of bristle k after the displacement x. For a given number of sliding bristles, 0 to K, the equation is
-    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. The reason: a bristle resists with the
-    smaller of its elastic and its sliding force. The valid equation therefore has the smallest resistance, and its |x|
-    is the largest.
+    linear in x. Of the K + 1 solutions, the one with the largest |x| is valid. Reason: the force of a bristle is the
+    smaller of two, its elastic force, which increases with |x|, and its constant sliding force. An equation with a
+    wrong set of sliding bristles uses the larger of the two for some bristle. Its resistance is then too large, and its
+    |x| too small.
 
     Args:
-        push: force on the joint, (..., n). In `advanced` it is a momentum, `slope` an inertia and x a velocity.
+        push: force on the joint, (..., n). Units are any consistent ones: in `advanced`, push is a momentum, slope an
+            inertia and x a velocity.
         slope: stiffness of the spring, without bristles, (..., n).
         strength, z, reach: stiffness, initial deflection and break-away displacement of each bristle, (K, ..., n), the
             shortest break-away displacement first: bristles begin to slide in this order.
     """
     direction, stiffness = push.sign(), slope + strength.sum(dim=0)
-    # The linear equations for 0 to K sliding bristles are computed by cumulative sums. Their solutions |x| are
-    # `remaining` (|push| minus the forces of the sliding bristles) divided by `resisting` (`slope` plus the stiffness
-    # of the bristles that do not slide).
+    # The linear equations for 0 to K sliding bristles are solved by cumulative sums. The displacement |x| of each
+    # solution is `remaining` (|push| minus the forces of the sliding bristles) divided by `resisting` (the stiffness
+    # `slope` plus the stiffness of the bristles that do not slide). The largest |x| is valid, see the docstring.
     remaining = torch.cat([push.abs().unsqueeze(0), -strength * (reach - direction * z)]).cumsum(dim=0)
     resisting = torch.cat([stiffness.unsqueeze(0), -strength]).cumsum(dim=0)
     return direction * (remaining / resisting).amax(dim=0)

@@ -29,7 +29,7 @@ class Tip:
 
 
 def tip_frame(loaded: Arm) -> Tip:
-    """Return the frame of the tip link of an arm, with the unrounded angles of the URDF."""
+    """Return the tip link of an arm, with its frame in the body that carries it. Angles of the URDF are not rounded."""
     names = loaded.chain.joint_names
     link = loaded.tip or loaded.robot.last_link(names)
     # Angles are not rounded: rounding would displace the tip by up to its tolerance times the extent of the arm.

@@ -47,15 +47,17 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 class NetworkTuning:
     """Constants of untrained networks: numbers of hidden units, and the scale of inputs."""
 
-    # [1] Factor of the encoded positions, inputs of friction networks. It is below one, so that an untrained network
-    # depends less on positions than on velocities. The velocities are divided by typical speeds.
+    # [1] Factor of the inputs of friction networks that encode positions, such as cos q and sin q. The other inputs are
+    # velocities, divided by typical speeds. The factor is below one, so that an untrained network depends less on
+    # positions than on velocities.
     position_sensitivity: float = 0.1
     # [1] Number of hidden units per joint of the friction networks.
     friction_units: int = 8
-    # [1] Smallest number of hidden units per group of outputs (of a network) that depend on the same joints.
+    # [1] Smallest number of hidden units per group of outputs. A group has all outputs of a network that depend on the
+    # same joints.
     min_units: int = 4
-    # [1] Smallest number of hidden units per group of outputs (with the same joints) of a Kolmogorov-Arnold network;
-    # smaller than `min_units`, because each edge of such a network has a learned function.
+    # [1] The same number for a Kolmogorov-Arnold network; smaller than `min_units`, because each edge of such a network
+    # has a learned function.
     min_kan_units: int = 2
     # [1] Number of hidden units of Kolmogorov-Arnold networks, divided by the number for multilayer perceptrons (the
     # option `width`); smaller, because each edge has several weights.
@@ -87,7 +89,7 @@ class ModelParts:
 
 
 def model_parts(spec: ModelSpec) -> ModelParts:
-    """Return the tables and the constructor call of the model that ``spec`` describes."""
+    """Return the tables (joints, links, functions, constants) and the constructor call of the model of ``spec``."""
     rows = {"JOINTS": tuple(map(_joint, spec.joints))}
     if spec.links:
         rows["LINKS"] = tuple(_link(spec, link) for link in spec.links)
@@ -361,7 +363,8 @@ def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[Constan
     """Return the lower triangle of the mean of M without armature, (n, n) [kg m^2, kg m, kg], to 6 significant digits.
 
     The mean is over random positions, for nominal inertial parameters. Elements above the diagonal are zero. outputs,
-    constants: the terms of M. Functions of q have their means over these positions, constants their values.
+    constants: the terms of M. In the sum of the terms, each function of q is replaced by its mean (`OutputSpec.mean`),
+    each constant by its initial value (`ConstantSpec.start`).
     """
     mean = np.zeros((n, n))
     for constant in constants:

@@ -41,8 +41,9 @@ from spelgen.structure.structure import Structure, derive
 class ModelTuning:
     """Constants of untrained models: initial values of drives, servos and friction that the URDF does not contain."""
 
-    # [1] Lower bound of the eigenvalues of a trained M, divided by the smallest eigenvalue of the nominal M at random
-    # positions. Both are generalised eigenvalues with respect to the mean of the nominal M over these positions.
+    # [1] Lower bound of the generalised eigenvalues of a trained M, divided by the smallest generalised eigenvalue of
+    # the nominal M at random positions. A generalised eigenvalue x of M solves M v = x M0 v, with the mean M0 of the
+    # nominal M over these positions.
     margin: float = 0.1
     # [1] Typical friction, divided by the effort limit of the drive: gears lose some per cent of the torque.
     friction_of_effort: float = 0.02
@@ -64,9 +65,9 @@ class ModelTuning:
     rise: float = 0.02
     # [Nm, N] Full effort of a servo without an effort limit, which determines the initial kp.
     servo_effort: float = 5.0
-    # [rad, m] Position error at which a servo with unknown kp initially has its full effort.
+    # [rad, m] A servo with unknown kp starts the fit with kp = full effort / this position error.
     full_effort_at: float = 0.5
-    # [s] Initial ratio kd / kp of a servo.
+    # [s] Ratio kd / kp with which each servo starts the fit.
     servo_lag: float = 0.05
     # [1] Armature of a drive with unknown rotor inertia and an unknown limit of effort or speed, divided by the joint's
     # diagonal entry of the nominal M.
@@ -140,9 +141,12 @@ def _inputs(actuation: Actuation, design: Design) -> tuple[InputSpec, ...]:
 
 
 def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[OutputSpec, ...]:
-    """Return an ``OutputSpec`` per learned function f of M: its joints, the matrix that f multiplies, mean and scale.
+    """Return an ``OutputSpec`` per learned function f_k of M = sum_k f_k(q) A_k + constant terms.
 
-    structure: terms of M. sizes: nominal means and standard deviations of the functions.
+    An ``OutputSpec`` has the joints on which f_k depends, the matrix A_k, and the nominal mean and scale of f_k.
+
+    structure: terms of M. sizes: nominal means and standard deviations of the functions. design: gives the encoding of
+    q: with "lie-group", each function depends on all joints.
     """
     outputs = []
     for output, mean, scale in zip(structure.outputs, sizes.output_means, sizes.output_scales, strict=True):
@@ -155,7 +159,7 @@ def _outputs(structure: Structure, sizes: Nominal, design: Design) -> tuple[Outp
 
 
 def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]:
-    """Return a ``ConstantSpec`` per trained constant c of M: the matrix that c multiplies, initial value and scale.
+    """Return a ``ConstantSpec`` per trained constant c_k of M: the matrix that c_k multiplies, initial value and scale.
 
     structure: terms of M. sizes: nominal values of the constants.
     """
@@ -168,7 +172,8 @@ def _constants(structure: Structure, sizes: Nominal) -> tuple[ConstantSpec, ...]
 def _motor_speeds(actuation: Actuation) -> tuple[tuple[float, ...], ...]:
     """Return the rows of the matrix C, for which C qd are the motor velocities; () if C is the identity."""
     speeds = actuation.drives().speeds
-    # The motors of most arms are not coupled: C is the identity, and the module has no matrix.
+    # Most arms have no coupled motors: C, the motor velocities per joint velocity, is the identity and is omitted from
+    # the module.
     if np.array_equal(speeds, np.eye(actuation.joints)):
         return ()
     return tuple(map(tuple, speeds.tolist()))
@@ -266,8 +271,8 @@ def _consistent(ten: Sequence[Fraction | float]) -> Sequence[Fraction | float]:
     pseudo = factor @ factor.T
     mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
     moments = pseudo[:3, :3] - mass * np.outer(center, center)
-    # A second moment below `min_second_moment` times the largest is raised, too: rounding to `inertia_digits` digits
-    # could make the body physically inconsistent.
+    # A consistent body is also changed if a second moment is below `min_second_moment` times the largest: rounding to
+    # `inertia_digits` digits could make the body physically inconsistent.
     values, vectors = np.linalg.eigh(moments)
     if is_consistent and values[0] > TUNING.min_second_moment * values[-1]:
         return ten

@@ -192,7 +192,10 @@ def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
 
 
 def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
-    """Return the description of a term of M: the entries of M that contain it, and the unit of the first entry."""
+    """Return the description of a term of M for a comment: the entries of M that contain it, and a unit.
+
+    The unit is the unit of the first entry; other entries have another unit only if a factor of the term has a unit.
+    """
     entries = [entry_name(row, column) for row, column, _ in term.basis]
     row, column, _ = term.basis[0]
     # The unit of an entry of M is kg m^2 for two revolute joints, kg m for one prismatic joint, kg for two.
@@ -202,7 +205,7 @@ def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
 
 
 def _mass_entries(spec: ModelSpec) -> str:
-    """Return the source of the function ``mass_entries``, which computes M from its functions f_j(q) and constants."""
+    """Return the source of ``mass_entries``, which computes M from values of its learned functions and constants."""
     names = parts.term_names(spec)
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"

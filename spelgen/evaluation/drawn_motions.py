@@ -30,7 +30,8 @@ class DrawnMotion:
     """Base class of the motions that charts show: positions q (T, n) [rad, m] along a segment of a log.
 
     t: times (T,) [s] since the first sample of the segment. which: "typical" for the motion of median error, "worst"
-    for the motion of largest error. error: error of the model on this motion; None if not finite.
+    for the motion of largest error. error: error of the model on this motion, None if not finite; its definition and
+    unit are given in the derived classes.
     """
 
     which: str = ""

@@ -47,7 +47,8 @@ def table(title: str, rows: Mapping[str, Numbers], note: str = "", unranked: Con
             # Numbers without a star end with a blank, so that the digits of a column are aligned.
             cells.append(f"{number(row[name]) if name in row else ''} {star}")
         lines.append(cells)
-    # Columns without a star end with their digits, so that names of joints have more room.
+    # The blanks in place of stars are removed from columns without any star, so that the table has more room for names
+    # of joints.
     padded = zip(["", *(f"{name}  " for name in columns)], *lines, strict=True)
     starred = [x if any(cell.endswith("*") for cell in x) else tuple(map(str.rstrip, x)) for x in padded]
     head, *body = zip(*starred, strict=True)

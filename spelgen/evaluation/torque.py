@@ -76,11 +76,11 @@ def predicted_torques(dynamics: Any, samples: DynamicsSamples) -> np.ndarray:
 
 
 def friction_past(dynamics: Any, samples: DynamicsSamples) -> tuple[Tensor, ...]:
-    """Return the history of motion on which friction depends: the last arguments of methods such as `inverse_dynamics`.
+    """Return the friction arguments of methods such as `inverse_dynamics`, which follow the arguments q, qd and qdd.
 
-    The arguments follow q, qd and qdd: the bristle deflections (T, n, K) [rad, m], and the direction (T, n), a smooth
-    sign of the velocity that is filtered like the torques. An argument that the methods of `dynamics` do not accept is
-    omitted (see `known_past`).
+    The first argument is the friction state z: bristle deflections (T, n, K) [rad, m]. The second argument is the
+    direction (T, n): the smooth sign of the velocity, after the low-pass filter that the measured torques have passed.
+    Arguments that the methods of `dynamics` do not have are omitted (see `known_past`).
     """
     past = (None if x is None else torch.from_numpy(x) for x in (samples.z, samples.direction))
     return known_past(dynamics, *past)

@@ -139,10 +139,10 @@ def motion_traces(
 
 
 def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
-    """Return the curves of the evaluation of an arm under position servos, from the replayed logs.
+    """Return the curves for the charts of an arm under position servos: measured and predicted positions of two logs.
 
-    Charts show the log of median error and the log of largest error. errors: position errors of the model along each
-    replayed log.
+    One log has the median position error of all replayed logs, the other log the largest. The result also contains the
+    range of motion of the logs. errors: replayed logs with the position errors of the model, (T, n) [rad, m].
     """
     motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
     return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
@@ -195,7 +195,7 @@ def _quantiles(values: Tensor) -> Quantiles:
 
 
 def _mass_trace(dynamics: Mapping[str, RigidDynamics], motion: DrawnMotion) -> MassTrace:
-    """Return M of each predictor along a motion that charts show."""
+    """Return the entries of M over time along a measured motion, for each predictor (the model and its baselines)."""
     q = torch.from_numpy(motion.q.copy())
     row, column = np.tril_indices(q.shape[-1])
     curves = {}

@@ -10,16 +10,16 @@ class EvaluationTuning:
     # [s] Time that the momentum observer runs before a prediction; with 0.2 and 0.3 s, predictions of the UR10e of
     # `benchmarks/arms.py` are no better.
     observed_past: float = 0.1
-    # [s] Time constant 1 / K of the momentum observer with the gain K; prediction errors differ by 3 % for 0.02 to 0.1
-    # s on the UR10e of `benchmarks/arms.py`.
+    # [s] Time constant 1 / K of the momentum observer with the gain K. On the UR10e of `benchmarks/arms.py`, the errors
+    # of the predictions that use the observer vary by 3 % between time constants of 0.02 and 0.1 s.
     observer_time_constant: float = 0.05
     # [1] Largest number of windows per horizon. The windows are evenly spread over the logs.
     most_windows: int = 1000
     # [1] Largest number of predicted steps per predictor and horizon. A horizon of k steps has this number / k windows,
     # but at least `fewest_windows`.
     most_predicted_steps: int = 10_000
-    # [1] Smallest number of windows of a horizon, reached at long horizons; there are fewer only if the logs are too
-    # short.
+    # [1] Smallest number of windows per horizon. The number of windows falls with the length of the horizon (see
+    # `most_predicted_steps`), but not below this value unless the logs are too short.
     fewest_windows: int = 100
     # [1] Number of test windows from which the number of integration steps of a model is chosen.
     probed_model_windows: int = 64
@@ -37,7 +37,7 @@ class EvaluationTuning:
     # [1] Largest relative prediction error (RMS error / RMS change of q and qd over the horizon) for which the
     # assessment recommends rough simulation.
     rough_prediction: float = 0.3
-    # [rad, m] Logs in which no joint has a larger range of positions contain no motion.
+    # [rad, m] Logs contain no motion if the range of positions of each joint is below this number.
     smallest_motion: float = 0.01
     # [1] Logs that cover less than this fraction of a joint's range are reported as narrow.
     narrow_range: float = 0.5

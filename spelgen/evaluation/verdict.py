@@ -148,7 +148,8 @@ def _assess_motion(results: Results, uses: _Uses) -> None:
 
 
 def _assess_replays(results: Results, uses: _Uses) -> None:
-    # Only the replay of whole logs, the first one, is assessed: windows of one second do not show drift.
+    # `replays[0]` is the replay of whole logs. Only this replay is assessed: the later ones are replays of windows of
+    # one second, which do not show drift.
     for replay in results.replays[:1]:
         error = replay.errors[MODEL].mean
         if error == min(errors.mean for errors in replay.errors.values()):
@@ -172,9 +173,11 @@ def _relative(errors: StateErrors | None) -> float:
 def _better_baselines(results: Results, good_torques: bool) -> list[str]:
     """Return sentences that name the baselines with a smaller error than the model: at which horizons, or in torque.
 
-    Constant velocity has a sentence of its own: at the horizons at which it predicts better than the model, the model
-    is recommended for torques only, if ``good_torques`` is True (torque errors small enough for a use). A second
-    sentence lists all other baselines with the horizons, or "in torque".
+    1. A sentence lists the horizons at which the baseline of constant velocity predicts better than the model. If
+       ``good_torques`` is True (torque errors small enough for a use), it adds that at these horizons the model should
+       be used only for torques, not for predictions.
+    2. For each horizon, and for torque, the best of all other baselines is listed if it is better than the model. The
+       error of the model is the smaller error of its predictions with and without observer.
     """
     times = []
     better: dict[str, list[str]] = {}
@@ -221,8 +224,9 @@ def _worst_motion(results: Results) -> tuple[str, float]:
     The error is relative: RMS error divided by RMS change over the horizon, averaged over q and qd.
     """
     for last in results.horizons[-1:]:
-        # The errors of q and qd of a joint are averaged, as in `mean_relative_rms`: the largest value is then at least
-        # the mean over joints. An unknown error (None) becomes NaN.
+        # The error of a joint is the mean of its errors of q and qd. `mean_relative_rms`, which the assessment compares
+        # with thresholds, is the mean of these errors over the joints: the error of the worst joint is not smaller. An
+        # unknown error (None) becomes NaN.
         of_model = last.errors[MODEL]
         errors = np.mean(np.array([of_model.q_relative_rms, of_model.qd_relative_rms], dtype=float), axis=0)
         if np.isfinite(errors).all():
@@ -258,7 +262,8 @@ def _recommendations(
             # A motion of one revolution covers all positions of a revolute joint, so a wider range counts as one
             # revolution.
             fractions[joint] = (covered["high"] - covered["low"]) / min(bound[1] - bound[0], 2 * math.pi)
-    # Only the joint of the narrowest range is named: users follow one recommendation rather than a list.
+    # Only the joint that has moved over the smallest fraction of its range is named: users follow one recommendation
+    # rather than a list.
     joint = min(fractions, key=fractions.__getitem__, default="")
     if joint and fractions[joint] < TUNING.narrow_range:
         reason = f"{joint} has moved over {share(fractions[joint], 'its range')}."

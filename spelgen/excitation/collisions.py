@@ -55,11 +55,12 @@ class Collisions:
     """
 
     def __init__(self, arm: Arm, surroundings: Surroundings, bounds: MotionBounds) -> None:
-        """Initialize the shapes and pairs. Raises LookupError if the URDF has no collision shape that can be read.
+        """Add the collision shapes of all objects, and select the pairs of objects whose distances are computed.
 
-        bounds: position limits of the joints. The pairs in ``ignored`` are determined at random positions within these
-        limits. The limits of prismatic joints also bound the length of the arm, from which the largest displacement of
-        a point of the arm is computed.
+        bounds: position limits of the joints. Pairs that are too close at nearly all random positions within these
+        limits are not compared (``ignored``). The limits of prismatic joints also bound the length of the arm, from
+        which the largest displacement of a point of the arm is computed. Raises LookupError if the URDF has no
+        collision shape that can be read.
         """
         robot, chain, self.clearance = arm.robot, arm.chain, surroundings.clearance
         shapes = link_shapes(robot.path, "collision", [link.name for link in robot.links], TUNING.faces)
@@ -118,12 +119,12 @@ class Collisions:
         return np.array([result.min_distance for result in self._found.distanceResults])
 
     def contact(self, motion: Motion) -> Contact | None:
-        """Return the first distance of a motion that is below the clearance; None if there is none.
+        """Return the first contact of a motion, a distance below the clearance; None if there is none.
 
-        Distances are computed at selected positions of the motion. They are so close that, between two successive
-        selected positions, each point of the arm moves by at most 1.5 clearances relative to any object. In between, a
-        distance is therefore at most 0.75 clearances smaller than at the nearer selected position. If all computed
-        distances are at least the clearance, there is no collision.
+        Distances are computed at selected positions of the motion. Between two successive selected positions, each
+        point of the arm moves by at most 1.5 clearances relative to any object. In between, a distance is therefore at
+        most 0.75 clearances smaller than at the nearer selected position. If all computed distances are at least the
+        clearance, there is no collision.
         """
         lengths = np.abs(np.diff(motion.q, axis=0)) @ self._displacement
         path = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -248,9 +249,10 @@ class Collisions:
         return weights
 
     def _remove_overlapping(self, bounds: MotionBounds, links: int) -> tuple[str, ...]:
-        """Remove pairs that are too close at nearly all random positions within the bounds; return their names.
+        """Remove pairs of objects that nearly always touch: their distances are not computed. Return their names.
 
-        links: number of objects that are shapes of links; they are the first objects.
+        Objects are shapes of links, the floor and boxes. Shapes of links that always touch would exclude all motions.
+        The positions of the test are random and within the bounds. links: number of shapes of links, the first objects.
         """
         generator = np.random.default_rng(0)
         random = generator.uniform(bounds.low, bounds.high, (TUNING.positions, len(bounds.low)))
@@ -258,8 +260,9 @@ class Collisions:
         names: dict[str, None] = {}
         for pair in reversed(range(self.pairs)):
             objects = self._geometry.collisionPairs[pair]
-            # A pair of a link and the floor, or a box, is removed only if it is too close at all positions (a base on
-            # the floor). In all other cases, the motion must avoid the contact.
+            # `share` is the fraction of positions at which a pair is closer than the clearance. Two links are removed
+            # at a share of at least `TUNING.overlap`, 95 %. A link and the floor, or a link and a box, are removed only
+            # at 100 %, as for a base on the floor: at a smaller share, the motion must avoid the contact.
             if share[pair] >= (TUNING.overlap if objects.second < links else 1.0):
                 names[" and ".join(self._names_of(pair))] = None
                 self._geometry.removeCollisionPair(objects)

@@ -49,7 +49,7 @@ class Criterion:
         self.limits = torch.tensor(efforts, dtype=torch.float64)
 
     def states(self, parameters: np.ndarray) -> Tensor:
-        """Return q, qd and qdd, (3, T, n), of the motion with the given parameters (size,), at T equidistant times."""
+        """Return q, qd and qdd, (3, T, n), at T equidistant times; parameters: see `ExcitationTrajectory`."""
         return self.trajectory.states(torch.from_numpy(parameters), self.times)
 
     def condition(self, states: Tensor) -> float:
@@ -72,7 +72,7 @@ class Criterion:
         return float(self._value(torch.from_numpy(parameters)))
 
     def value_and_gradient(self, parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the criterion and its gradient (size,) for parameters (size,). It must be finite there."""
+        """Return the criterion and its gradient (size,) for parameters (size,). Infinite values are not excluded."""
         variables = torch.from_numpy(parameters).requires_grad_()
         value = self._value(variables)
         (gradient,) = torch.autograd.grad(value, variables)

@@ -60,7 +60,7 @@ class Excitation:
         return "\n\n".join(paragraphs)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the quality numbers of the motion, which `text` shows, for JSON; unknown efforts are None."""
+        """Return the results of the design for JSON; an effort (largest torque / limit) that is unknown is None."""
         efforts = [None if np.isnan(effort) else float(effort) for effort in self.efforts]
         return {
             "robot": self.arm.name,

@@ -16,7 +16,8 @@ from torch import Tensor
 from spelgen.excitation.bounds import MotionBounds
 from spelgen.excitation.tuning import TUNING
 
-# [1] Lower bound of a ratio: the maximum of a Fourier series at the grid points, divided by its maximum at all times.
+# [1] Lower bound of the ratio of two maxima of a Fourier series: at the grid points, and at all times. The grid has
+# `TUNING.grid` points per period of the highest harmonic. Source: Ehlich and Zeller, Math. Z. 86:41, 1964.
 GRID_RATIO = cos(pi / TUNING.grid)
 
 
@@ -103,11 +104,11 @@ class ExcitationTrajectory:
         return Motion(t, q, qd, qdd)
 
     def states(self, parameters: Tensor, t: Tensor) -> Tensor:
-        """Return q, qd and qdd, (3, T, n), for parameters (size,) at times t (T,) [s].
+        """Return q, qd and qdd, (3, T, n), at times t (T,) [s]; parameters (size,): see the class.
 
-        The motion keeps its bounds at all times. The bounds are enforced at grid points with a safety factor: the
-        maximum of a series of H harmonics is at most 1 / cos(pi / N) times its maximum on a grid with N points per
-        period of the highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
+        Positions, speeds and, if limited, accelerations are within `bounds` at all times. They are computed at grid
+        points, with a safety factor: the maximum of a series of H harmonics is at most 1 / cos(pi / N) times its
+        maximum on a grid with N points per period of the highest harmonic (Ehlich and Zeller, Math. Z. 86:41, 1964).
         """
         coefficients, offsets = self._coefficients(parameters)
         points = torch.linspace(0.0, self.duration, TUNING.grid * self.harmonics + 1, dtype=torch.float64)
@@ -124,8 +125,9 @@ class ExcitationTrajectory:
         # Any value of the amplitude parameter gives an amplitude between zero and the largest amplitude within the
         # bounds.
         amplitude = largest * (-self.amplitude_reduction(parameters)).exp()
-        # `free` is the width of the range of offsets for which the motion keeps the position range, (n,). The tanh maps
-        # any value of the offset parameter into this range.
+        # Without offset, the motion is in amplitude * [middle - half, middle + half]. It is within the position range
+        # [low, low + room] for offsets in an interval that starts at low - amplitude * (middle - half) and has the
+        # width `free`, (n,). The tanh maps any value of the offset parameter into this interval.
         free = room - 2 * amplitude * half
         offset = low - amplitude * (middle - half) + free * (1 + offsets.tanh()) / 2
         q, qd, qdd = amplitude * self._signals(coefficients, t)
@@ -136,9 +138,10 @@ class ExcitationTrajectory:
         return parameters.reshape(self.joints, -1)[:, -1].square() / 4
 
     def _coefficients(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Return sine and cosine coefficients (2, H, n) and offset parameters (n,) of H harmonics.
+        """Return the sine and cosine coefficients of the H harmonics, (2, H, n), and the offset parameters, (n,).
 
-        parameters: (size,), see the class; the amplitude parameters are not used.
+        The coefficients are projected so that the motion starts and ends at rest (see the class). Offset parameters are
+        any real numbers; `states` maps them to offsets in rad or m. parameters: (size,), see the class.
         """
         rows = parameters.reshape(self.joints, 2 * self.harmonics + 2)
         sines_cosines = rows[:, :-2].reshape(self.joints, 2, self.harmonics).permute(1, 2, 0)

@@ -16,7 +16,7 @@ class ExcitationTuning:
     min_harmonics: int = 5
     # [1] Number of steps from which L-BFGS approximates the curvature.
     history: int = 30
-    # [1] Samples per harmonic at which the criterion is evaluated.
+    # [1] Number of samples of a motion at which the criterion is evaluated, divided by the number of harmonics.
     samples_per_harmonic: int = 12
     # [1] Weight, in the criterion, of the squared excess of a torque over the fraction `effort` of its limit.
     penalty: float = 50.0
@@ -38,12 +38,13 @@ class ExcitationTuning:
     # [1] Distance below which the criterion has a penalty, divided by the clearance. The number is greater than one,
     # because the penalty is computed only at samples, between which distances may be smaller.
     margin: float = 2.0
-    # [1] Weight of the penalty on distances in the criterion. Weights of 10, 1 and 0.1 give condition numbers of 368,
-    # 34 and 18 for a Panda with 36 shapes, all without a contact.
+    # [1] Weight in the criterion of the penalty on small distances between links, and of links from the surroundings.
+    # Weights of 10, 1 and 0.1 give condition numbers of the base regressor of 368, 34 and 18 for a Panda with 36
+    # collision shapes; no motion has a contact.
     collision_penalty: float = 0.1
     # [1] Largest number of designs, each with another seed and a smaller range, until one has no contact.
     attempts: int = 5
-    # [1] Factor by which the position range is reduced for each further design.
+    # [1] After a design with a contact, the range of positions of the next design is multiplied by this factor.
     range_factor: float = 0.85
 
 

@@ -92,7 +92,8 @@ def called_by_c(
     """
     loaded = ctypes.CDLL(str(library))
     by_name = {function.entry.name: function for function in functions}
-    # The friction state is double even if all other arrays are float.
+    # The friction state z is double even if all other arrays are float: in float, the sum z + dq would lose small
+    # displacements dq.
     dtypes = dict.fromkeys(FRICTION_STATES, np.float64)
 
     def called(name: str, inputs: Values) -> Values:

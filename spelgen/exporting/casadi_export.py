@@ -124,7 +124,8 @@ def _in_kinetic_energy(model: TrainedModel, qd: ca.MX) -> ca.MX:
     """
     products = []
     for row, column in model.residuals.entries:
-        # An off-diagonal entry occurs twice in R, so the factor 1/2 cancels.
+        # In 1/2 qd^T R qd, the term of an off-diagonal entry R_ij occurs twice, as R_ij and R_ji: its coefficient is
+        # qd_i qd_j without the factor 1/2.
         weight = 0.5 if row == column else 1.0
         products.append(weight * qd[row] * qd[column])
     return ca.vertcat(*products)

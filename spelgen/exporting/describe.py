@@ -300,15 +300,16 @@ def _network(
 ) -> SigmoidNetwork | None:
     """Return a network of tanh units as a network of sigmoids; None if it has no layers or a zero last layer.
 
-    The result computes y(q), the outputs of the given network, or tanh(y(q)) @ functions. Sigmoids take less time in C.
-    The factors and the shift in tanh(x) = 2 sigmoid(2 x) - 1 are included in the weights and biases of the adjacent
-    layers.
+    Let y(q) be the outputs of the given network. The result computes y(q) or, with ``functions``, tanh(y(q)) @
+    functions: the entries of R, the residual term of M. Sigmoids take less time in C. The factors and the shift in
+    tanh(x) = 2 sigmoid(2 x) - 1 are included in the weights and biases of the adjacent layers.
 
     Args:
         layers: weights and biases of the layers of tanh units, and of the last layer, which is linear.
         encoding: the inputs of the given network, (2 n,). A revolute joint has the inputs cos q and sin q, a prismatic
             joint (q - center) slope and zero.
-        functions: linear map of tanh(y), (outputs of the last layer, outputs); None: the result is y.
+        functions: matrix (k, m), entries of R per function tanh(y_i), for k elements of y and m entries of R; None: the
+            result is y.
     """
     if layers is None or not any(tensor.any() for tensor in layers[-1]):
         return None

@@ -108,11 +108,12 @@ def _simulated(text: bytes, arm: Chain, q: np.ndarray, qd: np.ndarray, controls:
         text: content of the MJCF file.
         arm: arm with n coordinates.
         q, qd: positions and velocities of the coordinates, (states, n) [rad, m] and [rad/s, m/s].
-        controls: inputs of the actuators, (states, n).
+        controls: inputs of the actuators, (states, n): torques [Nm, N] or, for position servos, commands [rad, m].
     """
     model = mujoco.MjModel.from_xml_string(text.decode())
-    # Torque limits and friction are switched off: the reference of `check_mjcf` has neither, since MuJoCo's friction
-    # model differs from the model's.
+    # Friction and limits of joint torques are switched off in MuJoCo, because the rigid bodies with which `check_mjcf`
+    # compares MuJoCo have neither. (Friction in MuJoCo differs from friction in the model.) The torque limits of servos
+    # are compared.
     model.jnt_actfrclimited[:] = 0
     model.dof_damping[:] = 0.0
     model.dof_frictionloss[:] = 0.0
@@ -199,9 +200,10 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
 
 
 def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> dict[str, object]:
-    """Return the MJCF attributes of the joint with the coordinate k: armature, friction and limits.
+    """Return the MJCF attributes of joint k from the rigid bodies of a model: armature, friction and limits.
 
-    is_coupled: (n,), True for a motor whose speed depends on several joints.
+    is_coupled: (n,), True for a motor whose speed depends on several joints. For such a motor k the armature of joint k
+    is 0, because the armature is an attribute of a tendon.
     """
     friction, joint = projection.friction, projection.arm.chain.coordinates[k]
     # With position servos, the learned torque limit is an attribute of the actuator, so the joint gets no limit.

@@ -28,8 +28,8 @@ RESIDUAL = "residual_"
 def expression_functions(model: TrainedModel, entries: Mapping[str, EntryPoint]) -> dict[str, ca.Function]:
     """Return {name of an entry point, such as inverse_dynamics: CasADi function of scalar expressions}.
 
-    The inputs of a function are the inputs of the entry point, then the residual terms on which it depends. The outputs
-    are dense.
+    The inputs of a function are the inputs of the entry point, then the values of the residual terms on which it
+    depends (see the module): other code computes these values from q and qd. The outputs are dense.
     """
     names = ("q", "qd", "qdd", "tau", "dq", "u")
     inputs = {name: ca.SX.sym(name, model.n) for name in names}
@@ -77,7 +77,8 @@ def residual_symbols(model: TrainedModel) -> Symbols:
     residuals = model.residuals
     entries, factors = len(residuals.entries), len(residuals.friction)
     has_potential = residuals.potential is not None
-    # {name: (whether the model has this term, number of rows)}
+    # {name: (nonzero or True if the model has this term, number of rows of its symbol)}. `entries` and `factors` are
+    # numbers that are 0 without the term.
     sizes = {
         "mass": (entries, entries),
         # `rate` and `kinetic` are directional derivatives of the network. Each is computed in one pass through the
@@ -201,15 +202,17 @@ def friction_torque(model: TrainedModel, qd: ca.SX, gravity: ca.SX, z: ca.SX) ->
     deflection = ca.reshape(
         z * (constants.bristle_fractions / model.breakaway).ravel(), model.breakaway.shape[1], model.n
     )
-    # The direction of dry friction is between -1 and 1: a function of the velocity at joints without bristles,
-    # otherwise the mean deflection of the bristles.
+    # The direction of dry friction is between -1 and 1. At joints without bristles (`memoryless` is 1), it is the
+    # smooth sign of the velocity. At other joints (`memoryless` is 0), it is the mean of the bristle deflections z,
+    # divided by the break-away displacements, with the weights `bristle_fractions`, whose sum is 1. `deflection`
+    # contains the weighted deflections.
     direction = constants.memoryless * _smooth_sign(qd, constants.coulomb_smoothing_velocity)
     direction += ca.sum1(deflection).T
     load = ca.sqrt(gravity**2 + constants.min_load**2)
     speed = ca.fabs(qd) / constants.stribeck_velocity
     rounding = constants.stribeck_rounding
     slow = 1 / (1 + (1 + rounding) / 8 * speed**2 / (speed + rounding))
-    for _ in range(3):  # squaring `slow` three times gives its eighth power
+    for _ in range(3):  # slow^8 = (1 + x / 8)^-8 is close to exp(-x), the Stribeck curve
         slow = slow * slow
     dry = constants.coulomb + constants.load_dependence * load + constants.stribeck * slow
     viscous = constants.viscous * qd + constants.saturation * _smooth_sign(qd, constants.saturation_velocity)

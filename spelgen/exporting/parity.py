@@ -38,12 +38,12 @@ class EntryPoint:
     """A function of the model that exports contain, such as inverse_dynamics.
 
     Attributes:
-        about: description.
+        about: description of the result, such as "the torques that give qdd".
         inputs: names of the arguments, among q, qd, qdd, tau, u (command of servos), dq (displacement), n numbers each,
             and z, the friction state.
         outputs: {name of a result: unit}.
-        reference: function of the torch model (a ``PreparedModel``) and the inputs, (states, ...) each, with the same
-            result; None for a function that only the exported estimator calls.
+        reference: function that returns the expected result, called as reference(PreparedModel, *inputs) with inputs
+            (states, ...); None for a function that only the exported estimator calls.
     """
 
     name: str
@@ -214,7 +214,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
     range of positions and velocities. memory: number of values in the friction state z, (states, memory).
     """
     random = np.random.default_rng(0)
-    # Velocities are mostly within the limits, because friction at higher speeds is extrapolated.
+    # Most velocities are within the limits, where the model is used: above them, friction is only extrapolated.
     speed = nominal_speeds(coordinates)
     q = np.stack([random.uniform(*joint.working_range, states) for joint in coordinates], axis=-1)
     return {
@@ -224,7 +224,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
         "dq": 0.05 * speed * random.standard_normal(q.shape),
         # The standard deviation of z is 1e-4 rad, as large as typical break-away displacements.
         "z": 1e-4 * random.standard_normal((states, memory)),
-        # Forward dynamics are linear in tau, so the size of tau has no influence on the relative difference.
+        # The accelerations are an affine function of tau: one magnitude of random torques is sufficient.
         "tau": 10.0 * random.standard_normal(q.shape),
         "u": q + 0.3 * random.standard_normal(q.shape),
     }

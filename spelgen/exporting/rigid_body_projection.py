@@ -59,8 +59,9 @@ class RigidBodyProjection:
         servos: position servos of the model; None for an arm under torques.
         exact: True if the bodies are the rigid bodies of the trained model; False if they were fitted to a model of
             another kind.
-        mass_error, gravity_error: RMS difference between the rigid bodies and the trained model, of M and of the
-            gravity torque, divided by the RMS of the trained model.
+        mass_error: RMS of (M of the rigid bodies - M of the trained model), divided by the RMS of M of the trained
+            model.
+        gravity_error: the same ratio for the gravity torque.
         bodies: float64 model that consists of the rigid bodies only.
     """
 
@@ -78,7 +79,7 @@ class RigidBodyProjection:
 
     @property
     def summary(self) -> tuple[str, str]:
-        """Two sentences for the user: how the rigid bodies, and how the friction, differ from the trained model."""
+        """Two sentences for the user on differences from the trained model: of the rigid bodies, and of friction."""
         bodies = "bodies are those of the model"
         if not self.exact or self.mass_error or self.gravity_error:
             source = "the rigid bodies nearest to the model"
@@ -137,7 +138,7 @@ def _nearest_bodies(model: ArmModel, arm: Arm, q: Tensor) -> ArmModel:
     load = gravity.square().mean().sqrt().clamp(min=1e-9)
 
     def distance() -> Tensor:
-        """Return the cost: squared differences of M and gravity torque, plus the ridge penalty, a scalar."""
+        """Return the cost of `_nearest_bodies`, a scalar, for the current parameters of the rigid bodies."""
         mass_error = whitening @ bodies.mass_matrix(q) @ whitening.mT - mass
         gravity_error = (bodies.gravity(q) - gravity) / load
         # The parameters represent differences from the values in the URDF. The ridge penalty towards the URDF is
@@ -159,7 +160,8 @@ def _relative_rms(values: Tensor, expected: Tensor) -> float:
 def nearest_friction(arm: Chain, model: ArmModel, q: Tensor) -> NearestFriction:
     """Return the viscous and Coulomb friction with the least squared difference from the friction of a model.
 
-    The coefficients are non-negative. The friction torque is averaged over positions.
+    Coefficients [Nm s/rad, N s/m] and [Nm, N] are non-negative. The model's friction is averaged over positions. It is
+    evaluated at speeds of 2 to 100 % of each joint's nominal speed in both directions, in logarithmic steps.
 
     Args:
         arm: arm with velocity limits.

@@ -24,7 +24,7 @@ Wrench = tuple[ca.SX, ca.SX]
 
 
 def constant(values: object) -> ca.DM:
-    """Return numbers (rows, columns) as a sparse CasADi matrix: zeros are structural and cause no operations."""
+    """Return a matrix (rows, columns) as a sparse CasADi matrix: expressions contain no operations with its zeros."""
     return ca.sparsify(ca.DM(np.array(values, dtype=float)))
 
 

@@ -99,7 +99,8 @@ def example_lines(
         model: model that was exported.
         names: names of the programs.
         imports: import statements.
-        run: Python expression that calls a program; its variables are `name` (of the program) and `inputs` (arguments).
+        run: source of the expression that the README's function ``run(name, **inputs)`` returns; it calls the program
+            ``name`` with the arguments ``inputs``.
         zeros: format string for an array of zeros, such as "np.zeros(({}), np.{})", for dimensions and number type.
     """
     number = _number_type(model)

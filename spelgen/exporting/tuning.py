@@ -21,12 +21,13 @@ class ExportTuning:
     # [1] Largest allowed difference of MuJoCo's dynamics, relative like `tolerance`. `benchmarks/deploy.py` measures
     # 9e-15.
     mujoco_tolerance: float = 1e-9
-    # [1] Number of random positions at which the nearest rigid bodies are fitted to a model.
+    # [1] Number of random positions at which M and gravity torque of rigid bodies are fitted to a model that has no
+    # rigid bodies, by least squares (the nearest rigid bodies, `_nearest_bodies`).
     positions: int = 512
-    # [1] Number of optimizer steps of the fit of the nearest rigid bodies.
+    # [1] Number of optimizer steps of the same fit.
     steps: int = 400
-    # [1] Factor of half the squared distance from the URDF's parameters in the fit of the nearest rigid bodies. It
-    # determines parameters on which M and gravity do not depend.
+    # [1] Weight r of the ridge term r/2 |x|^2 in the same fit; x are the differences of the parameters from the URDF.
+    # The term determines the parameters on which M and gravity torque do not depend.
     ridge: float = 1e-8
     # [1] Number of random positions at which viscous and Coulomb friction are fitted to the friction of a model.
     friction_positions: int = 32

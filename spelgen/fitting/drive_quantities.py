@@ -54,7 +54,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     ]
 
     def constants(model: ArmModel) -> Tensor:
-        """Return armature, viscous and Coulomb friction, torque offset and, if trained, gain, (4, n) or (5, n)."""
+        """Return the rows armature, viscous, coulomb, offset and, if trained, gain, (4 or 5, n); see `TORQUE_UNITS`."""
         rows = [model.armature, *line(model), model.torque_offset]
         if gains and isinstance(model.inputs, MotorInputs):
             rows.append(model.inputs.gains().sum(dim=1))
@@ -78,8 +78,9 @@ def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
         # The load of each drive is the gravity torque in the drive's coordinates, at P = 32 random positions, (P, n).
         load = model.gravity(q) @ torch.linalg.inv(motors_of(model))
         factor = friction_factor(model, q)
-    # The speeds are in units of the typical speed. The speeds are dense at low speeds, where the Stribeck effect
-    # determines the intercept of the line.
+    # The line is fitted to the friction torque at these 25 speeds, which are divided by the typical speed. Most of them
+    # are low, since the intercept of the line (Coulomb friction) depends on the friction at low speeds, including the
+    # Stribeck effect.
     speeds = np.geomspace(0.02, 1.0, 25)
     line = torch.from_numpy(np.linalg.pinv(np.stack([speeds, np.ones_like(speeds)], axis=-1)))
 

@@ -186,7 +186,7 @@ class _Fitting:
             self.run.save(self.objective.history, checkpoint["best_weights"], checkpoint)
 
     def _run(self) -> Status:
-        """Print the diagnostics, run the objective, fit the baselines, and return the status.
+        """Print the diagnostics of logs and preparation, fit the model and the baselines, and return the status.
 
         Ctrl-C ends the fit with status "interrupted", without baselines.
         """
@@ -239,8 +239,9 @@ def objective_of(request: FitRequest) -> Objective:
 def default_objective(model: ArmModel, rates: Rates) -> str:
     """Return the name of the default objective for a model and for the sample rates of its logs.
 
-    The default is "servo" for an arm with position servos, "torque" for rigid bodies if a log is sampled densely enough
-    for accelerations, and otherwise "rollout". rates: function that returns the sample rates of the logs.
+    The default is "servo" for an arm with position servos. For a model with rigid bodies, it is "torque" if at least
+    one log is sampled densely enough for accelerations (24 Hz). Otherwise it is "rollout". rates: function that returns
+    the sample rates of the logs [Hz].
     """
     if model.input_quantity == "position":
         return "servo"
@@ -252,7 +253,8 @@ def default_objective(model: ArmModel, rates: Rates) -> str:
 def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rates: Rates) -> FitConfig:
     """Return the requested configuration, or the default configuration with the requested options.
 
-    Raises OptionError for an option that does not apply to the model.
+    Raises OptionError for an option that does not apply to the model. rates: function that returns the sample rates of
+    the logs [Hz]; it determines the default objective and is called only if no objective is requested.
     """
     rigid_bodies = isinstance(model, RigidBodyDynamics)
     if isinstance(requested, FitConfig):
@@ -267,8 +269,9 @@ def choose_config(model: ArmModel, requested: FitConfig | FitOptions | None, rat
     objective, defaults = chosen.objective, chosen.defaults
     if objective is None:
         objective = default_objective(model, rates)
-        # The parameters of rigid bodies start at the values of the URDF and need no regularizer towards the URDF, so
-        # the default of its weight is zero. An objective that the user chose has its own default.
+        # Here the user chose no objective. For the default objective rollout, the default weight of the regularizer
+        # towards the URDF is zero, since parameters of rigid bodies start at the values of the URDF and need no
+        # regularizer. A user who names the objective rollout gets the default weight of `Rollout`.
         if rigid_bodies and objective == "rollout":
             defaults = {"urdf_weight": 0.0, **defaults}
     return fit_config(objective, rigid_bodies=rigid_bodies, options=chosen.options, defaults=defaults)

@@ -43,7 +43,7 @@ class Fit:
     Attributes:
         history: lines of metrics.jsonl, one per epoch.
         diagnostics: messages about the logs and the fit.
-        status: how the fit ended; None for a run that was loaded.
+        status: status with which the fit ended, such as "finished"; None for a run that was loaded.
         record: content of config.json.
         checkpoint: content of checkpoint.pt.
         baselines: content of least_squares.json, {} without baselines.
@@ -80,7 +80,7 @@ class Fit:
 
     @property
     def best_validation(self) -> float:
-        """Lowest validation loss: `rollout_loss`; for position servos, RMS position error [rad, m]."""
+        """Lowest validation loss: dimensionless `rollout_loss`; for position servos, RMS position error [rad, m]."""
         return self.checkpoint.best_loss
 
     @property

@@ -204,8 +204,10 @@ def _best_candidate(
 ) -> SolverState[Parameters]:
     """Return the state of minimum cost among the candidates of a step.
 
+    A candidate is a parameter vector after the step, such as x + step (see `LeastSquaresProblem.candidates`).
     Candidates after the first one with a high gain ratio are not evaluated. The gain ratio is the decrease of the cost
-    divided by its predicted decrease. predicted: predicted decrease of the cost.
+    divided by its predicted decrease. state: state before the step. step: (k,). predicted: predicted decrease of the
+    cost.
     """
     best = replace(state, cost=float("inf"))
     for x in problem.candidates(state.x, step):

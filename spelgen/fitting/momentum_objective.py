@@ -52,7 +52,7 @@ class MomentumObjective(Objective):
         self.allowed = math.inf if minutes is None else 60 * minutes  # time limit of the fit [s]
 
     def prepare(self) -> PreparedLogs:
-        """Check, split and filter the logs, cut windows, and make the regularizer. Raises LogError."""
+        """Check, split and filter the logs, cut windows, make the regularizer towards the URDF. Raises LogError."""
         self.data = prepare_data(self.request, self.config.window, self.config.stride)
         self.config = self.config.resolved(len(self.data.training))
         self.regularizer = None
@@ -75,7 +75,7 @@ class MomentumObjective(Objective):
         self.model.load_state_dict(self.best_weights)
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the momentum stage, unless it was completed before the run was resumed; return the status."""
+        """Run the momentum stage (`_momentum_stage`), unless a resumed run has completed it; return the status."""
         status: Status = "finished"
         if not self.momentum_done:
             self._start_clock()
@@ -126,7 +126,7 @@ class MomentumObjective(Objective):
         return seconds / self.allowed if self.allowed else math.inf
 
     def _new_optimizer(self, generator: torch.Generator) -> WindowOptimizer:
-        """Return an optimizer of the weights that require a gradient. generator: gives the random order of batches."""
+        """Return a new L-BFGS or AdamW optimizer of the trainable parameters; generator: order of AdamW's batches."""
         decay = self.config.weight_decay or 0.0
         if self.config.optimizer == "lbfgs":
             return LBFGS(self.model, decay)

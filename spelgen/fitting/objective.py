@@ -48,12 +48,15 @@ class Objective(ABC):
         """Run the part of a new fit that precedes the first checkpoint; return diagnostics for the user."""
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
-        """Restore the state of a fit from checkpoint.pt and metrics.jsonl. The base class loads only the best weights.
+        """Restore the state of an interrupted fit from its checkpoint.pt and metrics.jsonl.
 
-        Raises KeyError, RuntimeError, TypeError, ValueError or AttributeError for files of another model.
+        The method of the base class restores only the best weights. Raises KeyError, RuntimeError, TypeError,
+        ValueError or AttributeError if the files belong to another model.
+
+        checkpoint: content of checkpoint.pt. history: lines of metrics.jsonl, one per epoch.
         """
-        # If a class does not override this function, its `begin` runs the whole fit: the checkpoint is from a finished
-        # fit.
+        # An objective that does not override `resume` runs the whole fit in `begin`. Its only checkpoint is written
+        # after the fit, so nothing remains to be fitted after the best weights are loaded.
         self.model.load_state_dict(checkpoint["best_weights"])
         self._checkpoint = checkpoint
 

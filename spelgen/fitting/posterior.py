@@ -50,14 +50,16 @@ class Propagated(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of a model that was fitted to torques; for position servos see `ServoPosterior`.
+    """Posterior (mean and covariance of the parameters) of a model that was fitted to torques.
+
+    Models with position servos have the derived class `ServoPosterior`.
 
     Attributes:
         covariance: (K, K), covariance of the K rigid-body, drive and friction parameters.
         torque_std: (n,) [Nm, N], RMS of the low-pass filtered torque residual on blocks of samples that were not
-            fitted; None for position servos, whose torques are not logged.
-        delay: delay of the torques relative to the positions, or of the commands of position servos [s]; None if there
-            is no delay.
+            fitted; None in `ServoPosterior`, because torques are not logged.
+        delay: delay of the torques relative to the positions [s], in `ServoPosterior` delay of the commands; None if
+            there is no delay.
     """
 
     model: ArmModel
@@ -266,13 +268,14 @@ class Posterior:
 
     @cached_property
     def _base_values(self) -> Propagated:
-        """Values of the r base parameters, (r,), with a square root (r, k) of their covariance."""
+        """Values of the r base parameters, (r,), with a square root (r, k) of their covariance, see `Propagated`."""
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
     def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
-        """Return the constants of the drives that have intervals, and the function that returns their values.
+        """Return the constants of drives that have 95 % intervals, and the function that computes their values.
 
-        The function returns one row per constant for a model, (constants, n).
+        The constants are armature, friction, torque offset and motor gain (see `torque_drive_quantities`). The function
+        returns their values for a model, one row of n joints per constant, (constants, n).
         """
         return torque_drive_quantities(self.model)
 

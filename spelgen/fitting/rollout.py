@@ -51,7 +51,7 @@ def roll_out(
     for dt, tau in zip(windows.dt.unbind(1), windows.tau.unbind(1), strict=True):
 
         def rhs(q: Tensor, p: Tensor, z: Tensor, tau: Tensor = tau) -> tuple[Tensor, Tensor]:
-            """Return dq/dt and dp/dt of the W windows, (W, n) each."""
+            """Return dq/dt and dp/dt, (W, n), at q, momenta p = M qd and friction state z under inputs tau."""
             return model.port_hamiltonian_rhs(q, p, tau, prepared, *known_past(model, z))
 
         for substep in range(substeps):

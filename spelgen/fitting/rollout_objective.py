@@ -65,7 +65,7 @@ class RolloutObjective(MomentumObjective):
         self.history = history[: self.epoch]
 
     def run(self, progress: TrainingProgress, save: Callable[[], None]) -> Status:
-        """Run the momentum stage, then epochs until the fit ends; call ``save`` after this stage and each epoch."""
+        """Minimize the momentum loss, then the rollout loss in epochs; call ``save`` after each of them."""
         self._start_clock()
         if not self.momentum_done:
             self._momentum_stage(progress)
@@ -84,7 +84,10 @@ class RolloutObjective(MomentumObjective):
         return super().checkpoint() | state | {"generator": self.generator.get_state()}
 
     def _set_up(self) -> None:
-        """Compute the validation loss; initialize counters, fixed weights and optimizer of the first stage."""
+        """Compute the validation loss, and initialize counters and optimizer of the first of two stages of epochs.
+
+        In the first stage the parameters of idle residual terms, whose names are in `fixed`, are constant.
+        """
         super()._set_up()
         self.generator = torch.Generator().manual_seed(self.request.seed)
         self.fixed, self.stage_from, self.stage_epoch = idle_residuals(self.model), 0.0, 0
@@ -124,7 +127,8 @@ class RolloutObjective(MomentumObjective):
             # `state` is the state of the fit before the epoch: a diverged epoch is repeated from it.
             state = copy.deepcopy((self.model.state_dict(), self.optimizer.state_dict(), self.step))
             steps, start = self._steps_in_time(), self.seconds_now()
-            # The mean loss of an epoch is NaN if the loss or the gradient of any step is not finite.
+            # The mean loss of an epoch is NaN if the loss or the gradient of any step is not finite. The validation
+            # loss is then set to NaN, and the epoch is repeated with a lower learning rate (`_roll_back`).
             loss = self.optimizer.run(self._rollout_loss, self.training, steps, self._rate)
             trained = self.seconds_now()
             self.step, self._step_seconds = self.step + steps, (trained - start) / steps

@@ -60,9 +60,10 @@ class RunFolder:
     def started(self, spec: ModelSpec, urdf: Path | None, *, force: bool) -> Iterator[None]:
         """Context manager that makes the folder, writes the specification, and copies the robot's URDF and settings.
 
-        Files of a previous run are removed. A folder contains a run if it contains config.json, which the caller writes
-        last, so that a run has all files. If the caller is interrupted before, its files are removed. Raises RunError
-        if the folder contains a run and ``force`` is False.
+        Files of a previous run are removed. A folder contains a run if it contains config.json. The caller writes this
+        file last, inside the context, so that a run always has all its files. If the code inside the context raises an
+        exception, the files written so far are removed. Raises RunError if the folder contains a run and ``force`` is
+        False.
         """
         self.require_free(force=force)
         content = {self.spec: f"{spec.to_json()}\n".encode()}

@@ -106,9 +106,12 @@ def robot_of(
 ) -> tuple[Path | None, list[Diagnostic]]:
     """Return the path of the URDF for the run folder (None if there is none), and diagnostics about the URDF.
 
-    The URDF is `urdf` or, if it is None, the file named in `spec` in the folder of `module`. It must be the URDF from
-    which the module was built: otherwise ModuleError is raised for `urdf`, and a warning is returned for the file in
-    the folder of `module`. Raises RunError if there is no file `urdf`.
+    The URDF is `urdf` or, if `urdf` is None, the file named in `spec` in the folder of `module`. It must be the URDF
+    from which the module was built:
+
+    - If `urdf` is given, ModuleError is raised for another URDF, and RunError if there is no such file.
+    - If the file in the folder of `module` is absent or changed, the path is None, and a warning is returned.
+    - If `urdf` and `module` are None, the path is None, without a warning.
     """
     if urdf is not None:
         path = Path(urdf)

@@ -14,14 +14,15 @@ class FittingTuning:
     initial_damping: float = 1e-3
     # [1] Smallest damping: steps with a smaller damping equal Gauss-Newton steps to nine digits.
     min_damping: float = 1e-9
-    # [1] The damping is divided by this number after a step that decreases the cost, otherwise multiplied by it
-    # (Marquardt: 10), or by half of it in the few steps of the fits of single servos.
+    # [1] After a step that decreases the cost, the damping is divided by this number; after any other step, it is
+    # multiplied by it (Marquardt: 10). The fits of single servo joints, of at most six steps, multiply by only half of
+    # this number, 5: with a damping that is too large, the remaining steps would be too short.
     damping_factor: float = 10.0
     # [1] Largest number of dampings tried for one step. If the first is the smallest damping, the last is 1e5, with
     # which steps are negligible.
     max_trials: int = 15
-    # [1] After a rejected step, a step is tried only if a component differs by more than this fraction of the largest
-    # component: otherwise both steps are nearly equal.
+    # [1] After a rejected step, the step with a larger damping is tried only if a component differs from the rejected
+    # step by more than this fraction of the largest component: otherwise both steps are nearly equal.
     same_step: float = 1e-3
     # [1] Smallest predicted decrease of the cost for which a step is tried, as a fraction of the cost. Smaller
     # decreases are within rounding errors.
@@ -104,8 +105,8 @@ class FittingTuning:
     # [1] Margin on both sides of the logged range of positions, as a fraction of this range: a model is also used
     # slightly outside the range.
     regularizer_margin: float = 0.5
-    # [1] Errors of a joint's gravity torque are divided by a scale: its smallest value, as a fraction of the largest
-    # scale of all joints.
+    # [1] Lower bound of the scale of a joint's gravity torque, by which errors of this torque are divided, as a
+    # fraction of the largest scale of all joints.
     min_gravity_scale: float = 0.05
 
 

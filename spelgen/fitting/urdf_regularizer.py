@@ -1,6 +1,7 @@
 """Regularizer towards the mass matrix and gravity torque of a URDF, for parameters that the logs do not determine.
 
-The variation of M with q is compared, not its mean: rotors and loads that the URDF does not specify add constants to M.
+The variation of M with q is compared, not its mean: URDFs do not specify the inertias of rotors, which add constants to
+M.
 """
 
 from __future__ import annotations
@@ -23,10 +24,13 @@ class UrdfRegularizer(NamedTuple):
 
     Attributes:
         q: (S, n), positions [rad, m].
-        whitening: (n, n), W = inverse Cholesky factor of the model's mean M before the fit.
-        variation: (S, n, n), dimensionless, W (M - mean M) W^T for M of the URDF, with its mean over the positions.
+        whitening: (n, n), W, the inverse Cholesky factor of the mean over the positions of the model's mass matrix
+            before the fit.
+        variation: (S, n, n), dimensionless, W (M - mean M) W^T with the mass matrix M of the URDF and the mean of M
+            over the S positions.
         gravity: (S, n), gravity torque of the URDF [Nm, N].
-        gravity_scale: (n,), root mean square of `gravity` with a lower bound, the divisor of its errors [Nm, N].
+        gravity_scale: (n,), root mean square of `gravity` with a lower bound, by which errors of the gravity torque are
+            divided [Nm, N].
     """
 
     q: Tensor
@@ -40,7 +44,8 @@ class UrdfRegularizer(NamedTuple):
 
         The loss is the mean over the positions `q` of |W (M - mean M) W^T - `variation`|^2 / n + |(g - `gravity`) /
         `gravity_scale`|^2 / n. M and g are the mass matrix and the gravity torque of the model, mean M is the mean over
-        the positions, W is `whitening`, and |.| is the Frobenius norm.
+        the positions, W is `whitening`, and |.| is the Frobenius norm. `variation` and `gravity` are the URDF's values
+        of W (M - mean M) W^T and g.
         """
         variation = _variation(model.mass_matrix(self.q), self.whitening) - self.variation
         gravity = (model.gravity(self.q) - self.gravity) / self.gravity_scale
@@ -57,7 +62,8 @@ def urdf_regularizer(
     """Return the regularizer towards a URDF; None without a URDF.
 
     If the URDF cannot be read, a message is appended to ``notes``, and the result is None. windows: windows of the
-    logs; model and URDF are compared at random positions in their range of positions.
+    logs. The mass matrices and gravity torques of model and URDF are compared at random positions, within the range of
+    the windows' positions plus a margin.
     """
     if urdf is None or not urdf.exists():
         return None

@@ -17,7 +17,7 @@ UNITS = {"revolute": ("rad", "deg", "turns"), "prismatic": ("m", "mm")}
 
 
 class WrongOrder(Fault):
-    """Kind of fault of a log: the columns of the joints are in another order."""
+    """Kind of fault of a log: the columns of some joints contain the signals of other joints."""
 
     def __init__(self, code: str, description: str, rows: tuple[int, ...], starts: int = 9) -> None:
         """Define the columns of a log (motion, torques or both) that may belong to other joints.
@@ -26,11 +26,12 @@ class WrongOrder(Fault):
             code: code of the finding.
             description: text about the exchanged columns.
             rows: rows of `Hypothesis.source` that are permuted, 0 for the motion and 1 for the torques.
-            starts: number of orders from which the search for the best order starts, at most 9.
+            starts: number of initial orders of the joints, at most 9, from which the best order is searched.
         """
         self.code, self.description = code, description
         self._rows, self._starts = rows, starts
-        # exchanged columns of only the motion, or only the torques, are less frequent than exchanged whole joints
+        # the columns of whole joints are exchanged more often than only the motions or only the torques, whose
+        # hypotheses therefore have a penalty of 2 on the cost
         self.rarity = 0 if len(rows) == 2 else 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
@@ -59,7 +60,7 @@ class WrongOrder(Fault):
         # their names.
         starts = [present, present[::-1], np.argsort(np.argsort(joints))]
         starts += [rng.permutation(len(joints)) for _ in range(6)]
-        # fits are cached, since searches from several starts visit the same orders
+        # fits are cached, since searches from several starts reach the same permutations of the columns
         known: dict[bytes, HypothesisFit] = {}
 
         def fitted(hypothesis: Hypothesis) -> HypothesisFit:
@@ -99,7 +100,7 @@ class WrongOrder(Fault):
 
 
 class WrongScale(Fault):
-    """Base class of faults that are corrected by factors: motion or torques of the opposite sense or in another unit.
+    """Base class of faults that are corrected by factors: motion or torques of another sign or in another unit.
 
     factors: candidates for the factors, (2, n) each: first row for the motion, second row for the torques of n joints.
 
@@ -109,7 +110,7 @@ class WrongScale(Fault):
     """
 
     def __init__(self, factors: Sequence[np.ndarray]) -> None:
-        """Define the candidates for factors on the motion and torque of n joints, (2, n) each."""
+        """Define the candidates for the correction factors of n joints, (2, n) each: on the motion, on the torque."""
         self.factors = factors
 
     @abstractmethod
@@ -120,16 +121,20 @@ class WrongScale(Fault):
         """
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques, with the scales in `base` multiplied by each of `factors`."""
+        """Yield least-squares fits of the log's torques, one or two for each candidate in `factors`.
+
+        The correction factors of a candidate multiply the scales of motion and torques in the hypothesis of `base`.
+        """
         return self._scaled_by(self.factors, problem, base)
 
     def _scaled_by(
         self, factors: Sequence[np.ndarray], problem: GeometryProblem, base: HypothesisFit
     ) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques with scaled signals, one or two fits per array of `factors`.
+        """Yield least-squares fits of the log's torques with signals that are scaled by each array of `factors`.
 
-        An array (2, n) has the factors on the motion, then the factors on the torques. They multiply the scales that
-        the hypothesis of the fit `base` has.
+        An array (2, n) has the factors on the motion, then the factors on the torques of n joints. The scales in the
+        hypothesis of the fit `base` are multiplied by these factors. If the motion of a joint with a zero offset has a
+        negative factor, two fits are yielded, with either sign of the offset: its sign after the reversal is unknown.
         """
         reading = base.hypothesis
         for factor in factors:
@@ -140,9 +145,9 @@ class WrongScale(Fault):
                 yield problem.fit(reading.changed(self, scale=reading.scale * factor, offset=offset))
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the settings that correct the scale of a joint's signals; unchanged settings are omitted.
+        """Return the settings that correct the scale or the sign of a joint's signals; unchanged settings are omitted.
 
-        These settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
+        The settings are `sign`, `units`, `gain`, `torque_offset` and `offset`.
         """
         if not self.has(*correction.factors)[joint]:
             return {}
@@ -176,7 +181,10 @@ class WrongScale(Fault):
 
 
 class JointSense(WrongScale):
-    """Kind of fault of a log: a joint's positions and velocities, and perhaps its torques, have the opposite sense."""
+    """Kind of fault of a log: the positive direction of a joint's positions and velocities is opposite to the URDF's.
+
+    The torques of the joint may have the opposite sign, too.
+    """
 
     code = "joint-sense"
 
@@ -185,14 +193,17 @@ class JointSense(WrongScale):
         super().__init__([np.stack([sign, torque]) for sign in signs for torque in (np.ones(n), sign)])
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose motion has the opposite sense: its correction factor is negative.
+        """Return the mask (n,) of the joints whose motion is reversed: its correction factor is negative.
 
-        motion, torque: (n,) correction factors of the joints.
+        motion, torque: (n,) correction factors of the joints' motion and torques; the torques may be reversed or not.
         """
         return np.asarray(motion < 0)
 
     def text(self, correction: Correction) -> str:
-        """Return the text about joints whose motion is opposite to the URDF's sense, and the sense of their torques."""
+        """Return the text about joints whose positive direction of motion is opposite to the URDF's.
+
+        The text also states whether the torques of these joints are reversed: all, none or some.
+        """
         motion, torque = correction.factors
         is_reversed = torque[motion < 0] < 0
         if is_reversed.all():

@@ -1,6 +1,6 @@
-"""Kinds of faults of a log that real numbers describe: zero offsets, and the vector of gravity.
+"""Kinds of faults of a log that have continuous parameters: a zero offset of positions, and the vector of gravity.
 
-The values of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
+The parameters of lowest cost are found by Gauss-Newton steps (`GeometryProblem.descend`).
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class ZeroOffset(Fault):
 
         starts = RIGHT_ANGLE * np.array([[0], [1], [2], [-1]]) if is_revolute else np.zeros((1, 1))
         start = min(starts, key=lambda x: problem.fit(shifted(x)).cost)
-        # The descent ends at a step below `smallest`. If it starts at the unchanged zero, `smallest` is `min_offset`: a
-        # smaller offset is only a calibration error. If it starts at a multiple of 90 degrees, `smallest` is less, so
-        # that the offset is accurate.
+        # The descent ends at a step below `smallest`. If it starts at the current zero, `smallest` is `min_offset`
+        # (0.09 rad or 0.01 m): a smaller offset is only a calibration error. If it starts at a multiple of 90 degrees,
+        # the offset is certainly large and should be accurate, so `smallest` is 0.01 rad.
         smallest = GEOMETRY.min_shift if start.any() else min_offset
         offset, best = problem.descend(shifted, start, largest=1.0, smallest=smallest)
         candidates = []
@@ -73,7 +73,10 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets, with the largest offset. Reversed joints have a text of their own."""
+        """Return the text about zero offsets, with the largest offset of the joints whose motion is not reversed.
+
+        The zero offset of a reversed joint is a part of another correction (`JointSense`), which has its own text.
+        """
         shifts = correction.hypothesis.offset - correction.unchanged.offset
         shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
@@ -85,8 +88,8 @@ class ZeroOffset(Fault):
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
         """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
 
-        {} is also returned for a joint whose sense `correction` reverses: the method of `JointSense` returns both its
-        sign and its offset, since another sign may need another offset.
+        {} is also returned if `correction` reverses the sense of the joint: `JointSense.joint_keys` then returns the
+        offset together with the sign, since the offset may depend on the sign.
         """
         offset = correction.hypothesis.offset[joint]
         if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
@@ -94,7 +97,10 @@ class ZeroOffset(Fault):
         return {"offset": plain_number(offset)}
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all zero offsets are as small as errors of a URDF; else "", for an error."""
+        """Return `code`, the code of a warning, if all zero offsets are small; otherwise "", and the fault is an error.
+
+        Offsets below `GEOMETRY.serious_angle` [rad] or `serious_shift` [m] are within the typical errors of a URDF.
+        """
         shifts = np.abs(correction.hypothesis.offset - correction.unchanged.offset)
         is_revolute = np.array(correction.arm.joint_types) == "revolute"
         bounds = np.where(is_revolute, GEOMETRY.serious_angle, GEOMETRY.serious_shift)
@@ -123,8 +129,8 @@ class Compensation(Fault):
             return with_gravity(self, base, fraction * present)
 
         without = problem.fit(reduced(np.zeros(1)))
-        # The remaining fraction of gravity is between -0.5 and 0.5: if more than half of gravity remains in all joints,
-        # the masses of the URDF are probably wrong.
+        # The logged torques contain the fraction -0.5 to 0.5 of the gravity torque: if they contained more than half of
+        # it in all joints, wrong masses of the URDF would be a more likely reason than a compensation of gravity.
         fraction, _ = problem.descend(
             reduced, np.zeros(1), largest=0.5, smallest=1e-3, allowed=lambda x: np.clip(x, -0.5, 0.5)
         )
@@ -138,7 +144,7 @@ class Compensation(Fault):
         return f"torques in which gravity is compensated: {fraction:.2g} times the URDF's gravity remains in all joints"
 
     def robot_keys(self, correction: Correction) -> dict[str, object]:
-        """Return the setting `gravity` of the robot: the vector of gravity that the hypothesis assumes [m/s^2]."""
+        """Return the setting `gravity` [m/s^2]: the vector of gravity in the hypothesis of `correction`."""
         return {"gravity": [plain_number(x) for x in correction.hypothesis.gravity]}
 
 
@@ -157,14 +163,14 @@ class Gravity(Compensation):
         """
         present = np.array(base.hypothesis.gravity)
         size = float(np.linalg.norm(present))
-        standard = size or 9.81  # [m/s^2] magnitude of gravity in `base`
+        standard = size or 9.81  # [m/s^2] magnitude of gravity in `base`; 9.81 if it is zero
 
         def turned(gravity: np.ndarray) -> Hypothesis:
             """Return the hypothesis that gravity is this vector, (3,) [m/s^2]."""
             return with_gravity(self, base, gravity)
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
-            """Return the vector (3,) in the direction of `gravity` with the magnitude `standard` [m/s^2]."""
+            """Return the vector (3,) [m/s^2] in the direction of `gravity`, scaled to the magnitude `standard`."""
             return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
 
         # Gravity along -z is the first start, so it is preferred if the log does not determine the sign of gravity.
@@ -182,9 +188,10 @@ class Gravity(Compensation):
                 )
             )
         new, best = min(descents, key=lambda x: x[1].cost)
-        # Torques without gravity are also explained by gravity parallel to the axes of all joints. A direction found
-        # from the start -z is accepted. Any other direction must have a lower cost than zero gravity; otherwise a
-        # gravity compensation is more likely.
+        # Gravity parallel to the axes of all joints causes no torque. If the torques contain no gravity, such a
+        # direction therefore explains them as well as zero gravity does, and a gravity compensation is more likely. A
+        # direction must thus have a lower cost than zero gravity. The exception is a direction found from the start -z,
+        # the gravity of an upright arm, which is the most frequent mounting.
         is_likely = start is starts[0] or best.cost < problem.fit(turned(np.zeros(3))).cost - 1.0
         if is_likely and np.linalg.norm(new - present) > GEOMETRY.min_tilt * size:
             nearest = np.linalg.norm(new) * np.sign(new) * (np.abs(new) == np.abs(new).max())
@@ -193,14 +200,20 @@ class Gravity(Compensation):
             yield axis if is_axis else problem.fit(turned(new.round(3)))
 
     def text(self, correction: Correction) -> str:
-        """Return the text about the orientation of the arm: the angle between gravity in settings and hypothesis."""
+        """Return the text about the orientation of the arm, with the angle between two directions of gravity [degrees].
+
+        One is the direction in the settings, the other is the direction in the hypothesis of `correction`.
+        """
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         cosine = float(new @ present / max(np.linalg.norm(new) * np.linalg.norm(present), 1e-9))
         angle = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
         return f"torques of a gravity that is {angle:.3g} degrees from its direction in the settings"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if gravity is tilted no more than by mounting errors; else "", for an error."""
+        """Return `code`, the code of a warning, if gravity is tilted slightly; otherwise "", and the fault is an error.
+
+        Tilts below `GEOMETRY.serious_angle` [rad] are within the typical errors of the mounting.
+        """
         present, new = np.array(correction.unchanged.gravity), np.array(correction.hypothesis.gravity)
         is_small = np.linalg.norm(present - new) < GEOMETRY.serious_angle * np.linalg.norm(present)
         return self.code if is_small else ""

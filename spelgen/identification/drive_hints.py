@@ -35,8 +35,8 @@ FRICTION = FrictionModel(coulomb_smoothing_velocity=SAMPLES.moving)
 class Coupling:
     """Coupling of two joints: the motor of `joint` also rotates when the joint `moved_by` moves.
 
-    The speed of the motor, in units of the joint's speed, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
-    the logged torques are joint torques, "motors" if they are motor torques in the units of the joints.
+    The speed of the motor, on the output side of its gear, is qd[joint] + ratio * qd[moved_by]. logged_at: "joints" if
+    the logged torques are joint torques; "motors" if they are motor torques on the output side of the gears [Nm, N].
     """
 
     joint: int
@@ -228,8 +228,9 @@ def find_coupling(problem: DriveProblem) -> tuple[Coupling, float] | None:
     explained = coupled.max() < HINTS.coupling_gain
     if not (explained and _is_sure(logged, coupled, HINTS.coupling_gain, len(candidates))):
         return None
-    # A friction model without a state has a residual after each reversal. If the joints move at the same times, a
-    # coupling explains this residual, too; it must therefore also lower the residual with hysteresis.
+    # The torque residual so far is of a friction model without a state (hysteresis), which has errors after each
+    # reversal of a joint. If both joints reverse at the same times, a coupling explains these errors, too. A coupling
+    # is therefore accepted only if it also lowers the residual of the friction model with hysteresis.
     stateful = problem.with_hysteresis()
     without, with_coupling = (x.errors[:, best.pair].mean(axis=1) for x in (stateful, stateful.coupled(best)))
     if not _is_sure(without, with_coupling, HINTS.coupling_gain, 1):
@@ -254,13 +255,13 @@ def _with_best_ratio(start: Coupling, cost: Callable[[Coupling], float]) -> Coup
 
 
 def _is_sure(logged: np.ndarray, mended: np.ndarray, gain: float, candidates: int) -> bool:
-    """Return True if a candidate for a coupling significantly lowers the errors of B blocks of time.
+    """Return True if a coupling significantly lowers the errors of B blocks of time (one-sided t test).
 
     Args:
-        logged: (B,) errors without the candidate coupling.
-        mended: (B,) errors with the candidate coupling.
-        gain: upper bound for the mean error with the candidate, divided by the mean error without it.
-        candidates: number of candidates of which this candidate is the best.
+        logged: (B,) errors without the coupling.
+        mended: (B,) errors with the coupling.
+        gain: upper bound for the ratio (mean error with the coupling) / (mean error without it).
+        candidates: number of couplings of which this one is the best; the significance level is divided by it.
     """
     if mended.mean() >= gain * logged.mean():
         return False

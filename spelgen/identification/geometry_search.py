@@ -22,9 +22,10 @@ RANK = attrgetter("rank")
 
 
 def kinds_of_faults(arm: Chain, units: Sequence[Fault] = ()) -> tuple[Fault, ...]:
-    """Return all kinds of faults that the search tests on logs of an arm with n joints, such as an opposite sense.
+    """Return all kinds of faults that the search tests on logs of an arm with n joints.
 
-    units: kinds of wrong units, with their candidates; none if the units are right.
+    Examples: a joint whose positions have the opposite sign, or exchanged columns of joints. units: kinds of wrong
+    units, with their candidates; none if the units are right.
     """
     n = len(arm.coordinates)
     return (
@@ -45,7 +46,11 @@ def kinds_of_faults(arm: Chain, units: Sequence[Fault] = ()) -> tuple[Fault, ...
 
 
 def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
-    """Return the kinds of faults that positions and commands of a servo have in common, such as the opposite sense."""
+    """Return the kinds of faults that the search tests on logs of servos, with commanded and measured positions.
+
+    Each fault affects measured positions and commands in the same way, for example the opposite sign of both at a
+    joint.
+    """
     sense = JointSense(len(arm.coordinates))
     sense.factors = [factor for factor in sense.factors if (factor[1] < 0).any()]
     order = WrongOrder("joint-order", "the columns of other joints", (0, 1), starts=3)
@@ -55,10 +60,14 @@ def kinds_of_servo_faults(arm: Chain) -> tuple[Fault, ...]:
 def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tuple[HypothesisFit, ...]:
     """Return the fit of the unchanged log, then up to three fits of hypotheses with significantly lower costs.
 
-    The best hypothesis is first; costs of the others are within `GEOMETRY.ambiguous` of its cost. If no decrease is
-    significant, hypotheses with evidence other than the cost are tried (faults with `needed` = 0, such as
-    `TorqueUnit`). The best one is returned, too, if it lowers the cost at all; otherwise the result has only the fit of
-    the unchanged log. faults: kinds of faults, tested singly and combined.
+    faults: kinds of faults, corrected singly and combined. There are three cases:
+
+    - Hypotheses have significantly lower costs: the best is first, and the costs of the others are within
+      `GEOMETRY.ambiguous` of its cost.
+    - No decrease is significant, but a fault with `needed` = 0 lowers the cost at all: the best correction of such a
+      fault is returned, since there is other evidence for it. Example: `TorqueUnit`, for which the URDF's gravity
+      torque is evidence.
+    - Otherwise the result has only the fit of the unchanged log.
     """
     # the many hypotheses are compared on few samples, and only the best ones are compared on more samples below
     coarse = problem.thinned(GEOMETRY.coarse_samples)
@@ -76,9 +85,10 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         for start in sorted(fits, key=RANK)[: GEOMETRY.beam if is_partial else 1]:
             tried += _weighed(coarse, stateful, _corrected(coarse, stateful, faults, start), start)
         better = min(tried, key=RANK)
-        # Permutations of all joints and long drifts of delays take time. They are searched only if no single correction
-        # explains the torques, or if the best one is a drift: its search started from no delay, and may have found the
-        # wrong signals.
+        # `thorough_fits` search permutations of all joints, and drifts: delays that change by tenths of a second during
+        # a recording. They take time, and are made only if no single correction explains the torques, or if the best
+        # single correction is a drift. The search for single corrections starts at a drift of zero: if the true drift
+        # is large, it may find a drift of the wrong signals.
         is_wrong = (
             better.cost < unchanged.cost - GEOMETRY.needed or unchanged.errors.mean() > GEOMETRY.unexplained
         )
@@ -91,8 +101,8 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
         fits = [*tried, unchanged]
     likely = _likely(unchanged, fits)
     if not likely:
-        # If no cost decrease is significant, faults with other evidence than the cost are considered, e.g. another
-        # torque unit.
+        # No decrease of the cost is significant. Faults with `needed` = 0, such as another torque unit, may be accepted
+        # nevertheless: the comparison of their gravity torque with the URDF's is other evidence for them.
         known = _corrected(coarse, stateful, [fault for fault in faults if not fault.needed], unchanged)
         best = min(known, key=RANK, default=unchanged)
         return (unchanged, best) if best.cost < unchanged.cost else (unchanged,)
@@ -117,7 +127,10 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     remaining, deviating = np.unique(number).tolist(), list[int]()
 
     def errors(fitted: Sequence[int]) -> dict[int, np.ndarray]:
-        """Return {recording: squared residual (n,) / torque variance} of a fit to only the recordings `fitted`."""
+        """Return {recording: (n,) mean squared residual / torque variance} for all remaining recordings.
+
+        The model is fitted only to the recordings `fitted` (indices); the residuals of the others are held out.
+        """
         counted = np.isin(number, fitted)[:, None] & np.ones(tau.shape[1], bool)
         residual = coarse.residual(unchanged, coarse.on_torques(counted).fit(unchanged).parameters)
         scale = np.maximum(tau.var(axis=0), 1e-30)
@@ -162,21 +175,25 @@ def _weighed(
 ) -> list[HypothesisFit]:
     """Return the fits with costs that take a friction model with hysteresis into account.
 
-    The friction model of `problem` lacks presliding hysteresis, which causes a residual of a few per cent of the torque
-    under every hypothesis. This residual hides a part of the cost decrease of the right hypothesis.
-
     Let a be the decrease of the cost (negative log posterior) from `base` to a hypothesis in fits without hysteresis,
-    and b the decrease in fits with hysteresis. For a right hypothesis, b is the whole decrease. For a wrong hypothesis,
-    b may also be larger than a: on recorded arms, b is up to 32 and a up to 17. A wrong hypothesis may also have a
-    large a and a small b, since it explains the friction that the model without hysteresis lacks. The decrease is
-    therefore a, limited to at least b / 2 and at most b. For a hypothesis with another delay than `base`, it is min(a,
-    b): hysteresis resembles a delay, so such a hypothesis must lower both costs.
+    and b the decrease in fits with hysteresis. The result has the decrease min(b, max(a, b / 2)).
+
+    - a can be too small for the right hypothesis: without presliding hysteresis, the friction model has an error of a
+      few per cent of the torque, which remains in the residual under every hypothesis. b has no such error.
+    - a can be too large for a wrong hypothesis, which may explain friction that the model without hysteresis lacks. b
+      is then small, and is the upper bound of the decrease.
+    - b can be too large for a wrong hypothesis: on recorded arms, wrong hypotheses have b up to 32 and a up to 17. If a
+      is smaller than b, the decrease is therefore a or b / 2, whichever is larger.
+
+    For a hypothesis with another delay than `base`, the decrease is min(a, b): hysteresis resembles a delay, so such a
+    hypothesis must lower both costs.
 
     Args:
         problem: problem without hysteresis.
         stateful: the same problem with hysteresis.
-        fits: fits of `problem`. Only the best `GEOMETRY.weighed` fits with a cost below the cost of `base` are compared
-            with hysteresis.
+        fits: fits of `problem` under hypotheses. The fits with hysteresis take time: only hypotheses with a above
+            `GEOMETRY.slight`, at most the `GEOMETRY.weighed` best, are fitted with hysteresis. The others have the
+            decrease a.
         base: fit of `problem` with which the costs are compared.
     """
     best = sorted(fits, key=RANK)
@@ -201,8 +218,10 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
     if best.cost > unchanged.cost - GEOMETRY.needed:
         return ()
     likely = sorted((fit for fit in fits if fit.cost < best.cost + GEOMETRY.ambiguous), key=RANK)
-    # Exchanged columns may also explain errors of the friction model, by less than `needed`. The opposite sense of a
-    # single joint is then listed first, since it is more frequent than exchanged columns.
+    # Exchanged columns may explain errors of the friction model, and then have a lower cost than the right hypothesis,
+    # the reversed sign of a single joint, which is the more frequent fault. The best hypothesis of one reversed joint
+    # is therefore moved to the front if its rank exceeds the rank of the exchanged columns by less than `needed`, and
+    # is below the cost of the unchanged log by more than `ambiguous`.
     if isinstance(likely[0].hypothesis.faults[0], WrongOrder):
         bound = min(likely[0].rank + GEOMETRY.needed, unchanged.cost - GEOMETRY.ambiguous)
         senses = [fit for fit in fits if fit.rank < bound and _is_one_sense(fit.hypothesis)]
@@ -211,6 +230,6 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
 
 
 def _is_one_sense(hypothesis: Hypothesis) -> bool:
-    """Return True for a hypothesis that only corrects the opposite sense of one joint."""
+    """Return True if a hypothesis only reverses the sign of the motion or torque, or of both, at a single joint."""
     is_sense = len(hypothesis.faults) == 1 and isinstance(hypothesis.faults[0], JointSense | TorqueSense)
     return is_sense and int((hypothesis.scale < 0).any(axis=0).sum()) == 1

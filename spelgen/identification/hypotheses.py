@@ -73,7 +73,9 @@ class Hypothesis:
     def signals(self, samples: MotionSamples) -> MotionSamples:
         """Return the samples corrected by this hypothesis: true signals of the joints, in SI units.
 
-        samples: logged samples. The result has signals only at the samples, and not at times before and after each
+        samples: logged samples, with signals at E times around each sample if delays are tested. Delayed signals are
+        interpolated between these times. The result has signals only at the time of each sample: its `values` are (S,
+        n, 4, 1).
         sample: the last axis of `values` has the length 1.
         """
         delays = _per_signal(self.delay)
@@ -232,8 +234,8 @@ class Fault(ABC):
     def joints(self, correction: Correction) -> list[str]:
         """Return the names of the joints with the fault, for a message.
 
-        A joint has the fault if `joint_keys` returns settings for it. If it returns none for any joint, the names of
-        all joints are returned.
+        A joint has the fault if `joint_keys` returns settings that correct it. If no joint has such settings, the names
+        of all joints are returned. correction: hypothesis with this fault.
         """
         names = correction.arm.joint_names
         return [x for k, x in enumerate(names) if self.joint_keys(correction, k)] or list(names)

@@ -149,7 +149,11 @@ class Identification:
         }
 
     def text(self) -> str:
-        """Return the identified parameters, the residual and their quality as text for a terminal of 80 columns."""
+        """Return the identification as text for a terminal of 80 columns.
+
+        The text has the condition number, the torque residual of each joint, and the base parameters with 95 %
+        intervals.
+        """
         residuals, parameters = self.listings()
         definitions = ["where"]
         for name, formula in zip(self.base.names, self.base.formulas(), strict=True):
@@ -182,7 +186,11 @@ class Identification:
         return "".join(listing.html() for listing in self.listings())
 
     def heading(self) -> str:
-        """Return a sentence about the identification: numbers of parameters and samples, and weights of the joints."""
+        """Return a sentence about the identification: numbers of parameters and samples, and weighting of the joints.
+
+        In the least-squares fit, the torque residuals of all joints have equal weights, or are divided by the range or
+        by the noise of the joint's torque.
+        """
         drives = len(self.base) - self.base.bodies
         weighted = _WEIGHTED[self.method.weights]
         return (

@@ -137,11 +137,11 @@ class _Equations:
             self._regressors = list(map(self._regressor, self._blocks))
 
     def _regressor(self, block: DynamicsSamples) -> np.ndarray:
-        """Return the regressor (T, n, 10 bodies) of the inertial parameters for a block of samples."""
+        """Return the regressor (T, n, 10 B) of the inertial parameters of B bodies, for a block of T samples."""
         return regressor(self.arm, block.q, block.qd, block.qdd)
 
     def _rows(self, friction: FrictionModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield the regressor (T, n, K) and the joint torques (T, n) [Nm, N] of each block of samples."""
+        """Yield the regressor (T, n, K) of K parameters and the torques (T, n) [Nm, N] of each block of T samples."""
         reach = reach_of(self.arm.joint_types).values
         regressors = self._regressors or map(self._regressor, self._blocks)
         for block, bodies in zip(self._blocks, regressors, strict=True):
@@ -168,9 +168,10 @@ class _Equations:
         return products
 
     def solved(self, method: LeastSquares) -> Identification:
-        """Return the identification with the friction model and the weights of `method`, by weighted least squares.
+        """Return base parameters of bodies, friction and drives, fitted to the torques by weighted least squares.
 
-        Raises LogError if there are no samples.
+        method: friction model, and the weights of the joints' torque residuals: equal, or 1 / range or 1 / noise of the
+        torque. Raises LogError if there are no samples.
         """
         if not self._blocks:
             raise LogError("no samples to identify from", expected=NEEDED)
@@ -178,8 +179,8 @@ class _Equations:
         products = self._products(method.friction, len(base.parameters))
         torques = np.concatenate([block.tau for block in self._blocks])
         deviation = torques.std(axis=0)
-        # The range of a torque is bounded from below, since a joint with a constant torque would have an infinite
-        # weight.
+        # The standard deviation of a torque, by which it is weighted, has a lower bound: a joint with a constant torque
+        # would have an infinite weight otherwise.
         torque_range = np.maximum(deviation, 1e-3 * deviation.max())
         weights = np.ones_like(torque_range) if method.weights == "equal" else 1.0 / torque_range
         # with the weights "noise", each iteration weights the joints by their residuals in the previous fit

@@ -113,10 +113,11 @@ def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> t
     """Return the steps of a block jackknife, and the covariance of a MAP estimate of k parameters.
 
     The first value (B, k) has, for each of the B blocks, the Newton step from the estimate to the estimate without this
-    block. The second value (k, k) is the covariance V + S^-1 P S^-1, with the jackknife covariance V of these steps,
-    the Hessian S of all blocks and the prior, and the precision P of the prior: the second term is for the prior, which
-    no block contains. Errors of samples may be correlated within blocks, and their variance may differ between blocks
-    (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
+    block. The second value (k, k) is the covariance V + S^-1 P S^-1, where V is the jackknife covariance of these
+    steps, S is the Hessian of all blocks and the prior, and P is the precision of the prior. V is the error due to the
+    blocks. The second term is the error due to the prior: an error e of the prior mean, with covariance P^-1, shifts
+    the estimate by S^-1 P e. Errors of samples may be correlated within blocks, and their variance may differ between
+    blocks (Cameron and Miller, J. Human Resources 50:317, 2015, CV3).
 
     Args:
         curvature: (B, k, k) Gauss-Newton Hessian of each block.
@@ -139,8 +140,8 @@ def larger_covariance(covariance: Tensor, lower_bound: Tensor) -> Tensor:
     """
     # the matrix `lower_bound` is scaled to a unit diagonal, since parameters have different units
     scale = lower_bound.diagonal().sqrt()
-    # The eigenvalues of the scaled `lower_bound` are clamped, since it is inverted: for samples without noise it is
-    # singular except for rounding errors.
+    # The inverse of `lower_bound`, a covariance, is needed. Without noise in the samples, `lower_bound` is singular
+    # except for rounding errors. The eigenvalues of the scaled matrix are therefore clamped.
     variances, axes = torch.linalg.eigh(lower_bound / scale.outer(scale))
     deviations = variances.clamp(min=1e-12).sqrt()
     root, inverse = scale.unsqueeze(-1) * axes * deviations, (axes / deviations / scale.unsqueeze(-1)).mT

@@ -1,6 +1,7 @@
 """Changes between and within recordings: another load, and torques that have another scale or zero from a time on.
 
-One model of recordings with different loads, or of torques before and after a change, is wrong for all of them.
+A single model that is fitted to recordings with different loads, or to torques before and after a change, is wrong for
+all of them.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from spelgen.identification.tuning import GEOMETRY
 TOGETHER = 20
 """Number of recordings that are compared at a time. It bounds the number of columns of the least-squares problem."""
 SAMPLES = 1200
-"""Largest number of samples of these recordings."""
+"""Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
 Candidate = tuple[float, int, float, int | None]
@@ -56,7 +57,9 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     known = numbers[counts >= FEWEST].tolist()
     for first in range(1, len(known), TOGETHER):
         for change in _changes(problem, [known[0], *known[first : first + TOGETHER]]):
-            # The first recording is part of every group of recordings; of its several changes, the first is returned.
+            # known[0], the first recording, is compared with every group of at most `TOGETHER` other recordings. A
+            # change of its own load may therefore be found in several groups; only the change of the first group is
+            # kept.
             changes.setdefault(change.recording, change)
     return list(changes.values())
 
@@ -102,7 +105,7 @@ class TorqueChange(NamedTuple):
         recording: index of the recording.
         time: time of the change since the start of the recording [s].
         joint: index of the joint, or None for a change of the torques of all joints.
-        factor: ratio of the torques after the change to the torques before it.
+        factor: ratio of the torques after the change to the torques before it; 1 if the zero changes.
         offset: torque that is added after the change [Nm, N]; 0 if the scale changes.
     """
 
@@ -116,10 +119,11 @@ class TorqueChange(NamedTuple):
 def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
 
-    The changes are: another factor on the torque of one joint or, in common, of all joints, and another offset of the
-    torque of one joint. A change must lower the negative log likelihood by `GEOMETRY.needed` more than another load,
-    and more than other friction of the joints together with offsets that drift: a load that the arm picks up, friction
-    that falls as the drives warm up, and drifting sensors are no changes of the torques' unit.
+    A change is another factor on the torque of one joint, a common factor on the torques of all joints, or another
+    offset of the torque of one joint, from a time on. Two other hypotheses are fitted: another load from this time on
+    (the arm picks it up), and other friction from this time on together with offsets that drift (warm drives, drifting
+    sensors). A change is returned only if its negative log likelihood is lower by `GEOMETRY.needed` than without a
+    change and than under both other hypotheses.
     """
     subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
     fit = subset.fit(subset.unchanged)
@@ -131,7 +135,8 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
         times = subset.samples.times[rows]
         if len(times) < 4 * FEWEST or not times.any():
             continue
-        # A time is tested after each twentieth of the samples.
+        # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
+        # enough samples before and after each time.
         splits = len(times) * np.arange(2, 19) // 20
         falls = (
             _falls((residual + tau)[rows], residual[rows], splits)
@@ -155,10 +160,12 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
 
 
 def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
-    """Return decreases (C, n) of squared residuals by separate factors and offsets of torques before and after times.
+    """Return the decrease of the squared residual if torques may change their factor and offset at a time, (C, n).
 
-    torque, residual: torques of the model and their residuals, (S, n) [Nm, N]. splits: (C,) numbers of samples before
-    each time.
+    Each joint's residual is regressed on the model's torque and on 1 (factor and offset), once on all samples, and once
+    separately on the samples before and after each of C times. The result is the difference of both squared residuals
+    [Nm^2, N^2]. torque, residual: torques of the model and their residuals, (S, n) [Nm, N]. splits: (C,) numbers of
+    samples before each time.
     """
     ones = np.ones_like(torque)
     products = [torque * torque, torque, ones, torque * residual, residual]
@@ -166,7 +173,11 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
     total = np.sum(products, axis=1)[:, None]
 
     def explained(sums: np.ndarray) -> np.ndarray:
-        """Return the squares that a factor and an offset explain, from sums of products (5, C, n)."""
+        """Return the decrease of the sum of squared residuals by a regression on the torque and on 1, (C, n).
+
+        sums: (5, C, n), sums over the samples before or after each of C times. The five summands are torque^2, torque,
+        1, torque * residual and residual.
+        """
         squares, torques, count, products, residuals = sums
         slope = products - torques * residuals / count
         return np.asarray(
@@ -184,9 +195,12 @@ def _change(
     time: float,
     joint: int | None,
 ) -> tuple[float, TorqueChange]:
-    """Return the fall of the cost, compared with a load or other friction, by a change of torques, and this change.
+    """Return the evidence for a change of the logged torques from `time` on, and the change: another factor or offset.
 
-    torque: torques of the model of `fit`, (S, n) [Nm, N]. recording, time, joint: see `TorqueChange`.
+    Two other hypotheses are another load, or other friction with drifting offsets, from `time` on. The evidence is the
+    negative log likelihood of the better of these two minus the negative log likelihood of the change; 0 if the change
+    does not explain the torques. fit: fit of `problem` without a change. torque: torques of the model of `fit`, (S, n)
+    [Nm, N]. recording, time, joint: see `TorqueChange`.
     """
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
@@ -199,11 +213,16 @@ def _change(
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
-    quantity = float(best.quantities[0, 0])
-    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    factor, offset = 1.0, float(best.quantities[0, 0])
+    if best is refits[0]:
+        # `torque` was fitted to the samples before and after the change together. The parameters that were refitted
+        # with the change give the torque before it.
+        scaled, unchanged = columns[0][..., 0], rows @ best.parameters
+        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * unchanged).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
-    # Other faults of the log cause a large residual.
-    if fit.misfit - best.misfit <= GEOMETRY.needed or best.errors.mean() > GEOMETRY.explained:
+    # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
+    remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
+    if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained:
         return 0.0, change
     drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
@@ -213,10 +232,13 @@ def _change(
 
 
 class _Refit(NamedTuple):
-    """Fit of torques with D additional quantities of each of R parts of the samples, such as recordings.
+    """Fit of torques with D additional quantities per part of the samples, for example one load per recording.
+
+    There are R parts. Examples of quantities are the mass and the first moment of a load, or a torque offset.
 
     Attributes:
         misfit: negative log likelihood.
+        parameters: (K,) parameters of the arm.
         errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
         residual: torques of the model minus the logged torques, (S, n) [Nm, N].
         quantities: (R, D) quantities of the parts.
@@ -224,6 +246,7 @@ class _Refit(NamedTuple):
     """
 
     misfit: float
+    parameters: np.ndarray
     errors: np.ndarray
     residual: np.ndarray
     quantities: np.ndarray
@@ -233,18 +256,20 @@ class _Refit(NamedTuple):
 def _refit(
     problem: GeometryProblem, fit: HypothesisFit, columns: np.ndarray, parts: Sequence[np.ndarray]
 ) -> _Refit:
-    """Return the fit of the torques with additional quantities of each of R parts of the samples.
+    """Return the fit of the torques with D additional quantities per part of the samples (see `_Refit`).
 
     Args:
-        problem: problem with the samples.
-        fit: its fit without additional quantities.
-        columns: (S, n, D) derivative of the torques with respect to the quantities of the sample's part.
-        parts: masks (S,) of the samples of the parts.
+        problem: problem with the S samples.
+        fit: fit of `problem` without additional quantities.
+        columns: (S, n, D) derivatives of the torques with respect to the quantities of the sample's part. Examples:
+            regressor columns of the last body for a load, identity matrices for torque offsets.
+        parts: mask (S,) of each part.
     """
     count, size = len(fit.parameters), columns.shape[2]
     joined = np.concatenate([columns * part[:, None, None] for part in parts], axis=2)
     variance = np.maximum(problem.unchanged.signals(problem.samples).tau.var(axis=0), 1e-30)
-    # The weights of the joints depend on the residual, which the quantities reduce, so the fit is repeated.
+    # The weight of a joint depends on its torque residual, which is smaller after the fit of the D additional
+    # quantities, such as loads or torque offsets. The fit is therefore repeated with the new weights.
     for _ in range(3):
         change, covariance = problem.estimate(fit, joined)
         parameters = fit.parameters + change[:count]
@@ -253,4 +278,4 @@ def _refit(
         fit = replace(fit, errors=errors, parameters=parameters)
     shape = len(parts), size
     added = covariance[count:, count:].reshape(*shape, *shape)
-    return _Refit(problem.misfit(errors), errors, residual, change[count:].reshape(shape), added)
+    return _Refit(problem.misfit(errors), parameters, errors, residual, change[count:].reshape(shape), added)

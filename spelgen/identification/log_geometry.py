@@ -85,7 +85,8 @@ class GeometryProblem:
 
         The other torques and their regressor rows become zero.
 
-        counted: mask (S, n), True for the torques that are fitted, per sample and per joint of the uncorrected log.
+        counted: mask (S, n), True for the torques that are fitted, per sample and per joint of the arm. Hypotheses that
+        exchange the columns of joints do not permute the mask.
         """
         fewer = copy(self)
         fewer._equations, fewer._counted = {}, counted[..., None]
@@ -150,7 +151,11 @@ class GeometryProblem:
         return np.asarray(np.sqrt(np.einsum("snk,kl,snl->sn", rows, fit.covariance, rows, optimize=True)))
 
     def drive_parameters(self, fit: HypothesisFit) -> np.ndarray:
-        """Return the friction parameters and rotor inertias of a fit, (effects, n), in the order of `FRICTION`."""
+        """Return the rotor inertias and friction parameters of the n drives from a fit, (effects, n).
+
+        The rows are in the order of `FRICTION.effects`: rotor inertia [kg m^2, kg], viscous friction [Nm s/rad, N s/m],
+        Coulomb friction [Nm, N], and so on.
+        """
         return fit.parameters[self._bodies :].reshape(-1, len(self.speeds))
 
     def residual(self, hypothesis: Hypothesis, parameters: np.ndarray) -> np.ndarray:
@@ -206,8 +211,9 @@ class GeometryProblem:
         # is used.
         for iteration in range(14 if self._has_free_gains else 6):
             if self._has_free_gains and iteration < 6:
-                # Gain of a joint: coefficient of a regression of the model's torque on the logged torque. It is kept
-                # positive, even if both torques are not correlated.
+                # The gain of a joint multiplies its logged torque. It is the inverse of the coefficient in a regression
+                # of the logged torque on the model's torque. The correlation is bounded from below, so that the gain is
+                # positive and finite even if both torques are not correlated.
                 load = np.maximum((normal @ x) @ x, 1e-9 * total)
                 correlation = right @ x / np.sqrt(load * total)
                 gains = np.sqrt(load / total) / np.maximum(correlation, 0.3)
@@ -237,7 +243,10 @@ class GeometryProblem:
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
     def misfit(self, errors: np.ndarray) -> float:
-        """Return the negative log likelihood for relative squared residuals `errors` (n,) of the joints."""
+        """Return the negative log likelihood of the torques, up to a constant.
+
+        errors: (n,) mean squared residual of each joint's torque, divided by the variance of the torque.
+        """
         return 0.5 * self.count * float(np.log(errors + GEOMETRY.error_floor).sum())
 
     def step(self, fit: HypothesisFit, columns: np.ndarray) -> np.ndarray:
@@ -249,14 +258,20 @@ class GeometryProblem:
         return solution(*self._linearized(fit, columns))[len(fit.parameters) :]
 
     def estimate(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Gauss-Newton step (K + D,) of K parameters and D quantities (see `step`), and its covariance."""
+        """Return the Gauss-Newton step (K + D,) of K parameters and D quantities, and its covariance (K + D, K + D).
+
+        The quantities belong to a hypothesis, for example delays or loads. columns: (S, n, D) derivative of the torque
+        residual with respect to the quantities.
+        """
         matrix, vector = self._linearized(fit, columns)
         return solution(matrix, vector), inverse(matrix)
 
     def _linearized(self, fit: HypothesisFit, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the matrix (K + D, K + D) and vector (K + D,) of the normal equations of `estimate`.
 
-        columns: (S, n, D) derivative of the torque residual with respect to the D quantities.
+        The unknowns are steps of K parameters of the arm and of D quantities of a hypothesis, such as delays. The
+        torque residual is linearized at `fit`. columns: (S, n, D) derivative of the residual at S samples with respect
+        to the quantities.
         """
         rows, _ = self.equations(fit.hypothesis)
         tau, count = fit.hypothesis.signals(self.samples).tau, len(fit.parameters)
@@ -369,21 +384,25 @@ def _joint_step(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters (K,) and gains (n,) after a Gauss-Newton step of both.
 
-    The torque residual of joint k is tau_k - h_k Y_k x, with the logged torque tau_k and the inverse gain h_k. Its
-    derivatives with respect to x and to h_k are -h_k Y_k and -Y_k x.
+    The cost is the sum over joints of s_k |tau_k - h_k Y_k x|^2 / 2, plus the prior of x, with the logged torque tau_k,
+    the regressor Y_k, the weight s_k of the squared residual, and h_k = 1 / gain. The derivatives of the residual with
+    respect to x and to h_k are -h_k Y_k and -Y_k x. The step changes log h_k by at least -0.7 and at most 1.
 
     Args:
         matrix: (K, K) Hessian of the cost with respect to x.
         vector: (K,) right-hand side of the normal equations for x.
-        weights: (n,) weights of the squared residuals, divided by the gains.
-        gains: (n,) current gains.
+        weights: (n,) s_k h_k.
+        gains: (n,) current gains 1 / h_k.
         products: (n, K) Y_k^T Y_k x.
         agreement: (n,) tau_k^T Y_k x.
         x: (K,) current parameters.
     """
     count, coupling = len(x), weights[:, None] * products
     scale = weights * gains
-    # The factor 1 + 1e-6 is a ridge: it keeps the gain of a joint without load, which is confounded with friction.
+    # `power` is the second derivative of the cost with respect to h_k, s_k |Y_k x|^2. Without a gravity or inertial
+    # load, a joint's gain 1 / h_k is confounded with its friction: only friction / gain is determined, and the Hessian
+    # is singular. The factor 1 + 1e-6 adds a small ridge on the change of h_k, with which such a gain remains at its
+    # current value.
     power = scale * (products @ x) * (1 + 1e-6) + 1e-30
     whole = np.block([[matrix, coupling.T], [coupling, np.diag(power)]])
     step = solution(whole, np.append(vector, scale * agreement))
@@ -416,16 +435,19 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
     """Return a root R (10, 10) of the prior covariance R R^T of the inertial parameters (m, m c, I) of a body.
 
     The columns of R are the derivatives of the inertial parameters with respect to the mass (at a fixed shape), the
-    centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation.
+    centre of mass, and the inertia tensor about the centre of mass, each times a standard deviation. The standard
+    deviations are half of the mass, half of the extent of the body, and half of mass * (radius of gyration)^2.
 
     Args:
         own: (10,) inertial parameters of the body in the URDF.
-        length: largest distance from the body's origin to a joint that the body carries [m].
+        length: largest distance from the body's origin to a joint that the body carries [m], from which the extent of
+            the body is estimated.
         typical: mass assumed for a body without <inertial> [kg].
     """
     if own[0] <= 0:
-        # without <inertial> the prior is wide: standard deviations of 20 m, 20 m L and 20 m L^2, with the typical mass
-        # m and the distance L to the body's farthest joint, at least 0.5 m
+        # without <inertial> the prior is wide: with the typical mass M [kg] and the distance L to the body's farthest
+        # joint (at least 0.5 metres), the standard deviations are 20 M of the mass, 20 M L of the first moments, and 20
+        # M L^2 of the moments of inertia
         extent = max(length, 0.5)
         return 20.0 * typical * np.diag(np.repeat([1.0, extent, extent**2], (1, 3, 6)))
     mass = own[0]
@@ -442,8 +464,9 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
         root[1:4, 1 + axis] = mass * extent * unit
         root[4:, 1 + axis] = mass * extent * tensor[np.triu_indices(3)]
     root[4:, 4:] = mass * radius**2 * np.eye(6)
-    # The standard deviations of the prior are half of these values: of the mass, of the body's extent (for the centre
-    # of mass), and of mass times squared radius of gyration (for the inertia tensor).
+    # The factor 0.5 makes each column of the root one standard deviation of the prior: half of the mass (column 0),
+    # half of `extent`, the size of the body, for each coordinate of the centre of mass (columns 1 to 3), and half of
+    # mass * (radius of gyration)^2 for each entry of the inertia tensor (columns 4 to 9).
     return 0.5 * root
 
 

@@ -40,8 +40,9 @@ class MotionSamples(NamedTuple):
         values: (S, n, 4, E) q [rad, m], qd, qdd (per s, per s^2) and tau [Nm, N] at the E times `OFFSETS` relative to
             each sample. Before the start and after the end of a recording, the first and last values continue. E = 1 if
             a sample has only the signals at its own time, which suffice if no delays are tested.
-        bent: (S, n, K) deflections of K bristles per joint, divided by the break-away displacements, computed from
-            positions that were converted by the mapping of the log; K = 0 for samples without a history of motion.
+        bent: (S, n, K) deflections of K bristles per joint, divided by the break-away displacements. They are computed
+            from positions with the units, signs and zeros of the current mapping of the log. K = 0 for samples without
+            a history of motion.
         direction: (S, n) direction of dry friction, see `DynamicsSamples`.
         times: (S,) times of the samples since the start of their recording [s]; unused and 0 for E = 1.
         recording: (S,) index of the recording of each sample, in the order in which recordings were added.
@@ -57,9 +58,10 @@ class MotionSamples(NamedTuple):
     def of(
         cls, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray, tau: np.ndarray, recording: int = 0
     ) -> MotionSamples:
-        """Return samples with E = 1, for tests without delays; q, qd, qdd, tau: signals (S, n) at the samples.
+        """Return samples without signals before and after each sample (E = 1, see the class), for tests without delays.
 
-        recording: index of the recording that contains the samples.
+        q, qd, qdd, tau: signals at the samples, (S, n) [rad, m], per s, per s^2, and [Nm, N]. recording: index of the
+        recording that contains the samples.
         """
         values = np.stack([q, qd, qdd, tau], axis=2)[..., None]
         numbers = np.full(len(q), recording)
@@ -83,9 +85,10 @@ class MotionSamples(NamedTuple):
     def at(self, delays: np.ndarray) -> np.ndarray:
         """Return q, qd, qdd and tau (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
-        `delays` of shape (n, 4) are the same for all samples, up to `longest_delay` in magnitude: signals are
-        interpolated from the values of the same sample. `delays` of shape (S, n, 4) may be of any magnitude: signals
-        are interpolated from the values of the sample nearest to the delayed time.
+        A sample has the signals at E times around it (`values`), up to `longest_delay` before and after it. `delays` of
+        shape (n, 4) are common to all samples and at most `longest_delay` in magnitude: a signal is interpolated
+        between the E values of its sample. `delays` of shape (S, n, 4) may be of any magnitude: a signal is
+        interpolated between the E values of the sample nearest to the delayed time.
         """
         if not delays.any():
             return self.central
@@ -103,7 +106,10 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest delay [s], earlier or later, for which `values` of a sample contain the signals; 0 for E = 1."""
+        """Largest time [s] before or after a sample for which `values` contains signals: the last of `OFFSETS`.
+
+        It is 0 if `values` contains only the signals at the time of the sample itself (E = 1).
+        """
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
     def part(self, rows: slice | np.ndarray) -> MotionSamples:
@@ -137,18 +143,21 @@ def interpolation() -> CubicSpline:
 class DriveLog:
     """Collector of a bounded number of samples from successive trajectories, for the detection of delays and couplings.
 
-    Whenever the collector has more than twice `DriveHintTuning.samples` samples, every second one is removed. If there
-    are many trajectories, only every second, fourth, ... trajectory is used, since filtering all of a long log takes
-    minutes.
+    If the collector has more than twice `DriveHintTuning.samples` samples, half of them are removed: every second
+    trajectory if it has more than `DriveHintTuning.trajectories` trajectories, otherwise every second sample. With each
+    removal of trajectories, the stride of added trajectories doubles, so that only every second, fourth, ... trajectory
+    is filtered and added: to filter all trajectories of a long log takes minutes.
     """
 
     def __init__(self, joint_types: Sequence[str], drives: Drives, preprocessing: Preprocessing) -> None:
-        """Create a collector of samples of the arm's motion and torques, without samples.
+        """Create an empty collector of samples of the motion and torques of an arm with n joints.
 
         Args:
             joint_types: "revolute" or "prismatic" for each of the n joints.
-            drives: input matrix, and matrix from joint speeds to motor speeds.
-            preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
+            drives: input matrix, which converts logged to joint torques, and matrix from joint speeds to motor speeds,
+                which converts break-away displacements of the friction of motors.
+            preprocessing: filter, and shortest gap [s] at which recordings are split. Its torque delay is ignored,
+                since the samples are used to estimate the delay.
         """
         self._inputs, self._preprocessing = drives.inputs, replace(preprocessing, torque_delay=0.0)
         smoothing = np.full(len(joint_types), FrictionModel().coulomb_smoothing_velocity)

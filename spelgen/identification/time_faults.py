@@ -30,13 +30,14 @@ class Delay(Fault):
     rarity = 2
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits of the log's torques, each with one set of delayed signals (`_delayed_signals`).
+        """Yield least-squares fits of the log's torques, each with a common delay of a set of signals.
 
-        Each fit has the best delay of its signals. Delays below `GEOMETRY.min_delay` are omitted: friction causes such
-        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if the samples
-        lack the earlier and later signals from which delayed signals are interpolated.
+        The sets (`_delayed_signals`) are the torques of all joints, and the motion, the torque or both of one joint.
+        Each fit has the best delay of its set. Delays below `GEOMETRY.min_delay` are omitted: friction causes such
+        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if samples have
+        signals only at their own times, between which delayed signals cannot be interpolated.
         """
-        reading, longest = base.hypothesis, problem.samples.longest_delay
+        reading, longest, reference = base.hypothesis, problem.samples.longest_delay, base
         if not longest or reading.delay.any():
             return
         for signals in _delayed_signals(len(reading.offset)):
@@ -51,13 +52,16 @@ class Delay(Fault):
             # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
             # torques, whose derivative with respect to time is mostly noise.
             starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
-            delay, _ = problem.descend(
+            delay, best = problem.descend(
                 delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
                 allowed=lambda x: np.clip(x, -longest, longest),
             )  # fmt: skip
             if abs(delay[0]) >= GEOMETRY.min_delay:
                 fit = problem.fit(delayed(delay.round(3)))
-                yield from [fit] if _explains_more(problem, base, fit) else []
+                yield from [fit] if _explains_more(problem, reference, fit) else []
+            elif signals[1].all() and best.cost < base.cost:
+                # The delay of one joint must explain more than a short delay of all torques, which is not reported.
+                reference = best
 
     def text(self, correction: Correction) -> str:
         """Return the text about delayed signals: which signals of the joints, and the longest delay."""
@@ -67,7 +71,11 @@ class Delay(Fault):
         return f"{_late_signals(delay)} logged {abs(longest):.3g} ms {order}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `delay` of a joint's delayed signals; {} without delay, or if `log_keys` corrects it."""
+        """Return the setting `delay` of a joint, {quantity: delay [s]} for its delayed signals; {} without a delay.
+
+        {} is also returned if the torques of all joints have the same delay, which `log_keys` corrects for the whole
+        log.
+        """
         mapping, delays = correction.mapping, correction.hypothesis.delay[:, joint]
         if self.log_keys(correction) or not delays.any():
             return {}
@@ -98,13 +106,14 @@ class JointClock(Fault):
     advice = "no setting corrects it: log all joints with one clock"
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterable[HypothesisFit]:
-        """Return the least-squares fit of the torques with a delay that changes linearly with time.
+        """Return the best fit in which the delay of a set of signals changes linearly during a recording, or no fit.
 
-        If the hypothesis of `base` has a delay, the search starts from this delay, without a change. Otherwise each set
-        of `_delayed_signals` gives an initial guess: the delays at the start and at the end of a recording after one
-        Gauss-Newton step from zero. The derivatives of the residual with respect to these two delays are (1 - t) d and
-        t d, with the relative time t from 0 to 1 and the derivative d with respect to a constant delay. [] is returned
-        if the delay of `base` already changes.
+        If the hypothesis of `base` has a delay, the search starts from this delay at both the start and the end of a
+        recording. Otherwise there is one initial guess per set of signals, such as the torque of one joint
+        (`_delayed_signals`): the delays at the start and at the end after one Gauss-Newton step from zero. The
+        derivatives of the residual with respect to these two delays are (1 - t) d and t d, with the relative time t
+        from 0 to 1 and the derivative d with respect to a constant delay of the set. There is no fit if the delay of
+        `base` already changes.
         """
         reading = base.hypothesis
         if reading.drift.any() or not problem.samples.longest_delay:
@@ -146,20 +155,26 @@ class JointClock(Fault):
         limit: float,
         count: int = 1,
     ) -> Iterator[HypothesisFit]:
-        """Yield least-squares fits in which some signals have the best delays at the start and end of a recording.
+        """Yield least-squares fits in which a set of signals has the best delays at the start and end of a recording.
 
-        Between start and end the delay changes linearly. A fit is omitted if both delays are about equal, or if the
-        torque residual hardly falls.
+        Between start and end the delay changes linearly. A fit is omitted if both delays are about equal, if the change
+        is larger than the error of a clock (`GEOMETRY.clock_error`), or if the fit lowers the torque residual too
+        little: in the mean of the joints (`GEOMETRY.lower`), or at each joint (`_explains_more`).
 
         Args:
             problem: least-squares problem of the log.
             reading: hypothesis without these delays.
-            starts: initial delays (2,) [s] at the start and the end, and masks (2, n) of the delayed motions and
-                torques. Only the `count` starts of lowest cost, below `limit`, are refined.
+            starts: initial guesses: delays (2,) [s] at the start and at the end, and a mask (2, n) of the signals that
+                are delayed (first row: motion, second row: torques of n joints).
+            limit: only initial guesses with a cost below this limit are refined.
+            count: only this number of initial guesses, with the lowest costs, are refined.
         """
 
         def drifting(delays: np.ndarray, signals: np.ndarray) -> Hypothesis:
-            """Return the hypothesis in which the delay of some signals changes linearly during a recording."""
+            """Return the hypothesis in which the delay of some signals changes linearly during a recording.
+
+            delays: (2,) [s], at the start and at the end. signals: mask (2, n), motions and torques.
+            """
             first, last = delays
             drift = (last - first) / float(problem.samples.times.max())
             return reading.changed(self, delay=first * signals, drift=drift * signals)
@@ -187,7 +202,7 @@ class JointClock(Fault):
         return f"{_late_signals(drift)} of a clock that runs {abs(largest):.2%} {'fast' if largest > 0 else 'slow'}"
 
     def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints with signals whose times, by `correction`, are from a clock of their own."""
+        """Return the names of the joints that have a signal with another clock according to `correction`."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
 
@@ -216,7 +231,11 @@ def _delayed_signals(n: int) -> list[np.ndarray]:
 
 
 def _late_signals(delay: np.ndarray) -> str:
-    """Return words for the delayed signals, such as "torques". delay: (2, n) of motions and torques."""
+    """Return words for the signals with a delay, such as "torques".
+
+    delay: (2, n), delays of the motions (first row) and torques [s], or their drifts [1]; 0 for signals without a
+    delay.
+    """
     names = {
         (0, 1): "torques",
         (1, 0): "positions and velocities",

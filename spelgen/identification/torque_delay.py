@@ -29,8 +29,9 @@ class TorqueDelay:
     Attributes:
         delay: delay [s], positive if torques are logged later than positions; 0 if no delay is significant.
         interval: half the width of the delay's 99 % interval [s].
-        coupling: coupling of motors, and the squared torque residual with it divided by the residual without it, see
-            `find_coupling`. If a coupling is found, no delay is estimated, since the estimate would be biased.
+        coupling: (coupling, ratio) if two motors are coupled, otherwise None. The ratio is the squared torque residual
+            with the coupling divided by the squared residual without it (`find_coupling`). If a coupling is found, no
+            delay is estimated, since the estimate would be biased.
     """
 
     delay: float = 0.0
@@ -81,7 +82,8 @@ def find_torque_delay(
         joint_types: "revolute" or "prismatic" for each joint.
         drives: input matrix, and matrix from joint speeds to motor speeds.
         chain: chain of the arm's bodies.
-        preprocessing: filter, and shortest gap [s] at which recordings are split; its torque delay is ignored.
+        preprocessing: filter, and shortest gap [s] at which recordings are split. Its torque delay is ignored, since
+            the delay is estimated here.
     """
     collected = DriveLog(joint_types, drives, preprocessing)
     for log in logs[:: -(-len(logs) // HINTS.trajectories)]:
@@ -91,10 +93,11 @@ def find_torque_delay(
 
 
 def delay_of(problem: DriveProblem) -> TorqueDelay:
-    """Return the delay of the torques in a `DriveProblem`; if motors are coupled, only `coupling` of the result is set.
+    """Return the delay of the torques in the samples of `problem`, or only a coupling of motors, if one is detected.
 
-    Both are detected by the decrease of the least-squares torque residual. A coupling is searched after the torques
-    are shifted by the delay.
+    A delay and a coupling are both detected by a decrease of the least-squares torque residual. The delay is estimated
+    first. Then the torques are shifted by the delay, and a coupling is searched. If a coupling is found, the delay is
+    discarded.
     """
     late, samples = _likely_delay(problem), problem.samples
     if late.delay:
@@ -122,12 +125,13 @@ def _likely_delay(problem: DriveProblem) -> TorqueDelay:
     for dry in (samples.bent, samples.direction[..., None]):
         friction = FRICTION.columns(qd, qdd, dry, problem.speeds)
         estimates.append(_estimate(np.concatenate([problem.bodies, friction, tau], axis=2)))
-    # The delay must be significant without a friction state: errors of this model do not lag behind the motion, and do
-    # not resemble a delay. A friction state depends on past motion: its errors lag behind the motion, and do resemble a
-    # delay.
+    # The delay must be significant for the model without a friction state: its friction depends only on the current
+    # motion, so its errors do not lag behind the motion, and do not resemble a delay. In the model with a friction
+    # state, friction depends on past motion: errors of this model lag behind the motion, and resemble a delay.
     memory, direct = estimates
     likely = [direct]
-    # on recorded arms the squared residual with a friction state is 0.3 to 0.8 times the squared residual without
+    # On recorded arms, the squared residual with a friction state is 0.3 to 0.8 times the squared residual without. A
+    # factor above 2 shows that the state does not describe the friction, and the model with the state is ignored.
     if memory.squares <= 2.0 * direct.squares:
         likely.append(memory)
     best = min(likely, key=lambda x: x.squares)

@@ -84,18 +84,21 @@ class LogGeometryTuning:
     # [1] A recording has a fault of its own if its squared torque residual is larger than this multiple of the squared
     # residual of the other recordings, to which the model is fitted.
     deviation: float = 5.0
-    # [1] A hypothesis does not explain the torques if the relative residual variance is above this value, at a joint
-    # and in the mean of the joints that the hypothesis affects. With the right correction, logs of recorded arms have
-    # at most 0.07 in the mean of all joints, although up to 0.27 at a joint whose torque is mostly friction.
+    # [1] A hypothesis does not explain the torques if the relative residual variance (residual variance / variance of
+    # the torque) is above this value at a joint, and also in a weighted mean of the joints. The weight of a joint is
+    # the change of its relative residual variance by the hypothesis: joints that the hypothesis does not affect do not
+    # count. With the right correction, logs of recorded arms have at most 0.07 in the mean of all joints, although up
+    # to 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
-    # [1] If the relative residual variance of the unchanged log is above this value, its torques are probably no joint
-    # torques.
+    # [1] If the rigid-body and friction model is fitted to the log without corrections, and the residual variance /
+    # variance of the torque is above this value in the mean of the joints or at a loaded joint, the logged columns are
+    # probably no joint torques.
     no_torque: float = 0.6
     # [1] Standard deviation of the mass of a tool or load that the URDF does not contain, divided by the median mass of
     # the arm's links.
     load: float = 0.5
-    # [m] Standard deviation of the distance of the centre of mass of such a tool or load from the origin of the last
-    # body.
+    # [m] Standard deviation of the distance between the centre of mass of a tool or load that the URDF does not contain
+    # and the origin of the last body.
     load_distance: float = 0.15
     # [1] Largest number of samples for the comparison of all hypotheses.
     coarse_samples: int = 200
@@ -105,11 +108,12 @@ class LogGeometryTuning:
     min_angle: float = 0.09
     # [rad] Tilts of the base below this bound are errors of the mounting and are not reported.
     min_tilt: float = 0.06
-    # [m] Zero offsets of prismatic joints below this bound are calibration errors and are not reported.
+    # [m, rad] Zero offsets of prismatic joints below this bound are calibration errors and are not reported. It is also
+    # the accuracy, in rad, of large zero offsets of revolute joints.
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are not reported: friction causes an apparent delay of up to 30 ms.
     min_delay: float = 0.03
-    # [s] Delay, late or early, from which the search for a delay starts if it fits better than no delay.
+    # [s] The search for a delay starts from zero, from this delay or from its negative, whichever fits best.
     delay_start: float = 0.06
     # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)

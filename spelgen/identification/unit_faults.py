@@ -15,7 +15,9 @@ from spelgen.identification.tuning import GEOMETRY
 from spelgen.settings.log_mapping import SCALES
 
 Form = tuple[np.ndarray, np.ndarray, int]
-LARGEST_GEAR = 500.0  # [1]
+# [1] Largest plausible gear ratio: gears of robot arms have smaller ratios. A larger fitted ratio is not advised as a
+# setting.
+LARGEST_GEAR = 500.0
 GIVE_GEAR = (
     "write its 'units', or, for positions of a motor, the units counts and counts/s with 'counts_per_turn', 2 pi times "
     "the gear ratio"
@@ -37,33 +39,36 @@ class TorqueUnit(WrongScale):
     evidence = "by the URDF's gravity"
 
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
-        """Define the candidates for corrections of the torques' unit.
+        """Define the candidates for factors that correct the unit of the torques.
 
-        factors: candidates, each (n,) factors on the torques of the joints. is_open: (n,) True for joints whose torque
-        may have another unit: the mapping states mNm or none. is_milli: (n,) True for torques declared in mNm.
+        factors: candidates, (n,) each: one factor per joint, by which its torques are multiplied. is_open: (n,) True
+        for joints whose torque may have another unit: the column mapping states no unit for it, or mNm, although the
+        numbers may be in Nm. is_milli: (n,) True for the joints with mNm in the mapping, a subset of `is_open`.
         """
         super().__init__([])
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield, for each candidate, the least-squares fit of torques that are multiplied by its factors (n,).
+        """Yield the least-squares fits of the log with corrected units of the torques: one fit per candidate.
 
-        If `base` has no such factors yet, also yield fits with separate factors of some joints, and of all joints. The
-        other corrections in `base` remain.
+        A candidate has one factor per joint, (n,), by which its torques are multiplied. If the hypothesis of `base`
+        does not correct the unit of torques yet, also yield fits in which each torque that may have another unit gets
+        its own factor (see `_separate`). The other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
         candidates = [] if is_found else [x.copy() for x in self._torque_factors]
         if is_open.all():
-            # The hypothesis may change senses or the order of joints, and with them the ratio of the fitted gravity
-            # torque to the URDF's. The torque factor is therefore computed again from this ratio; this also corrects an
-            # earlier factor with a wrong sense.
+            # The ratio of the fitted gravity torque to the URDF's depends on the other corrections of `base`, such as
+            # reversed or exchanged joints. The factor 1 / ratio is therefore computed for each `base`. If `base` has a
+            # torque factor already, a negative ratio shows that the sign of this factor is wrong.
             fitted, of_urdf = problem.gravity_torques(base)
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
         for factor in candidates:
-            # For torques declared in mNm, a factor near 1000 becomes 1000: the logged numbers are in Nm, and the factor
-            # is inexact because the masses of the URDF are.
+            # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
+            # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from
+            # 200 to 5000 are replaced by 1000.
             is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
@@ -76,16 +81,20 @@ class TorqueUnit(WrongScale):
     def _separate(
         self, problem: GeometryProblem, lowest: HypothesisFit, base: HypothesisFit, has_gravity: bool
     ) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with separate factors on the torques of some joints, and of all joints.
+        """Yield the least-squares fits in which joints have different factors on their torques.
 
-        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
-        the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
-        little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
-        significantly below the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each
-        joint is small.
+        The first fit has factors only on the joints whose gain differs much from the median gain. The second fit has
+        factors on all joints whose unit is open; it is tried only if several joints, or all, have another unit.
+
+        The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and the
+        masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
+        little. A fit is therefore yielded only if (1) its cost, plus a penalty for each factor, is significantly below
+        the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that the torques do not
+        determine is 1.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
-        factors. has_gravity: True if gravity torques in the log gave a candidate.
+        factors. has_gravity: True if the gravity in the logged torques gave at least one candidate. If it is False, and
+        no gain differs much from the median gain, the factors are unknown and nothing is yielded.
         """
         present, scale = base.hypothesis, base.hypothesis.scale
         tau = present.signals(problem.samples).tau
@@ -95,37 +104,37 @@ class TorqueUnit(WrongScale):
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
         is_free = self._is_open & (gains > 0)
         is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
-        # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
+        # If no gain differs much from the median gain, only one common factor on all torques can be wrong. It is known
+        # only if the torques contain gravity, which is compared to the URDF's gravity torques.
         if not (is_other.any() or has_gravity):
             return
-        single = np.where(is_other, gains / common, 1.0) * (common if is_other_unit(common) else 1.0)
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
             rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
             return problem.fit(present.changed(self, scale=rounded))
 
-        for factors, changed in (
-            (single, is_other),
-            (gains, is_free & (is_other.any() | is_other_unit(common))),
-        ):
-            if not changed.any() or not (changed | (factors == 1)).all():
-                continue
+        is_common, units = bool(is_other_unit(common)), np.eye(len(gains))
+        several = is_free & (is_common or is_other.sum() > 1)
+        for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
+            factors = np.where(changed, factors, 1.0)
             fit = fitted(factors)
-            # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
-            # masses may change it by less than this factor.
-            steps = [
-                GEOMETRY.other_unit ** (sign * x) for x in np.eye(len(gains))[changed] for sign in (-1, 1)
-            ]
-            is_sure = min(fitted(factors * step).cost for step in steps) > fit.cost + 0.5
-            is_sure &= fit.errors.max() <= GEOMETRY.unexplained
-            if is_sure and fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum():
+            # The factor of a joint is determined if the cost rises both when the factor is multiplied by `other_unit`
+            # and when it is divided by `other_unit`. Smaller changes of the factor are no test, since errors of the
+            # masses cause them, too. Factors that are not determined become 1.
+            for joint in np.flatnonzero(changed):
+                steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
+                changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
+            fit = fitted(np.where(changed, factors, 1.0))
+            is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
+            if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
                 yield fit
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose torque has another unit than the mapping states.
+        """Return the mask (n,) of the joints whose torque has another unit than stated: |`torque`| is not 1.
 
-        motion, torque: (n,) correction factors of the joints; only `torque` counts: it is neither 1 nor -1.
+        motion, torque: (n,) factors that correct motion and torque of the joints. `motion` is not used here, but by
+        other kinds of faults.
         """
         return np.asarray(np.abs(torque) != 1)
 
@@ -146,9 +155,10 @@ class TorqueUnit(WrongScale):
         return f"torques of another unit{sense}, {times}"
 
     def minor_code(self, correction: Correction) -> str:
-        """Return the code of a warning if all factors on the torques are between 0.1 and 10; else "", for an error.
+        """Return "torque-scale", the code of a warning, if all factors on the torques are between 0.1 and 10; else "".
 
-        Masses of a URDF may be wrong by such a factor, but never by a factor of ten.
+        Such factors may be due to masses of the URDF, which are never wrong by a factor of ten. With the result "", the
+        caller reports the fault as an error. correction: its `factors` are factors on motion and torques, (2, n).
         """
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
@@ -171,7 +181,8 @@ def rounded_factor(factor: float) -> float:
     changes it by less than 10 %, otherwise to two digits.
     """
     if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # The tolerance of 1.5 is wide, since the factor is only as exact as the masses of the URDF.
+        # Magnitudes from 0.00067 to 0.0015 become 0.001. The range is wide, since the factor is only as exact as the
+        # masses of the URDF.
         return float(np.copysign(1e-3, factor))
     one = float(f"{factor:.1g}")
     return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
@@ -180,8 +191,9 @@ def rounded_factor(factor: float) -> float:
 class PositionUnit(WrongScale):
     """Kind of fault of a log: positions in another unit, of all joints of a type or of single joints.
 
-    The unit of all joints of a type is one of `UNITS`. The factors of groups of joints are optimised, since their
-    positions may be the positions of motors, before gears of any ratio.
+    The unit of all joints of a type is one of `UNITS`. Positions may also have been measured at the motors, before
+    gears of any ratio. For given groups of joints (a single joint, or all revolute joints), the factors on the
+    positions are therefore optimised.
     """
 
     code = "joint-unit"
@@ -197,31 +209,40 @@ class PositionUnit(WrongScale):
         """Define the candidates for other units of the positions of n joints.
 
         Args:
-            factors: candidates for the factors of all joints of a type, (2, n) each.
-            groups: indices of the joints of each group whose factors are also optimised.
-            open_fault: fault of the hypotheses with a factor that the log does not determine. None: this object is such
-                a fault, and no setting is advised for it.
+            factors: candidates, (2, n) each: factors on the motion (first row) and on the torques (second row).
+            groups: lists of joint indices. The factors on the positions of the joints in a list are optimised together.
+            open_fault: the fault "positions in an unknown unit", which has no setting to write. It is reported instead
+                of this fault if the optimised factors are uncertain. None: this object itself is that fault.
         """
         super().__init__(factors)
         self._groups, self._open_fault = groups, open_fault
         self.advice = "" if open_fault else GIVE_GEAR
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
-        """Yield the least-squares fits with other units of all joints, and with the best factors of each group.
+        """Yield the least-squares fits with other units of the positions: of the candidates, then of groups of joints.
 
-        A single joint is omitted if the hypothesis of `base` already changes its unit.
+        A candidate has given factors on the positions, such as pi / 180. The joints of a group, such as all revolute
+        joints, get the factors of lowest cost. A group is omitted if the hypothesis of `base` already changes the unit
+        of one of its joints. All groups are omitted if `base` or a candidate explains the torques.
         """
-        yield from super().fits(problem, base)
-        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained.
-        if base.errors.max() <= GEOMETRY.explained:
-            return
+        units = list(super().fits(problem, base))
+        yield from units
+        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained, and
+        # the factors of several joints must halve the residual.
+        lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
-        yield from (self._free(problem, base, x) for x in self._groups if not is_changed[x].any())
+        for joints in self._groups if lowest.max() > GEOMETRY.explained else ():
+            if not is_changed[joints].any():
+                fit = self._free(problem, base, joints)
+                yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 
     def _free(self, problem: GeometryProblem, base: HypothesisFit, joints: list[int]) -> HypothesisFit:
-        """Return the least-squares fit with the best factor on the positions of each of m joints.
+        """Return the least-squares fit with the best factors on the positions of a group of m joints, one per joint.
 
-        Units in `UNITS` are preferred if the cost is about equal. Other factors are rounded to three digits.
+        A factor near the factor of a unit in `UNITS` is replaced by it if the cost is about equal. Other factors are
+        rounded to three digits.
+
+        base: fit whose hypothesis gets the factors. joints: indices of the m joints of the group.
         """
         scale, present = base.hypothesis.scale, np.abs(problem.unchanged.scale[0, joints])
         span = float(np.ptp(base.hypothesis.signals(problem.samples).motion[0][:, joints], axis=0).max())
@@ -231,15 +252,19 @@ class PositionUnit(WrongScale):
             factors[:, joints] = sense * np.exp(exponents), torque_sense * np.exp(-power * exponents)
             return base.hypothesis.changed(fault, scale=scale * factors)
 
-        # Forms (senses of the motion, senses of the torque, power): the torque of the joint (power 0), of either sense
-        # if the motion is reversed, or the torque of the motor (power 1), which the gear multiplies.
+        # A form is (sign of the positions, sign of the torques, power). Positions are multiplied by sign * x and
+        # torques by sign * x^-power, with a factor x per joint. Power 0: only the positions are in another unit; if
+        # they are reversed, the torques may be reversed or not. Power 1: positions and torques were measured at the
+        # motor of a gear with the ratio 1 / x, so that the joint's torque is 1 / x times the motor's. Both have the
+        # same sign.
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
-        # `_descended` reverses the senses of several joints.
+        # For several joints, only the two forms without reversal are tried here; `_descended` then reverses joints.
         forms: list[Form] = [
             (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
         ]
-        # the largest motion is at least 0.05 rad or m, and at most two turns
+        # `common`: logarithms of the tried factors. The factor makes the largest motion at least 0.05 rad or m and at
+        # most two turns, and is at most exp(-0.6) = 0.55: a factor near 1 is neither a unit nor a gear.
         common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
         costs = np.array([[problem.fit(scaled(x * ones, form)).cost for form in forms] for x in common])
         lowest = costs.min(axis=0)
@@ -248,8 +273,8 @@ class PositionUnit(WrongScale):
             for k in lowest.argsort()[: 1 if len(ones) == 1 else 2].tolist()),
             key=lambda x: x[0].cost,
         )  # fmt: skip
-        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well,
-        # or, for a single joint, if another form does.
+        # The factors are undetermined if factors that are 10 % larger or smaller explain the log about equally well.
+        # For a single joint, they are also undetermined if the best factor in another form (other signs or power) does.
         steps = 0.1 * np.concatenate([np.eye(len(joints)), -np.eye(len(joints))])
         sides = [problem.fit(scaled(exponents + x, form)).cost for x in steps]
         if len(joints) == 1:
@@ -259,7 +284,8 @@ class PositionUnit(WrongScale):
         exact = np.log(np.array(scales)[:, None] / present)
         nearest = np.take_along_axis(exact, np.abs(exact - exponents).argmin(axis=0)[None], axis=0)[0]
         is_unit = np.abs(nearest - exponents) < 0.1
-        # no joint has a gear of a larger ratio than LARGEST_GEAR
+        # A factor that is not near a unit's is the inverse of a gear ratio. The result is certain only if the largest
+        # gear ratio is plausible, below LARGEST_GEAR.
         largest_gear = np.where(is_unit, 0.0, np.exp(-exponents)).max()
         is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
         fault = self if is_sure else self._open_fault or self
@@ -274,16 +300,22 @@ class PositionUnit(WrongScale):
     def _descended(
         self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
     ) -> tuple[HypothesisFit, np.ndarray, Form]:
-        """Return the fit of lowest cost near initial exponents (m,) of the factors, its exponents, and its form.
+        """Return the fit of lowest cost near initial factors on the positions of m joints, its exponents, and its form.
 
-        The senses of several joints are reversed one by one while the torques are not explained and the cost falls.
+        The exponents (m,) are the logarithms of the factors by which the positions of the joints are multiplied;
+        `start` has their initial values, (m,). A form has the signs of positions and torques (see `_free`).
+        scaled(exponents, form) returns the hypothesis.
+
+        If m > 1, joints are reversed one after the other: while the relative residual of a joint is above
+        `GEOMETRY.explained`, the joint whose reversal lowers the cost most is reversed, if the decrease is significant.
         """
 
         def lowest(form: Form) -> tuple[HypothesisFit, np.ndarray, Form]:
             hypothesis_of = partial(scaled, form=form)
             exponents = start
             for _ in range(3):
-                # ratios from 1.5 to 1000, as of mm
+                # The bounds permit logged positions that are 1.5 to 1100 times the joint's. Values in mm, for example,
+                # are 1000 times the values in m.
                 exponents, fit = problem.descend(
                     hypothesis_of,
                     exponents,
@@ -304,18 +336,23 @@ class PositionUnit(WrongScale):
         return best
 
     def has(self, motion: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of the joints whose positions have another unit than the mapping states.
+        """Return the mask (n,) of the joints whose positions have another unit than stated: |`motion`| is not 1.
 
-        motion, torque: (n,) correction factors of the joints; only `motion` counts: it is neither 1 nor -1.
+        motion, torque: (n,) factors that correct motion and torque of the joints. `torque` is not used here.
         """
         return np.asarray(np.abs(motion) != 1)
 
     def text(self, correction: Correction) -> str:
-        """Return the text that the positions have another unit, with its name, or with the factor of a gear."""
+        """Return the text about positions in another unit: the name of the unit, or the gear ratio if no unit fits.
+
+        The text also states an opposite sense, unless the hypothesis contains `JointSense`, whose text states it.
+        """
         motion, torque = correction.factors
         texts, ratios = [], dict[str, list[str]]()
+        is_stated = any(isinstance(x, JointSense) for x in correction.hypothesis.faults)
+        is_reversed = [bool(x < 0) and not is_stated for x in motion]
         for k in np.flatnonzero(self.has(motion, torque)).tolist():
-            unit, sense = position_unit(correction, k), " and of the opposite sense" * bool(motion[k] < 0)
+            unit, sense = position_unit(correction, k), " and of the opposite sense" * is_reversed[k]
             if unit:
                 texts.append(f"positions in {unit}{sense}")
             else:
@@ -331,8 +368,8 @@ class PositionUnit(WrongScale):
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
     """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
 
-    There is one candidate for each type of joint and each unit that differs from the unit in the mapping; torques have
-    the factor 1.
+    The first row of a candidate has factors on the positions and velocities, the second row factors on the torques,
+    which are 1. There is one candidate per joint type and unit that differs from the unit in the mapping.
 
     scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
     `sign: -1`.

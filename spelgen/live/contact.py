@@ -40,16 +40,19 @@ class ContactObserver:
         low: Low-pass filtered terms, (15, n). Row 0: torque; 1: friction; 2: uncertainty of friction; 3 and 4: momentum
             p of the arm; 5 to 14: regressor of the payload. Row 4 is filtered at twice the bandwidth of the observer,
             all other rows at this bandwidth.
-        baseline: Slow disturbance, which is subtracted from the external torque, (n,) [Nm, N].
+        baseline: Low-pass filtered disturbance d of the drift filter, which is subtracted from the external torque,
+            (n,) [Nm, N].
         jerk: Low-pass filtered square of the difference between the estimates of dp/dt from rows 3 and 4, a measure of
             the change of dp/dt, (n,) [Nm^2, N^2].
-        level: Mean square of the torque residual divided by its standard deviation, over about the last half second,
-            (n,) [1]. A level above 1 multiplies the variance of the residual: residuals are larger in some motions, for
-            example if the arm vibrates. The last two blocks of samples (see `Block`) are not part of the level, so that
-            a contact does not raise the threshold before it is detected. The squares are limited to
-            `TUNING.level_limit`, so that slow contacts raise the thresholds by a factor of at most two.
+        level: Mean of the squared `normalised` torque residual (see below, but without division by the level) over
+            about the last half second, (n,) [1]. The contact threshold is multiplied by sqrt(level) if the level is
+            above 1: residuals are larger in some motions, for example if the arm vibrates. The level contains no
+            samples of the last two blocks (see `Block`), so that a contact does not raise the threshold before it is
+            detected. The squares are limited to `TUNING.level_limit` = 4, so that slow contacts raise the threshold by
+            a factor of at most two.
         normalised: Excess of the external torque's magnitude over `NoiseLevels.resting_torque`, divided by the standard
-            deviation of the torque residual, (n,) [1]. A joint is in contact above `NoiseLevels.thresholds`.
+            deviation of the torque residual and by sqrt(level), (n,) [1]. A joint is in contact above
+            `NoiseLevels.thresholds`.
     """
 
     def __init__(self, levels: NoiseLevels, alarms_per_minute: float) -> None:
@@ -143,9 +146,10 @@ class ContactObserver:
             torque - rate * at.momentum - regressor @ payload.parameters - friction * scale - self.baseline
         )
         jerk = 2 * rate * (at.momentum - fast) - rate * (at.momentum - slow)
-        # If measured torques lag behind the motion, the residual has an error proportional to `jerk`, the change of
-        # dp/dt. The low-pass filter of the observer prolongs this error by about its time constant. The variance
-        # therefore contains jerk^2 for the present error, and the low-pass filtered jerk^2 (`self.jerk`) for past ones.
+        # `jerk` [Nm, N] is the difference of two estimates of dp/dt, with the momentum p (see `TUNING.jerk`). If
+        # measured torques lag behind the motion, the residual has an error proportional to it. The low-pass filter of
+        # the observer prolongs this error by about its time constant. The variance therefore contains jerk^2 for the
+        # present error, and `self.jerk`, the low-pass filtered jerk^2, for past errors.
         self.jerk = self.jerk + gain * (jerk**2 - self.jerk)
         variance = TUNING.jerk**2 * (jerk**2 + self.jerk) + TUNING.uncertainty * uncertainty**2
         variance += np.einsum("ji,ik,jk->j", regressor, payload.covariance, regressor)

@@ -216,8 +216,8 @@ class Estimator:
             decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:
-                # Errors of measured torques may make the external torque arbitrarily large. The compensation is limited
-                # to torques that the drives can exert.
+                # The disturbance d now contains the external torque, so that the returned torques compensate it. Errors
+                # of measured torques may make d arbitrarily large; it is limited to the torque limits of the drives.
                 limit, d = self.levels.effort, self.observer.baseline - self.contact.external_torque
                 d = np.clip(d, -limit, limit)
             drift = torch.from_numpy(a) * friction + torch.from_numpy(d * decay)

@@ -49,7 +49,11 @@ class Block(NamedTuple):
     moving: np.ndarray
 
     def joined(self, later: Block) -> Block:
-        """Return the means over this block and the next block, `later`, as one block of both durations."""
+        """Return this block and the next block, `later`, as one block.
+
+        The duration of the joined block is the sum of both durations. Its torque residual, regressor, friction and
+        uncertainty are means over the whole time. A joint counts as moving only if it moved in both blocks.
+        """
         duration = self.duration + later.duration
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
@@ -240,9 +244,10 @@ class JointFilters:
         used[:, -1] |= self.drifts
         gain = np.where(used, covariance / variance[..., None], 0.0)
         self.x = self.x + gain * residual[..., None]
-        # The Kalman gain K is optimal for the states in `used` and zero for the other states. For such a gain, Joseph's
-        # form of the update of the covariance P is P_ij - c_i c_j / variance if state i or j is used, with c the
-        # covariance of state and measurement.
+        # Only the states in `used` are updated: their gain is the Kalman gain, and the gain of the other states is zero
+        # (Schmidt-Kalman filter). Joseph's form of the covariance update is then simple: P_ij is reduced by c_i c_j /
+        # variance if at least one of the states i and j is used, otherwise it is unchanged. c is the covariance of the
+        # states with the measurement.
         product = covariance[..., None] * covariance[..., None, :] / variance[..., None, None]
         self.P = self.P - np.where(used[..., None] | used[..., None, :], product, 0.0)
         return residual, expected
@@ -300,7 +305,10 @@ class PayloadEstimate:
             yield
 
     def _compare(self, moving: int) -> None:
-        """Accept or drop the hypotheses of a changed payload and of a contact, or start them if residuals are large.
+        """Update the detection of a changed payload after all filter updates of a block of samples.
+
+        If the hypotheses of a changed payload and of a contact exist, accept the change or drop both hypotheses.
+        Otherwise start both if the squared torque residuals of the block are much larger than expected.
 
         moving: number of joints that moved in the block.
         """

@@ -67,7 +67,7 @@ class Intake:
         self._begin()
 
     def _begin(self) -> None:
-        """Reset the bounds of the friction state and the delay line: the past motion is unknown."""
+        """Discard the past motion: reset the bounds of the bristle deflections and the delay line of q, qd and tau."""
         self.bounds = np.stack([-self.limit, self.limit])
         self.line = DelayLine(abs(self.levels.delay))
 
@@ -97,7 +97,8 @@ class Intake:
             now = np.stack([q, qd, tau])
             is_delayed = np.array([[True], [True], [False]]) == (self.levels.delay > 0)
             self.aligned = np.where(is_delayed, self.line.step(t, now), now)
-            # Position changes of one encoder step are treated as rounding, not as motion.
+            # The position has a dead band of one encoder step: `path` changes only if the position differs from it by
+            # more. Smaller changes are rounding, and do not deflect the bristles.
             position = self.aligned[0]
             start = position if begins else self.path
             path = np.clip(start, position - self.levels.encoder, position + self.levels.encoder)
@@ -117,8 +118,9 @@ class Intake:
             return "jump"
         if t - self.t > TUNING.gap:
             return "used" if self.t == -np.inf else "gap"
-        # `furthest` is the largest plausible motion since the last sample. Time stamps may be delayed, so it includes a
-        # motion of `TUNING.block` seconds at the largest speed of the training logs, and one encoder step.
+        # The largest plausible motion since the last sample is c v dt + T v + e, with c = `TUNING.jump`, the largest
+        # speed v of the training logs, the time step dt, T = `TUNING.block` and the encoder step e. The term T v is for
+        # delayed time stamps, whose dt is too short. `speed` is c v.
         furthest = speed * (t - self.t + TUNING.block / TUNING.jump) + self.levels.encoder
         if (np.abs(q - self.q) > furthest).any():
             return "jump"

@@ -150,11 +150,12 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     """
     logs = [log for _, fold in folds for log in fold]
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
-    # At first `levels` contains only limits. Samples within the limits are accepted, and the noise is estimated from
-    # them. A torque limit in the URDF is wrong if logged torques exceed it by more than noise. A limit of 1000 is often
-    # a placeholder: real limits are 1.6 to 50 times the largest torque of recordings. Instead of a wrong or unknown
-    # limit, `limit` is a guess: torques above it (for example under a payload) do not count as saturated up to
-    # `TUNING.jump` times it.
+    # At first `levels` contains only the limits by which samples are accepted; the noise is then estimated from the
+    # accepted samples. `limit` is the torque limit of the URDF, but at least 1.2 times the largest logged torque. If
+    # logged torques exceed the limit of the URDF by more than 20 %, or if it is absent or a placeholder, `limit` is a
+    # guess: 2.5 times the largest logged torque. A placeholder is at least 100 times the largest logged torque; real
+    # limits are 1.3 to 50 times the largest torque of recordings. A payload may need more torque than the guess, so a
+    # torque counts as saturated only if it is at least `TUNING.jump` times the guess.
     is_known = (1.2 * effort >= largest) & (effort < 100 * largest)
     limit = np.where(is_known, np.maximum(effort, 1.2 * largest), 2.5 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
@@ -164,7 +165,8 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
     segments = [[x.block for x in samples if x.block is not None] for samples in tested]
-    # A block of the payload filter has twice the length of a block of the drift filter.
+    # A block of the payload filter is joined from two blocks of the drift filter. This halves the number of updates of
+    # the payload filter, which take longer since it has 10 + 3 n states.
     pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
     payload = load_variance(list(itertools.chain(*pairs)), levels)
@@ -175,12 +177,14 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, flo
     """Return the fields `load_variance`, a factor for the covariance of estimated payloads, and `load_freedom`.
 
     The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
-    factor is found by trials: each trial estimates the payload from several consecutive blocks. The logs are without
-    payload, so the estimate x is an error, with the normalised square s = x^T P^-1 x / k; x is the mass (k = 1), or
-    mass and first moments (k = 4). The mean of s is computed for each k and each number of blocks per trial, because
-    errors are correlated over time. As a prior, each mean includes `prior_trials` imaginary trials with s =
-    `prior_variance`. The factor is the largest mean; its degrees of freedom are the number of trials in this mean,
-    including the imaginary trials.
+    factor is found by trials on logs without payload:
+
+    1. A trial estimates the payload from several consecutive blocks. The true payload is zero, so the estimate x is an
+       error. Its normalised square is s = x^T P^-1 x / k, for the mass (k = 1) and for mass and first moments (k = 4).
+    2. The mean of s over all trials is computed for each k, and for trials of each of the lengths `trial_blocks`: since
+       errors are correlated over time, the mean depends on the length. As a prior, `prior_trials` trials with
+       s = `prior_variance` are added to the trials of each mean.
+    3. The factor is the largest mean. Its degrees of freedom are the number of trials in this mean, prior included.
 
     Args:
         blocks: consecutive blocks of the payload filter, from held-out logs.
@@ -238,8 +242,9 @@ def _likelihood(
     """
     constant, ratio = grid.T[:, :, None]
     cost, squares, count = np.zeros((3, *scale.shape))
-    # `prior`: prior standard deviations of friction change a, offset b and disturbance d, (G, n, 3). The offset b is
-    # assumed to be at most a few standard deviations of the white noise.
+    # `prior`, (G, n, 3): prior standard deviations of the friction change a [1], the offset b [Nm, N] and the
+    # disturbance d [Nm, N] for each of the G noise models. The prior of the offset is 4 standard deviations of the
+    # white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
         # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is
@@ -301,12 +306,17 @@ def held_out_tail(peaks: Sequence[np.ndarray], levels: NoiseLevels) -> dict[str,
     """Return the distribution of the largest peaks: `peak_start`, `peak_scale` and `peak_count` of `NoiseLevels`.
 
     A peak is the largest residual of the momentum observer in a time window, divided by its standard deviation. An
-    exponential distribution is fitted to the largest peaks and gives the contact thresholds. Peaks differ between logs,
-    so thresholds from some logs cause too many alarms on others. All peaks, and thereby the thresholds, are therefore
-    multiplied by a factor. Cross-validation determines the factor: for each log, thresholds are computed from all other
-    logs. With these thresholds times the factor, all held-out logs together have at most the number of alarms that the
-    default rate of false alarms allows. The factor is the same for all joints, because the joint that needs the largest
-    factor differs between logs.
+    exponential distribution fitted to the largest peaks gives the contact thresholds. Thresholds from some logs cause
+    too many alarms on other logs, since peaks differ between logs. All peaks, and thereby the thresholds, are therefore
+    multiplied by a factor, which is found by cross-validation:
+
+    1. For each log, thresholds are computed from the peaks of all other logs. A time window of the log has an alarm if
+       the peak of a joint exceeds its threshold times the factor.
+    2. The factor is the smallest one with which the windows of all logs have no more alarms than the default rate of
+       false alarms allows, and at least `TUNING.other_days`.
+
+    All joints have the same factor. Factors of single joints would be too small for new logs, since the joint with the
+    largest ratio of peak to threshold differs from log to log.
 
     Args:
         peaks: peaks of each log in W time windows, (W, n) [1].
@@ -333,10 +343,11 @@ def _peak_tail(peaks: Sequence[np.ndarray], factor: float = 1.0) -> dict[str, ob
     # for joints whose residuals are all zero.
     count = max(int((together > start).sum(axis=0).max()), 1)
     scale = np.maximum(together - start, 0).sum(axis=0) / count
-    # The scales of the joints are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the
-    # errors, the scales are shrunk towards their mean (James and Stein, 1961). The weight of the mean is the error
-    # variance divided by the variance over the joints. It is at most 1 - 1 / n, so that `peak_count` is at most n
-    # `count`, the number of peaks of all n joints.
+    # `scale` (n,) is the mean excess over `start` of the `count` largest peaks of each joint. The scales of the joints
+    # are similar, but each has a relative standard error of 1 / sqrt(count). To reduce the errors, the scales are
+    # shrunk towards their mean (James and Stein, 1961). The weight w of the mean is the error variance divided by the
+    # variance of the scales over the joints. A shrunk scale is as exact as one from `peak_count` = count / (1 - w)
+    # peaks. All n joints together have only n count peaks, so w is at most 1 - 1 / n.
     n, mean = len(scale), scale.mean()
     variance = max(float(scale.var(ddof=min(n - 1, 1))), 1e-300)
     weight = min(mean**2 / count / variance, 1 - 1 / n)

@@ -76,8 +76,10 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     weight = torch.zeros_like(velocity)
     weight[..., 3] = -chain.base.flatten()
     directions, vectors = torch.stack([jacobian, rate, jacobian]), torch.stack([velocity, velocity, weight])
-    # Momentum and torque of the payload have the form tr(A J B^T), with the payload's pseudo-inertia J (4, 4), A in
-    # `directions` and B in `vectors`. Both are linear in J, with the coefficients A^T B (4, 4).
+    # Momentum, centrifugal torque and gravity torque of the payload have the form tr(A J B^T), with the payload's
+    # pseudo-inertia J (4, 4), A from `directions` and B from `vectors`, (3, 4) each. The three quantities are linear in
+    # J, with the coefficients A^T B (4, 4) in `products`. `units` is the derivative of J with respect to the ten
+    # inertial parameters.
     products = torch.einsum("ktnxa,ktxb->ktnab", directions, vectors)
     units = pseudo_inertia(torch.eye(10).to(q))
     momentum, centrifugal, weighed = torch.tensordot(products, units, dims=([-2, -1], [1, 2]))

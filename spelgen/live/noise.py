@@ -32,7 +32,10 @@ Vector = Annotated[
 
 
 class BlockNoise(BaseModel):
-    """Noise of the torque residual of the momentum balance, averaged over blocks of samples of one length.
+    """Noise of the torque residual of each joint, averaged over a block of samples (see `live.filters`).
+
+    The noise depends on the duration of a block. `NoiseLevels` therefore has a `BlockNoise` for each of its two
+    durations, 0.1 and 0.2 s.
 
     Attributes:
         white: standard deviations of white noise, (n,) [Nm, N].
@@ -50,26 +53,29 @@ class BlockNoise(BaseModel):
 class NoiseLevels(BaseModel):
     """Noise levels and limits of an arm that the estimator uses in addition to its model.
 
-    Peaks are the largest values, in time windows, of the external torque divided by its standard deviation. The largest
-    fifth of the peaks is modelled by an exponential distribution.
+    A peak is the largest external torque of a joint in a window of half a second, divided by its standard deviation.
+    The largest fifth of the peaks of the training logs is modelled by an exponential distribution, from which the
+    contact thresholds are computed.
 
     Attributes:
-        drift: `BlockNoise` of the torque residual, for averages over a block of samples of the drift filter.
-        load: `BlockNoise` of the torque residual, for averages over a block of samples of the payload filter.
+        drift: Noise of block means for the filter of friction drift and disturbance, whose blocks have 0.1 s.
+        load: Noise of block means for the payload filter, whose blocks have 0.2 s.
         observer: Standard deviation of the torque residual of the momentum observer for a moving joint, (n,) [Nm, N].
-        resting: Additional threshold for a joint at rest, (n,) [Nm, N]: three standard deviations of the noise that
-            exists at rest in addition to `observer`. At a velocity qd it is multiplied by exp(-|qd| / resting_speed).
-        resting_speed: Velocity scale of the additional threshold, (n,) [rad/s, m/s].
+        resting: Torque that is added to the contact threshold of a joint at rest, (n,) [Nm, N]: three standard
+            deviations of the noise that exists at rest in addition to `observer`. At a velocity qd it is multiplied by
+            exp(-|qd| / resting_speed).
+        resting_speed: Velocity at which the added torque has decreased to 1/e, (n,) [rad/s, m/s].
         peak_start: Peak at which the exponential distribution begins, (n,) [1].
         peak_scale: Scale of the exponential distribution, (n,) [1].
         peak_count: Effective number of peaks from which the scale of a joint is estimated.
-        load_variance: Factor by which the covariance of an estimated payload is multiplied.
+        load_variance: Factor by which the covariance of an estimated payload is multiplied, because the payload filter
+            neglects errors of the model.
         load_freedom: Degrees of freedom of the estimate of `load_variance`.
         speed: Largest speed of the training logs, (n,) [rad/s, m/s].
         encoder: Encoder step, (n,) [rad, m].
         effort: Torque limit, (n,) [Nm, N]; for an unknown limit a multiple of the largest logged torque.
-        saturation: Torque from which a sample is saturated, divided by `effort`: 1, or more for joints with an unknown
-            limit, (n,) or (1,) [1].
+        saturation: Smallest torque that counts as saturated, divided by `effort`: 1 for a known limit, more for a
+            guess, (n,) or (1,) [1].
         minutes: Duration of the training logs [min].
         point: Position of the tip in the frame of the last body, (3,) [m].
         delay: Delay of measured torques relative to positions, as found by the fit [s].
@@ -134,16 +140,20 @@ class NoiseLevels(BaseModel):
 
     @property
     def tail_peaks(self) -> float:
-        """Number of peaks per minute above `peak_start` (the largest fifth), of all joints together [1/min]."""
+        """Expected number of peaks above `peak_start`, a fifth of all peaks (see the class), of all joints [1/min].
+
+        A peak is a large torque residual in a log without contacts.
+        """
         return 60 / TUNING.window * TUNING.tail * len(self.observer)
 
     def thresholds(self, alarms_per_minute: float) -> np.ndarray:
         """Return the contact thresholds of the external torques, divided by their standard deviations, (n,) [1].
 
-        Peaks (see the class) above `peak_start` have an exponential distribution. Its scale is uncertain, because it is
-        estimated from m = `peak_count` peaks. With the prior density 1 / scale, the probability that a peak above
-        `peak_start` also exceeds `peak_start` + x is p(x) = (1 + x / (m `peak_scale`))^-m. There are `tail_peaks` such
-        peaks per minute. The threshold is `peak_start` + x, at least 1, where x solves
+        A peak is the largest external torque of a joint in a time window, divided by its standard deviation. Without
+        contacts, all joints together have `tail_peaks` peaks per minute above `peak_start`; these peaks have an
+        exponential distribution. Its scale is uncertain, because it is estimated from only m = `peak_count` peaks. With
+        the prior density 1 / scale, a peak above `peak_start` also exceeds `peak_start` + x with the probability
+        p(x) = (1 + x / (m `peak_scale`))^-m. The threshold is `peak_start` + x, at least 1, where x is the solution of
         `tail_peaks` p(x) = `alarms_per_minute`.
 
         alarms_per_minute: rate of false alarms of all joints together [1/min].

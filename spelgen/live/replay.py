@@ -196,10 +196,10 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> tuple[Payload, list
 
 
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
-    """Return the indices of the samples at which the load changes.
+    """Return the indices of the samples at which the payload changes.
 
-    All samples with `load_changed` are returned, with one exception: if no payload was reported before a change, and
-    the status after it is "no payload", the two loads differ by less than the errors of the model.
+    They are the samples at which the estimator detected a change (`load_changed`). A change is omitted if no payload
+    was reported before it and the last status after it is "no payload": it is due to errors of the model.
 
     states: estimates after each sample of a log.
     """

@@ -17,8 +17,8 @@ class LiveTuning:
     # [s] Longest time between two samples of a block. After a longer gap the friction state is unknown.
     gap: float = 0.25
     # [1] A sample is refused if its velocity, or the change of position since the last sample divided by the time,
-    # exceeds this multiple of the largest speed of the training logs. A torque of a joint whose torque limit is unknown
-    # is saturated from this multiple of `NoiseLevels.effort`.
+    # exceeds this multiple of the largest speed of the training logs. If the torque limit of a joint is unknown, a
+    # torque counts as saturated if it is at least this multiple of `NoiseLevels.effort`, a guess of the limit.
     jump: float = 10.0
     # [1] Number of consecutive refused samples after which the estimator restarts at the new positions.
     restart: int = 5
@@ -59,7 +59,7 @@ class LiveTuning:
     # not averaged out by more motion. The variance of the torque of the estimated payload has a lower bound: this
     # fraction times the variance of torque errors. Without the bound, the normalised squared error of a payload that is
     # estimated for an arm without payload increases with time, to 20 after ten minutes of repeated logs of a UR10e.
-    # With 0.03, 20 minutes of repeated logs of other arms give payloads of 6 to 60 g.
+    # The fraction 0.03 is too small: after 20 minutes of repeated logs, it gives payloads of 6 to 60 g for other arms.
     recurring: float = 0.1
 
     # Constants of the detection of changed loads (`live.filters.PayloadEstimate`).
@@ -74,9 +74,10 @@ class LiveTuning:
     # "changed load" exceeds the log likelihoods of "no change" and of "contact" by more than `changed` [1].
     changed: float = 15.0
     changed_after: float = 1.0
-    # The hypotheses "changed load" and "contact" are dropped after `dropped_after` [s] of motion at the latest. They
-    # are dropped earlier, after `changed_after` [s], if "changed load" is unlikely: if its log likelihood minus the
-    # larger one of "contact" and "no change" is below `unlikely` [1].
+    # The hypotheses "changed load" and "contact" are dropped together: "contact" serves only for comparison. They are
+    # dropped after `dropped_after` [s] of motion. They are dropped earlier, after `changed_after` [s], if "changed
+    # load" is unlikely: if its log likelihood minus the larger one of "contact" and "no change" is below `unlikely`
+    # [1].
     unlikely: float = -8.0
     dropped_after: float = 4.0
 
@@ -84,14 +85,16 @@ class LiveTuning:
 
     # [1/s] Bandwidth of the momentum observer.
     bandwidth: float = 20.0
-    # [1] If measured torques lag behind the motion, the residual has an error while dp/dt changes (p: momentum). The
-    # standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt: one with
-    # the bandwidth B of the observer, one with 2 B. The first estimate lags by 1 / B and the second by 1 / (2 B), so
-    # their difference is the error for torques that lag by 1 / (2 B). `jerk` = 0.5 assumes half this lag, 12 ms.
+    # [1] If measured torques lag behind the motion, the torque residual has an error while dp/dt changes (p: momentum).
+    # The standard deviation of this error is assumed to be `jerk` times the difference of two estimates of dp/dt: one
+    # with the bandwidth B = 20/s of the observer, one with 2 B. The first estimate lags by 1 / B = 50 ms, the second by
+    # 25 ms. Their difference is the change of dp/dt in 25 ms, the error for torques that lag by 25 ms. `jerk` = 0.5
+    # assumes half this lag, 12 ms.
     jerk: float = 0.5
-    # [s] Time constant of `ContactObserver.level`, and [1] upper limit of the squared residuals of which it is the
-    # mean. In recordings of an AIRBOT, the first joint vibrates at 6 Hz in some motions. Of the contacts with 10 % of
-    # the effort limit, 73 % are detected within 150 ms; without the level 60 %, at the same rate of false alarms.
+    # `ContactObserver.level` is a mean of squared normalised residuals. `level` [s] is the time constant of this mean,
+    # and `level_limit` [1] the upper limit of a square in it. In recordings of an AIRBOT, the first joint vibrates at 6
+    # Hz in some motions. Of the contacts with 10 % of the effort limit, 73 % are detected within 150 ms. If thresholds
+    # do not depend on the level, 60 % are detected at the same rate of false alarms.
     level: float = 0.5
     level_limit: float = 4.0
     # [1] Lower bound of the standard deviation of the momentum observer, relative to the torque limit of a joint, so
@@ -100,8 +103,8 @@ class LiveTuning:
     # [s] Time constant of the low-pass filter of the estimated disturbance, which is subtracted from the external
     # torque. Contacts are detected in less time, so that they are not subtracted with the disturbance.
     baseline: float = 0.3
-    # [1] Smallest factor by which thresholds from the training logs are multiplied, because the errors of a model are
-    # larger on other days.
+    # [1] The errors of a model are larger on other days than in the training logs. Thresholds from the training logs,
+    # and standard deviations of payloads, are therefore enlarged by at least this factor.
     other_days: float = 1.3
     # [1/min] Default rate of false contact alarms.
     alarms_per_minute: float = 1.0
@@ -151,7 +154,8 @@ class LiveTuning:
     # disturbance divided by the standard deviation of white noise [1].
     time_constants: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
     disturbance_ratios: tuple[float, ...] = (0, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 5)
-    # [1] Lengths of trial estimates of the payload, as numbers of blocks of the payload filter: 5 and 10 s.
+    # [1] Noise of the estimated payload is found by trials: estimates from segments of logs without payload
+    # (`live.levels.load_variance`). Lengths of these segments, as numbers of blocks of the payload filter: 5 and 10 s.
     trial_blocks: tuple[int, ...] = (25, 50)
     # [1] Prior value of `NoiseLevels.load_variance`, with the weight of `prior_trials` trials: the logs of an arm often
     # have too few trials for an estimate.

@@ -57,13 +57,14 @@ SAME_STEP, ENCODER_STEP = 1e-3, 4e-3
 def find_servo_unit(logs: Sequence[Trajectory], joints: Sequence[str], unit: str) -> Advice | None:
     """Return a finding if the positions of servos have another unit than `unit`, one of `ANGLES`; else None.
 
-    Quantisation steps of encoders (see the comment at `NORMALISED_RANGE`) in `unit` show that it is right. Otherwise
-    the finding is the first of these:
+    Encoders have quantisation steps of 360 / 2**k degrees, with k from 10 to 14. If the positions have such steps in
+    `unit`, it is right. Otherwise the finding is the first of these:
 
     1. In another of the units `ANGLES`, the positions have the steps of encoders: this is their unit.
     2. `unit` is "deg", but all joints move by less than 0.1 rad; read in radians, a joint moves by more than 0.5 rad
        and less than two turns: the unit is "rad".
-    3. `unit` is "deg", and the step differs from joint to joint: the positions are normalised.
+    3. `unit` is "deg", and the step differs from joint to joint: the positions are normalised by LeRobot, to -100..100
+       over the calibrated range of each joint.
 
     Args:
         logs: recordings, with positions converted to radians from `unit`.
@@ -137,7 +138,8 @@ class Following(NamedTuple):
         offset: (n,) [rad, m] mean of u - q if its magnitude exceeds two standard deviations of u - q, else 0: a smaller
             mean may be due to a changing load.
         joints: tracking errors and lag of each joint.
-        saturation: (n,) [rad, m] see `measure_following`.
+        saturation: (n,) [rad, m] distance of a position from its command at which the servo's torque is at its limit;
+            infinity if it is unknown.
     """
 
     moves: np.ndarray
@@ -339,9 +341,10 @@ class ServoLogs:
     def _check_units(self, summary: Findings) -> None:
         """Add an error to `summary` if positions of one or of all recordings have another unit than the mapping states.
 
-        The error names single recordings if another one has the steps of encoders in the stated unit. Nothing is tested
-        if `summary` already has an error, or if the mapping states several units for the joints or a unit that is not
-        in `ANGLES`.
+        If a recording has the quantisation steps of encoders in the stated unit, this unit is right for it, and the
+        error names the other, faulty recordings. If there is no such recording, the error is about all recordings.
+        Nothing is tested if `summary` already has an error, or if the mapping states several units for the joints or a
+        unit that is not in `ANGLES`.
         """
         mapping = self._logs[0].mapping
         units = {mapping.unit("q", name) or "rad" for name in self._names}
@@ -408,9 +411,9 @@ class ServoLogs:
 def _command_faults(
     following: Following, log: Trajectory, joints: Sequence[str], *, is_only: bool
 ) -> dict[int, CommandFault]:
-    """Return {index of a joint: finding} for joints whose logged commands cannot be the commands that it tracked.
+    """Return {index of a joint: finding} for joints whose logged commands cannot be the commands of their servo.
 
-    The commands may belong to other joints, be in another unit or sense than the positions, or be increments of the
+    The commands may belong to other joints, have another unit or sense than the positions, or be increments of the
     position.
 
     Args:

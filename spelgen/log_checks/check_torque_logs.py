@@ -55,7 +55,9 @@ if TYPE_CHECKING:
 COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
 SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-changed"
-# Codes of warnings after which the drives are not tested: the torques may belong to another signal than the joints'.
+# Codes of warnings after which couplings of motors and delays of torques are not tested. SMALL_MOTION: the motion is
+# too small. UNEXPLAINED: the logged columns may not be the torques of the joints. WARNINGS: the scale or the zeros of
+# torques, or their gravity, probably differ from the URDF.
 UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
 
 
@@ -108,12 +110,12 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors, since faults give wrong hints. An error about an unknown unit
-        # of positions is an exception: the torques may show the unit, and an error that states it then replaces it.
+        # The model is fitted only to logs without errors: after an error, a hypothesis about the log may be wrong. An
+        # exception are the errors of earlier checks that guess the unit of positions from their range: if the torques
+        # determine the unit, they are replaced by an error that states this unit.
         self._guessed = summary.guessed
-        if summary.is_presumed and moving is not None:
-            summary.errors[:] = [self._with_known_unit(moving, error) for error in summary.errors]
-        is_sound = len(summary.errors) <= bool(self._guessed)
+        guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
+        is_sound = bool(guesses) or not summary.errors
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
         if moving is None:
@@ -125,13 +127,14 @@ class TorqueLogs:
             # samples.
             samples = [motion, motion if moving is None else moving]
             loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
-            geometry = [] if unscaled else self._geometry_findings(samples, evidence, accepted, loads)
-            if self._guessed:
-                errors = [x for x in geometry if isinstance(x, LogError)]
-                geometry = [*(errors or [x for x in summary.errors if isinstance(x, LogError)])]
-                summary.errors.clear()
+            geometry: Sequence[SpelgenError | Diagnostic] = []
+            if not unscaled:
+                geometry = self._geometry_findings(samples, evidence, accepted, loads)
+            if guesses:
+                geometry = [x for x in geometry if isinstance(x, LogError)] or guesses
+                summary.errors[:] = [x for x in summary.errors if x not in guesses]
             summary.extend(geometry)
-            is_right = not any(isinstance(x, LogError) or x.code in UNEXPLAINING for x in geometry)
+            is_right = not any(isinstance(x, SpelgenError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
                 self._check_drives(moving, summary)
             if is_right:
@@ -178,7 +181,8 @@ class TorqueLogs:
         recording.
 
         Args:
-            samples: unfiltered samples, then filtered ones, which are used unless they are too few.
+            samples: two sets of samples, first unfiltered, then low-pass filtered. The filtered samples are used; if
+                there are too few of them, for example at low sample rates, the unfiltered samples are used.
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
             loads: changes of the load between recordings.
@@ -212,10 +216,10 @@ class TorqueLogs:
         return findings
 
     def _load_changes(self, motion: MotionSamples, moving: MotionSamples | None) -> list[LoadChange]:
-        """Return the changes of the load between recordings.
+        """Return the changes of the load (the arm's payload) between recordings; [] for a single recording.
 
-        motion: unfiltered samples of all recordings. moving: filtered samples, which are used if they are of all
-        recordings: they show smaller changes.
+        motion: unfiltered samples of all recordings. moving: low-pass filtered samples; None if there are none. The
+        filtered samples are used if they are from all recordings, since smaller changes are detectable in them.
         """
         problem = self._problem(motion)
         if problem is None or len(self._sources) == 1:
@@ -226,7 +230,7 @@ class TorqueLogs:
         return load_changes(problem)
 
     def _load_notes(self, loads: Sequence[LoadChange]) -> Iterator[Diagnostic]:
-        """Yield a warning if there are changes of the load between recordings."""
+        """Yield a warning that names the recordings with another load, with its mass; none if `loads` is empty."""
         masses = []
         for change in loads:
             width = 2 * change.deviation
@@ -321,6 +325,9 @@ class TorqueLogs:
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
+        if isinstance(unexplained, LogError) and self._guessed:
+            do = f"positions beyond two turns have an unknown unit: {GIVE_GEAR}; {unexplained.do}"
+            unexplained = replace(unexplained, do=do)
         if unexplained is not None:
             yield unexplained
             return
@@ -330,8 +337,9 @@ class TorqueLogs:
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
-        # If a hypothesis changes the unit of only one joint's torque, the evidence is the magnitude of gravity in this
-        # torque. A wrong link of the URDF changes it as well, so warnings about links are added.
+        # If the best hypothesis changes the unit of only one joint's torque, its evidence is that the gravity in this
+        # torque is much larger or smaller than the URDF's. A wrong mass of a link in the URDF is another explanation of
+        # this difference, so warnings about links are added.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
             yield from _link_notes(problem, unchanged)
@@ -357,8 +365,10 @@ class TorqueLogs:
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
 
-        The candidates for torques are derived from the magnitude of gravity in the torques of the joints `evidence`. A
-        unit of torques in the mapping is assumed to be right, except mNm: torques declared in mNm may be in Nm.
+        Candidates for the unit of torques are derived from the ratio of gravity in the logged torques to the URDF's. A
+        unit in the mapping is assumed to be right, except mNm: numbers declared as mNm may be in Nm. evidence: joints
+        with their fits of gravity. problem: least-squares problem of the logs, from which ranges of positions and
+        gravity torques are computed.
         """
         names = self._arm.chain.joint_names
         units = [self._mapping.unit("tau", name) for name in names]
@@ -376,7 +386,7 @@ class TorqueLogs:
         if not motion <= {(None, None), *stated}:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
-        # two turns.
+        # two turns. If this is true of most joints, they may all be logged at their motors.
         width = np.array(
             [
                 min(high - low, 4 * np.pi) if high > low else np.inf
@@ -385,44 +395,17 @@ class TorqueLogs:
         )
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
+        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
+        if 2 * len(self._guessed) > len(turning):
+            wide = [turning]
         candidates = position_factors(problem.arm, problem.unchanged.scale[0])
         return kinds_of_faults(problem.arm, [PositionUnit(candidates, wide, PositionUnit([])), torque_unit])
 
-    def _with_known_unit(self, samples: MotionSamples, error: SpelgenError) -> SpelgenError:
-        """Return an error; the error that most positions are in degrees is replaced if the torques contradict degrees.
-
-        The positions may be the positions of the motors, before gears. If gear ratios of the joints explain the
-        torques much better than degrees, they are advised. If neither explains the torques, no setting is advised.
-        """
-        problem = self._problem(samples)
-        if problem is None or not isinstance(error, LogError) or "--accept degrees" not in (error.do or ""):
-            return error
-        turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
-        coarse = problem.thinned(2 * GEOMETRY.coarse_samples).with_hysteresis()
-        factors = position_factors(problem.arm, problem.unchanged.scale[0])
-        unit = min(PositionUnit(factors).fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost)
-        fault = PositionUnit([], [turning], PositionUnit([]))
-        best = min(fault.fits(coarse, coarse.fit(coarse.unchanged)), key=lambda x: x.cost, default=unit)
-        is_explained = (
-            unit.errors.mean() <= GEOMETRY.unexplained and 2 * best.errors.mean() > unit.errors.mean()
-        )
-        if best.cost > unit.cost - GEOMETRY.needed or is_explained:
-            return error
-        if best.errors.max() <= GEOMETRY.explained:
-            finding = geometry_finding(problem, self._mapping, unit, [best], by_name=self._is_bag)
-            return finding if isinstance(finding, LogError) else error
-        # the log may have another fault in addition to positions in degrees
-        converted = self._problem(unit.hypothesis.signals(problem.samples))
-        if converted is not None:
-            _, *better = compare_hypotheses(converted, kinds_of_faults(problem.arm))
-            if better and better[0].errors.mean() <= GEOMETRY.explained:
-                return error
-        message, _, unit_text = error.got.partition(": ")
-        do = f"{unit_text} does not explain the torques; {GIVE_GEAR}; --accept degrees if it is right"
-        return replace(error, got=message, do=do)
-
     def _check_drives(self, moving: MotionSamples, summary: Findings) -> None:
-        """Add a warning to `summary` about a coupling of motors that the logs show, or a note on a torque delay."""
+        """Add a warning to `summary` if the torques show a coupling of two motors; otherwise notes on delayed torques.
+
+        moving: samples of joints in motion. If a coupling is found, no delay is reported.
+        """
         late = delay_of(drive_problem(body_chain(self._arm.chain), self._drives, moving))
         if late.coupling is not None:
             summary.notes.append(_coupling_hint(self._arm, *late.coupling))
@@ -446,9 +429,10 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     problem = problem.thinned(GEOMETRY.confirming_samples)
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
-        # a joint that no model fits (residual above 10 % of the torque's variance) needs no comparison without gravity
-        # At other joints, the cost without gravity must be lower by at least the penalty of a rare fault, `rarity`: a
-        # wrong centre of mass of the last link has a similar effect.
+        # The torque of a joint is reported to have no gravity in two cases: (1) the model with gravity does not fit its
+        # torque, with a residual above 10 % of the torque's variance, or (2) the cost without gravity at this joint is
+        # lower by more than `rarity`, the penalty of a rare fault. The penalty is needed since a wrong centre of mass
+        # of the last link also lowers the gravity torque.
         without = problem.without_gravity(k).fit(problem.unchanged).cost
         if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
             message = (
@@ -487,7 +471,8 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             ratio = float(axis @ found)
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis))
             # The ratio must be above 2.5 or below 1/2.5: masses of CAD models are wrong by less. It must also differ
-            # from 1 by more than four standard deviations: at one of many bodies, it differs by two by chance.
+            # from 1 by more than four of its standard deviations: among many bodies, the ratio of one may by chance
+            # differ from 1 by two standard deviations.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

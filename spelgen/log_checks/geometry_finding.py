@@ -107,16 +107,18 @@ def find_unexplained(
 
 
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:
-    """Return the mask (n,) of the joints whose torque the unchanged log does not explain, and their relative residual.
+    """Return the mask (n,) of the joints whose torque the model does not explain, and a relative residual, see below.
 
-    A relative residual is the squared torque residual divided by the variance of the torque. `no_torque` and the lower
-    bound `no_advice` are thresholds in `GEOMETRY`.
+    The relative residual of a joint is its squared torque residual divided by the variance of its torque. unchanged:
+    fit of the model to the log without corrections. The thresholds in `GEOMETRY` are `no_torque` = 0.6 and `no_advice`
+    = 0.2.
 
-    1. If the mean residual of all joints is above `no_torque`, the mask contains the joints with a residual above
-       `no_advice`, and the mean is returned. It is weighted with the variances of the torques, since the torque of a
-       joint at rest may be only noise.
-    2. Otherwise the mask contains the moving joints with a residual above `no_torque` whose torque by the URDF has more
-       than half the standard deviation of the logged torque, and the largest residual of these joints is returned.
+    1. If the mean residual of all joints is above 0.6, the mask contains the joints with a residual above 0.2, and the
+       second result is the mean. The mean is weighted with the variances of the torques, since the torque of a joint at
+       rest may be only noise.
+    2. Otherwise the mask contains the joints that move, have a residual above 0.6, and have a load: the standard
+       deviation of the torque predicted with the URDF's parameters exceeds half of the logged torque's. The second
+       result is the largest residual of these joints.
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)

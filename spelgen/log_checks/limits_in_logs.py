@@ -41,7 +41,10 @@ class FlatTops(NamedTuple):
 
     @classmethod
     def of(cls, q: np.ndarray, tau: np.ndarray) -> FlatTops:
-        """Return the flat bottoms and tops of positions q and torques tau of one trajectory, (T, n) each."""
+        """Return the flat bottoms and tops of positions q and torques tau of one trajectory, (T, n) each.
+
+        A flat top is a highest value at which a signal stays, as if it were clipped (see `flat_tops`).
+        """
         return cls(flat_tops(q)[0], *flat_tops(tau))
 
     @classmethod
@@ -88,8 +91,9 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     if not suspects.any():
         return []
     fits = []
-    # Two guesses of the signs are refined: the signs of the URDF's torques and, for joints with little load, the signs
-    # of the velocity (friction).
+    # The signs of the suspected torques are unknown at each sample. Two initial guesses are refined: the signs of the
+    # torques predicted with the URDF's parameters, and the signs of the velocities. The second guess is good for joints
+    # with little load, whose torque is mostly friction.
     for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
@@ -142,9 +146,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
         sides = zip(SIDES, at_torque[..., k], strict=True)
         doubt = certain * deviation[:, k]
         excess = np.array([_median((side * residual[:, k] - doubt)[rows]) for side, rows in sides])
-        # Torques are clipped at a flat top if the model's torque exceeds the logged torque by more than `sure`. This
-        # bound is at least the joint's friction, since friction estimated from few samples may be wrong by its own
-        # magnitude.
+        # `excess` is the median, over the samples at a flat top (or bottom), by which the model's torque exceeds the
+        # logged torque. The torques are clipped there if it is above `sure`, which is at least the joint's friction: in
+        # few samples, the estimated friction may be wrong by 100 %.
         sure = max(certain * noise[k], 0.08 * samples.tau[:, k].std(), abs(friction[k]))
         is_clipped = excess > sure
         if is_clipped.any():
@@ -160,9 +164,10 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - certain * deviation)[rows, k])
-            # Contact with a stop requires a large difference, since a controller that pushes against a stop needs a
-            # large torque. Smaller differences also occur in pauses of a joint that moves one way only: its friction is
-            # not determined.
+            # `difference` is between logged torque and torque of the model, while the position is at an extreme. A
+            # joint counts as pushed against a stop only if the difference is large. Smaller differences also occur in
+            # pauses of a joint that moves only in one direction: such motion does not determine the friction, so that
+            # the torque of the model is wrong by about the friction when the joint is at rest.
             sure = max(certain * noise[k], 0.5 * samples.tau[:, k].std())
             if difference > sure + 2 * abs(friction[k]):
                 message = (

@@ -252,7 +252,8 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
     """Return two tables of the joints: the ranges of the signals `quantities`, and their noise and quantisation steps.
 
-    The first quantity must be "q": the fraction of the joint's range is in the column after it.
+    The first quantity must be "q". In the first table, the column after it is the fraction of the range between the
+    joint's position limits that the motion covered.
     """
     ranges, signals = [], []
     for joint in joints:

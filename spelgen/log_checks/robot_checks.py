@@ -81,8 +81,8 @@ def _fit_joint(signals: np.ndarray, friction: np.ndarray) -> GravityFit:
     """
     remainders = _without(friction, signals)
     lengths = np.linalg.norm(remainders, axis=0)
-    # `is_rounding`: True for signals, e.g. a constant torque, that are zero except for rounding errors after the
-    # projection
+    # `is_rounding`: True for signals that consist only of friction and inertia, or are constant. After the projection,
+    # only rounding errors of them remain.
     is_rounding = lengths <= TUNING.dependent * np.linalg.norm(signals, axis=0)
     largest = max(1.0, float(np.abs(signals[:, 2:]).max(initial=0.0)))
     is_seen = lengths[2:] > TUNING.dependent * largest * np.sqrt(len(signals))

@@ -48,7 +48,7 @@ class Statistics(NamedTuple):
 
 
 def statistics(trajectory: Trajectory) -> Statistics:
-    """Return the statistics of one trajectory: its sample times, and the range, noise and steps of its signals."""
+    """Return statistics of one trajectory: sample times, and range, noise and quantisation step of each signal."""
     # Noise is estimated only for dense samples: at low sample rates the third differences also contain the motion.
     dense = is_dense(trajectory.sample_rate) and len(trajectory) > 8
     signals = {}
@@ -106,8 +106,8 @@ def quantisation_step(values: np.ndarray) -> float:
     near = differences[differences < 100 * step] / step
     is_whole = np.abs(near - np.round(near)) < tolerance
     is_grid = len(near) > 2 and is_whole.mean() > 1 - tolerance
-    # A quantised measurement changes mostly from one level to a neighbouring level. A signal that jumps over several of
-    # few levels is a command with rounded values, which does not count as quantised.
+    # A quantised measurement changes mostly from one level to a neighbouring level. A signal with few levels that often
+    # changes by several levels at once is a command with rounded values, which does not count as quantised.
     changes = np.abs(np.diff(values))
     is_command = has_few_levels(step, float(np.ptp(values))) and changes[changes > 0].mean() > 1.5 * step
     return step if is_grid and not is_command else float("nan")

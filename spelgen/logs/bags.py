@@ -142,8 +142,12 @@ def _joint_states(
 def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    names: {joint: its name in the mapping}. logged: names in the log. The advice contains the settings that map the
-    names if exactly one logged name contains each name, or its distinct words ("j1" of "panda_j1" for "fer_j1").
+    The mapping gives each joint of the URDF a name, by default the URDF's. The log has other names. A joint's name is
+    searched in them, in full or without the words that all joint names share: "fer_j1" is found by "j1" in "panda_j1"
+    (see `joint_patterns`). If each joint is found in exactly one logged name, the advice contains the settings that map
+    the names; otherwise it shows the form of the settings for one joint.
+
+    names: {joint: its name in the mapping}. logged: names of joints in the log.
     """
     patterns = joint_patterns(list(names.values()), logged)
     matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}
@@ -232,7 +236,7 @@ def _of_other_recorders(path: Path, remarks: list[str]) -> list[Path]:
             head = source.read(64)
             if head.startswith(MAGIC):
                 # The first record of an MCAP file begins, after its code and length, with the profile, such as "ros2".
-                # Tools that join or cut files write an empty profile.
+                # Tools that join or cut files write an empty profile, and `rosbags` then refuses the file.
                 is_ros2 &= _text(head, len(MAGIC) + 9) == "ros2"
                 source.seek(-len(MAGIC), 2)
                 is_closed &= source.read() == MAGIC

@@ -73,7 +73,8 @@ class Check(Generic[Subject]):
     do: str | None = None
 
 
-# A check of a trajectory or of a joint; `LogChecks` collects the findings of both in one dict.
+# Type of a check of any subject. A check is of a trajectory or of the signals of a joint; one dict of `LogChecks`
+# contains the findings of both kinds.
 AnyCheck = Check[Any]
 
 
@@ -81,14 +82,13 @@ AnyCheck = Check[Any]
 class Findings:
     """Findings of checks of logs: errors, which prevent training, and notes, which do not.
 
-    guessed: names of joints whose positions have an unknown unit, which the torques may show. is_presumed: True
-    if the unit of most positions is advised by their range only, so that the torques may contradict it.
+    guessed: names of joints whose unit of positions is concluded from their range only, so that the torques may show
+    another one.
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
     errors: list[SpelgenError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
-    is_presumed: bool = False
 
     def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
@@ -201,8 +201,8 @@ REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None
 # This check compares a trajectory with earlier ones: `LogChecks` computes its message.
 REPEATED: Check[Trajectory] = Check("repeated-samples", "warning", lambda trajectory: None)
 CHECKS: list[Check[JointSignals]] = [
-    # Jumps are searched before frozen signals. If a signal consists of raw register words, qd and dq/dt differ, and the
-    # check "frozen" would report a frozen signal.
+    # Register words (raw integers that overflow, or have a sign bit) are searched first. The jumps of such a signal
+    # make dq/dt differ from qd, which the check "frozen" would otherwise report as a frozen signal.
     Check("jumps", "error", find_words, expected="signals without jumps"),
     Check(
         "frozen", "error", find_frozen, unless=("jumps",), expected="columns that belong together",
@@ -275,8 +275,8 @@ class LogChecks:
     def add(self, trajectory: Trajectory) -> Trajectory:
         """Apply all checks that need no robot to a trajectory, and collect the findings.
 
-        The result is the trajectory with dq/dt in place of velocities that are wrong for an unknown reason, for checks
-        with a model of the robot.
+        Return the trajectory for the later checks, which use a model of the robot. In it, velocities that are wrong for
+        an unknown reason are replaced by dq/dt.
         """
         self._count += 1
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
@@ -329,12 +329,13 @@ class LogChecks:
                 continue
             message = advice.message
             entries = {name: self._results[name, check][0][0].joint for name in names}
-            if advice.is_guess and 2 * len(names) <= len(self._limited(names[0])):
-                # The unit, after the colon of the message, is not certain.
-                message, _, _ = message.partition(": ")
+            if advice.is_guess:
                 summary.guessed.update(names)
-                entries = {}
-            summary.is_presumed |= advice.is_guess
+                if 2 * len(names) <= len(self._limited(names[0])):
+                    # All joints of a type normally have one unit. If at most half of them have the fault, the guessed
+                    # unit is uncertain: it is removed from the message (the text after the colon).
+                    message, _, _ = message.partition(": ")
+                    entries = {}
             if len(occurrences) > 1:
                 message += f" (and in {counted(len(occurrences) - 1, 'more trajectory')})"
             if names[0] in self._joints:
@@ -354,7 +355,10 @@ class LogChecks:
         return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
 
     def _limited(self, joint: str) -> list[str]:
-        """Return the names of the joints in `_kin` with limited motion: positions beyond two turns show a unit."""
+        """Return the names of the joints of the same type as `joint`, without continuous joints.
+
+        Only at joints with position limits do positions beyond two turns show a wrong unit.
+        """
         kinds = dict(zip(self._joints, self._kinds, strict=True))
         return [x for x in self._kin(joint) if kinds[x] != "continuous"]
 

@@ -113,8 +113,8 @@ def parse_column_name(
     # The last word that states a quantity is the noun: `position` in `current_position` or `velocity_control/position`.
     for word in reversed(texts):
         if quantity is None and (quantity := next((x for x, y in WORDS.items() if word in y), None)):
-            # Only a noun that is a current keeps the words for currents: `current_torque` and `current_as_torque` are
-            # torques.
+            # Words for currents remain in `words` only if the noun is such a word, as in `motor_current`. Otherwise
+            # they are adjectives: `current_torque` and `current_as_torque` are torques in Nm.
             words = words if word in CURRENT else words - CURRENT
     quantity = quantity or next((x for x in UNIT_NAMES if mapped_unit(x, unit)), None)
     if quantity is None and words & MEASURED:

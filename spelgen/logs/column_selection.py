@@ -68,7 +68,11 @@ def best_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[ColumnNa
 
 
 def complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozenset[str], list[ColumnName]]:
-    """Return {words of the names: columns} of the signals that have a column for each of the `joints`."""
+    """Return {words of the column names: columns} of the signals that have at least as many columns as `joints`.
+
+    Example: {frozenset({"joint", "pos"}): columns `joint_pos_1`, `joint_pos_2`, ...}. Words of joint names and numbers
+    are not included, so all columns of a signal have the same words.
+    """
     signals: dict[frozenset[str], list[ColumnName]] = {}
     for column in columns:
         signals.setdefault(frozenset(column.words), []).append(column)
@@ -82,8 +86,10 @@ def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> N
     """
     signals = complete_signals(columns, joints)
     best = min(signals, key=_rank, default=frozenset[str]())
-    # Column names of several arms differ only in words that do not describe a signal, such as "left", or in a number,
-    # which is not among the words.
+    # `best` is the set of words in the names of the preferred signal. `arms` contains `best` and the sets that differ
+    # from it only in unknown words (not in `KNOWN`), such as "left" and "right": these may name arms. The names of two
+    # arms may also differ only in numbers, such as q0 to q13. Numbers are no words, so these columns are one signal,
+    # with more columns than joints.
     arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
     of_joint: dict[str, list[str]] = {}
     for column in chain.from_iterable(signals[x] for x in arms):
@@ -105,7 +111,7 @@ def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> N
 
 
 def _rank(words: frozenset[str]) -> list[int]:
-    """Return the order of preference of a signal with these words, the smallest first (see `best_signal`)."""
+    """Return the sort key of a signal with these words; `best_signal` prefers the signal with the smallest key."""
     ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
     return [*ranks, words.isdisjoint(MEASURED), not words.isdisjoint(FILTERED), len(words)]
 
@@ -115,9 +121,9 @@ def columns_by_joint(
 ) -> dict[str, ColumnName]:
     """Return {joint: column}: the column whose name contains the name of the joint.
 
-    If no column name contains a joint name, columns are assigned by the last number in their names: to the joint with
-    this number in `order` or, if `order` does not contain all joints, in ascending order to `joints`. order: {joint:
-    number}, the result of `_order_in_cells`.
+    If no column name contains a joint name, columns are assigned by the last number in their names. `order` may state
+    the number of each joint, such as {"elbow": 2} for the column `q2` (see `_order_in_cells`). If it lacks a joint, the
+    columns, sorted by their numbers, belong to the `joints` in the given order.
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}

@@ -28,6 +28,8 @@ STAMP = ("sec", "nanosec", "frame_id")
 COMMENT = re.compile(r"^(#|% )\s*")
 
 
+# First cell of a line with statistics of the columns, or of an end mark: a word, or a quantile such as "25%".
+STATISTIC = re.compile(r"[^\W\d]\D*|\d+ ?%")
 # Texts that are no value, in addition to the texts that Arrow recognises.
 NO_VALUE = ["-", "--", "---", "None", "missing", "nan(ind)", "-nan(ind)", "1.#INF", "-1.#INF"]
 NO_VALUE += ["#DIV/0!", "#NUM!", "#VALUE!", "#REF!", *pa.csv.ConvertOptions().null_values]
@@ -61,13 +63,14 @@ class Beginning(NamedTuple):
 
 
 def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
-    """Return a list with one table, the content of a CSV file; lines below the last row are omitted, with a remark.
+    """Return the tables of a CSV file: one table, or one per recording if the header is repeated between the rows.
 
-    If the header is repeated between the rows, one table per recording is returned: a new recording begins at a header
-    after which the times do not increase.
+    A new recording begins at a repeated header after which the times do not increase. Incomplete lines and lines
+    without values after the last row of numbers are omitted, which a remark of the table states.
     """
     content = _in_utf8(file.read_bytes())
-    # A line begins after the end of another one, or after the byte order mark of an appended file.
+    # Repetitions of the header are searched. A repetition begins at the start of a line, or after the byte order mark
+    # of a file that was appended.
     header = re.escape(_beginning(content).header.encode())
     starts = [x.start() for x in re.finditer(header + rb"(?=[\r\n])", content)] if header else []
     starts = [0, *[x for x in starts if content[max(x - 1, 0) : x] in (b"", b"\n", b"\r", b"\xbf")][1:]]
@@ -94,7 +97,7 @@ def read_csv(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 
 
 def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[str, ...]]:
-    """Return the table of a CSV file, the number of lines before the values, and a remark on lines below the last row.
+    """Return the table of a CSV file, the number of lines before the values, and a remark on omitted last lines.
 
     content: content of the file, or a part that begins with a header, in UTF-8; b"": the file is read.
 
@@ -103,7 +106,10 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     """
     content = content or _in_utf8(file.read_bytes())
     text = _beginning(content)
+    content, footer = _without_footer(content, text)
     names = _joint_state_columns(text.names, file) if is_number(text.names[0]) else None
+    # pandas writes the index of a table, often its times, as a first column without a name.
+    columns = names or [name or f"column {k}" for k, name in enumerate(text.names, start=1)]
     start = '"' if text.delimiter == "," else f'(^|{re.escape(text.delimiter)}) *"?'
     decimal_point = "," if re.search(rf"{start}-?\d+,\d", text.rows, re.MULTILINE) else "."
     wrong: list[pa.csv.InvalidRow] = []
@@ -124,13 +130,13 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     # costs 0.02 s for 17 MB.
     table = pa.csv.read_csv(
         pa.BufferReader(content),
-        pa.csv.ReadOptions(use_threads=False, skip_rows=text.lines, column_names=names or text.names),
+        pa.csv.ReadOptions(use_threads=False, skip_rows=text.lines, column_names=columns),
         pa.csv.ParseOptions(delimiter=text.delimiter, invalid_row_handler=skipped),
         pa.csv.ConvertOptions(decimal_point=decimal_point, null_values=NO_VALUE),
         memory_pool=pa.system_memory_pool(),
     )
-    # Only lines below the last row may be incomplete, as after a power failure of the recorder, or have no values. Any
-    # other incomplete line is an error.
+    # Incomplete lines are permitted only after the last complete row of the table, as after a power failure of the
+    # recorder. An incomplete line between complete rows is an error.
     for row in wrong:
         if not len(table) or row.number <= text.lines + len(table):
             got = f"{row.actual_columns} values ({row.text:.40})"
@@ -141,10 +147,35 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     if text.units:
         units = dict(zip(text.names, text.units, strict=False))
         table = table.replace_schema_metadata({STATED_KEY: json.dumps(units)})
-    if not wrong:
+    omitted = [*(row.text for row in wrong), *footer]
+    if not omitted:
         return table, text.lines, ()
-    ending = "line is cut off and was" if len(wrong) == 1 else f"{len(wrong)} lines are no rows and were"
-    return table, text.lines, (f"the last {ending} left out: {wrong[0].text:.30}",)
+    ending = (
+        "line is no complete row and was"
+        if len(omitted) == 1
+        else f"{len(omitted)} lines are no rows and were"
+    )
+    return table, text.lines, (f"the last {ending} left out: {omitted[0]:.30}",)
+
+
+def _without_footer(content: bytes, text: Beginning) -> tuple[bytes, list[str]]:
+    """Return the content of a CSV file without the lines at its end that begin with a word, and these lines.
+
+    They are statistics of the columns (`Mean,0.1,...`) or an end mark, unless the rows begin with a word, too.
+    """
+
+    def begins_with_word(line: str) -> bool:
+        cell = _cells(line, text.delimiter)[0]
+        return bool(STATISTIC.fullmatch(cell)) and not is_number(cell) and cell not in NO_VALUE
+
+    # Arrow would read the first column as text if one of its cells is a word.
+    lines = content[-HEAD:].decode(errors="replace").splitlines(keepends=True)
+    end = list(takewhile(lambda line: not line.strip() or begins_with_word(line), reversed(lines)))
+    words = [line.strip() for line in reversed(end) if line.strip()]
+    first = text.rows.split("\n", 1)[0]
+    if not first or begins_with_word(first) or len(words) > TUNING.ending:
+        return content, []
+    return content[: len(content) - len("".join(end).encode())], words
 
 
 def _beginning(content: bytes) -> Beginning:
@@ -160,7 +191,8 @@ def _beginning(content: bytes) -> Beginning:
         start += 1
     texts = [k for k in range(start) if len(cells[k]) == width and (k >= header or COMMENT.match(lines[k]))]
     units = {k: [plain_unit(x) for x in cells[k]] for k in texts}
-    # Names, and the header itself, may contain words such as `deg`.
+    # A line counts as a line of units only if more than half of its nonempty cells are units: a line of names may also
+    # contain a word such as `deg`.
     stated = [k for k, x in units.items() if sum(map(is_unit, x)) > sum(map(bool, x)) / 2]
     stated = stated if len(stated) < len(texts) else []
     below = [k for k in range(header, start) if k not in stated]
@@ -197,10 +229,13 @@ def _header_row(lines: Sequence[str], cells: Sequence[Sequence[str]], width: int
 
 
 def _column_names(rows: Sequence[list[str]]) -> list[str]:
-    """Return the names of the columns of a CSV file from the cells of its header, and of the lines below it.
+    """Return the names of the columns of a CSV file from the cells of its header (rows[0]) and of the next lines.
 
-    Names may be in two lines: the first line has the quantities, each repeated for all joints or only above its first
-    joint; the second line has the joints.
+    The next lines are used only if several columns have the same name in the header. The header then has the
+    quantities, each repeated for all joints or only above its first joint, and the next line has the joints: "q" above
+    "elbow" gives the name "q_elbow".
+
+    rows: cells of the header and of the lines between the header and the values, without lines of units.
     """
     names = rows[0]
     if len(rows) == 1 or len(set(names)) >= len(names) - 1:
@@ -215,8 +250,8 @@ def _column_names(rows: Sequence[list[str]]) -> list[str]:
 def _is_text(line: str, header: str, cells: Sequence[str]) -> bool:
     """Return True if a line below the header of a CSV file has no values: units, names, or the header again.
 
-    Names and units may have digits, such as "joint1" and "m/s2". A value is a cell that is a number, or has a number or
-    a time in its text, such as "[0.1, 0.2]" and "10:00:00".
+    A line has values if one of its cells is a number, or contains a point, comma or colon between two digits, such as
+    "[0.1, 0.2]" and "10:00:00". Names and units with digits, such as "joint1" and "m/s2", are no values.
     """
     has_values = any(map(is_number, cells)) or re.search(r"\d[.,:]\d", line)
     return bool(line) and (line == header or not has_values)

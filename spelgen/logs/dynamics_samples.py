@@ -117,7 +117,7 @@ def _columns(
     is_denser = rate > 1.5 * FREQUENCY
 
     def sampled(signals: np.ndarray) -> np.ndarray:
-        """Return signals of `piece` at its sample times, (T, ...), filtered and resampled to the times t (100 Hz)."""
+        """Return signals of the piece, (S, n), low-passed and resampled to the regular times t (100 Hz), (T, n)."""
         if cutoff is None:
             return resampled(times, signals, t, rate)
         # A dense log is filtered before it is resampled: resampling first would alias frequencies above 50 Hz.

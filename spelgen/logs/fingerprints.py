@@ -22,7 +22,7 @@ class Fingerprints:
         self._names: dict[int, str] = {}
 
     def add(self, name: str, fingerprint: Collection[int]) -> None:
-        """Add the fingerprint of a recording."""
+        """Add the fingerprint (hashes of samples) of the recording `name`, so that later copies of it are found."""
         self._recordings[name] = fingerprint
         for number in fingerprint:
             self._names.setdefault(number, name)

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
+from spelgen.logs.row_names import are_names
 from spelgen.logs.tables import Layout, LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping
 
@@ -46,7 +47,8 @@ CONVERT = {
     ".npy with a dict": _PYTHON.format(
         "numpy; numpy.savez('{1}.npz', **numpy.load('{0}', allow_pickle=True).item())"
     ) + ' (only a file of a known source: pickles may contain code)',
-    # JSON has the fields of structs, as x.q; NPZ would have them as Python objects.
+    # The file is converted to JSON and not to NPZ: JSON can represent structs, whose fields are then read as columns
+    # such as x.q. NPZ would contain structs as Python objects, which are not read.
     ".mat": _PYTHON.format(
         "json, scipy.io; json.dump(scipy.io.loadmat('{0}', simplify_cells=True), open('{1}.json', 'w'), "
         "default=lambda x: x.tolist() if hasattr(x, 'tolist') else str(x))"
@@ -94,7 +96,8 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> Itera
     with reading(path):
         for log in log_format.read(path, joints, mapping):
             layout = table_layout(log, joints, path)
-            yield layout, log.read(stored_columns(layout, log.schema.names))
+            names = [x.name for x in log.schema if are_names(x.type)]
+            yield layout, log.read([*stored_columns(layout, log.schema.names), *names])
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:

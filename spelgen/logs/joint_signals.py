@@ -266,7 +266,11 @@ def find_words(signals: JointSignals) -> Advice | None:
 
 
 def _words_text(signals: JointSignals, readings: Mapping[str, WordReading]) -> str:
-    """Return the text of the finding of `find_words`. readings: decoding of each signal of register words, by name."""
+    """Return the message of `find_words` about signals that are register words: the size and number of their jumps.
+
+    Register words are the raw integers of a drive's register, which overflow or have a sign bit. readings: {name of a
+    signal, such as "q": the decoding of its words}.
+    """
     (name, reading), *others = readings.items()
     raw = signals.raw(name)
     values, what = unwrapped(raw, reading.size), "a register or an angle that starts again"
@@ -300,15 +304,16 @@ def find_jumps(signals: JointSignals) -> str | None:
 def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
     """Return the decoding of a signal of the joint as register words; None if it does not consist of such words.
 
-    A joint with a single jump, or with noise at an end of the register, may suggest a wrong decoding. The registers of
-    all joints have the same type, so the decodings of all joints are tried, the most frequent first. The result is the
-    first one that was found for this joint or removes more than half of its jumps.
+    Register words are the raw integers of a drive's register: they overflow at a period, or have a bit for the sign. A
+    joint with a single jump, or with noise about the value of overflow, may suggest a wrong decoding. The registers of
+    all joints have the same type, so the decodings found for all joints are tried, the most frequent first. A decoding
+    is returned if it was found for this joint, or if it removes more than half of the jumps of this joint.
 
     name: signal, "q", "qd", "tau" or "u".
     """
     present, raw = _reading(signals, name), signals.raw(name)
-    # Decodings of other joints are tried only if the signal jumps, by more than 40 % of its range. Two samples show no
-    # jump: their only step always equals their range.
+    # Decodings that were found for other joints are tried only if this signal has a jump, by more than 40 % of its
+    # range. In a signal of two samples nothing is a jump: its only step always equals its range.
     if len(raw) < 3 or not (np.abs(np.diff(raw)) > 0.4 * np.ptp(raw)).any():
         return present
     numbers = [k for k in range(len(signals.joints)) if k != signals.number]
@@ -325,15 +330,18 @@ def _shared_reading(signals: JointSignals, name: str) -> WordReading | None:
 
 
 def _reading(signals: JointSignals, name: str) -> WordReading | None:
-    """Return the decoding of a signal as register words, derived from its own jumps; None if no decoding fits."""
+    """Return the decoding of a signal as register words (see `_shared_reading`); None if no decoding fits.
+
+    The size of the signal's jumps shows the period at which the words overflow, or the value of their sign bit.
+    """
     mapping, values = signals.trajectory.mapping, signals.signal(name)
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.
         has_unit = mapping.unit(name, signals.joint) is not None
         turns = [2 * np.pi / abs(mapping.scale(name, signals.joint)), *([] if has_unit else [360.0])]
-    # Lost samples and outliers are removed first: they cause jumps, too, but only jumps by the period or sign bit of
-    # register words determine a decoding.
+    # The decoding is derived from the jumps of the signal, which have the size of the period or of the sign bit. Lost
+    # samples and outliers cause jumps of other sizes, so they are removed first.
     is_valid = ~(is_outlier(values, smooth=True) if name == "q" else is_lost(values))
     for turn in turns:
         word = read_as_words(signals.raw(name)[is_valid], turn)
@@ -348,8 +356,9 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
 def find_elastic(signals: JointSignals) -> str | None:
     """Return a message if the apparent inertia of the joint shows the resonance of an elastic gear or belt.
 
-    The apparent inertia is the torque component in phase with the acceleration, divided by the acceleration; it depends
-    on frequency as H(f) in the docstring of this module.
+    The apparent inertia H(f) at the frequency f is the torque component in phase with the acceleration, divided by the
+    acceleration. An elastic joint has H(f) = J_m + J_l / (1 - (f / f_0)^2), with the inertias J_m of the motor and J_l
+    of the link and the resonance f_0 [Hz]; a rigid joint has H(f) = J + c / f^2, where c is due to gravity.
     """
     piece = max(split_at_gaps(signals.trajectory), key=len)
     rate, k = piece.sample_rate, signals.number
@@ -376,9 +385,9 @@ def find_elastic(signals: JointSignals) -> str | None:
         # link would not be visible in the motor's torque.
         if motor > 0 and link > 0.1 * motor:
             candidates.append((error, resonance, motor, link))
-    # A joint counts as elastic if the RMS error of the rigid model is at least 10 %, and the RMS error of the elastic
-    # model is at most 6 % and at most half the error of the rigid model. With these thresholds no recorded arm counts
-    # as elastic.
+    # RMS errors of the two models are errors of the apparent inertia, relative to its RMS. A joint counts as elastic if
+    # the error of the rigid model is at least 10 %, and the error of the elastic model is at most 6 % and at most half
+    # the rigid model's. With these thresholds there is no false alarm for the recorded arms, which are rigid.
     if rigid < 0.1 or not candidates or min(candidates)[0] > min(0.06, rigid / 2):
         return None
     _, resonance, motor, link = min(candidates)
@@ -421,8 +430,9 @@ def _apparent_inertia(
     firsts = np.unique(np.searchsorted(frequency, edges))
     (moved, driven), together = np.add.reduceat(power, firsts, axis=1), np.add.reduceat(cross, firsts)
     means = np.add.reduceat(frequency, firsts) / np.diff(np.append(firsts, len(frequency)))
-    # A band is coherent if its squared in-phase coherence is above 0.85. Bands with less than 0.1 % of the acceleration
-    # power of the strongest band are excluded, too, since their ratio would be noise.
+    # A band is coherent if the squared in-phase coherence of torque and acceleration is above 0.85. Bands with less
+    # than 0.1 % of the acceleration power of the strongest band are excluded, too: their apparent inertia, the ratio of
+    # torque to acceleration, would be noise.
     coherent = together**2 > 0.85 * moved * driven
     coherent &= moved > 1e-3 * moved.max(initial=0.0)
     return means[coherent], together[coherent] / moved[coherent]

@@ -13,7 +13,8 @@ import numpy as np
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import Decoding
 
-# Smallest step of register words, as a fraction of the signal's range: words have at most 18 bits, and 2^-18 is 4e-6.
+# Register words of drives have at most 18 bits, so their step is at least 2^-18 = 4e-6 of their range. Smaller steps of
+# a signal are rounding errors.
 FINEST_WORD = 4e-6
 
 
@@ -49,7 +50,8 @@ def signed(words: np.ndarray, sign_bit: float) -> np.ndarray:
 def decoded(words: np.ndarray, key: Decoding, size: float) -> np.ndarray:
     """Return the numbers (T,) that register words (T,) represent.
 
-    key: "sign_bit" or "period", the type of the words. size: sign bit or period, in the unit of the words.
+    key "sign_bit": a word w >= size represents size - w. key "period": words wrap at the period `size`; the wraps are
+    removed, and the median of the signal is shifted to within half a period of 0. Size and words have the same unit.
     """
     return signed(words, size) if key == "sign_bit" else centred(unwrapped(words, size), size)
 
@@ -125,12 +127,15 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
 def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin: int = 0) -> np.ndarray:
     """Return a mask (T,) of stale samples: repetitions of an old value while the measured quantity must have changed.
 
-    A block is a run of equal values. It is stale if it is more than 20 times as long as the median block, and if a
-    reference signal changes by more than `min_change` within it. A quantised signal has genuine blocks: in such a
-    signal, the step at the end of a stale block must also be larger than four times the typical step (see the module).
+    A block is a run of equal values. A block is stale, except for its first sample, if it meets these conditions:
 
-    values: the signal (T,). changes: the reference signal (T,), for example the position for a torque. margin: number
-    of samples at both ends of a block in which a change of the reference signal does not count.
+    1. It has more than 20 times as many samples as the median block.
+    2. The reference signal `changes` changes by more than `min_change` within the block, not counting the first and the
+       last `margin` samples.
+    3. If the signal is quantised, the step at the end of the block is larger than four times the median step between
+       blocks: slow motion of a quantised signal also has long blocks, but these end with a step of one quantum.
+
+    values: the signal (T,). changes: the reference signal (T,), for example the velocity of the joint for its torque.
     """
     stale = np.zeros(len(values), bool)
     starts = np.flatnonzero(np.diff(values, prepend=np.nan))
@@ -167,10 +172,13 @@ def jumps(t: np.ndarray, q: np.ndarray) -> np.ndarray:
 def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]:
     """Return a mask (T,) of the repeated rows of a log (T, C) with C columns, and the number of copies of each row.
 
-    A logger may write each row m times. A block is a run of k equal rows. In a block written during motion, all rows
-    after the first are repeats. The position step at the end of such a block is as large as k normal steps: 1, 1, 1, 4,
-    5 has k = 3. The number of copies m is the median of k over the blocks during motion, or 1 if there are none. In all
-    other blocks, the arm was at rest: every m-th row is original, the rows between are repeats.
+    A logger may write each row m times. A block is a run of k equal rows, of one of two kinds:
+
+    1. The arm moved, and all rows after the first are repeats. Such a block is recognised by the position step at its
+       end, which is as large as k normal steps. Example: in the positions 1, 1, 1, 4, 5, the first three rows are a
+       block with k = 3, and the step from 1 to 4 makes up for the repeats. The number of copies m is the median of k
+       over all blocks of this kind, or 1 if there are none.
+    2. Otherwise the arm was at rest: every m-th row of the block is original, and the rows between are repeats.
 
     positions: number of leading columns that are positions.
     """
@@ -235,8 +243,8 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))
     rows = np.flatnonzero(np.abs(steps) > limit)
-    # A signal in which more than half of the samples jump does not consist of register words: even noise about 0
-    # changes a sign bit at half of the steps at most.
+    # A change of the sign bit, or an overflow, is a jump. In register words at most half of the steps are jumps: even
+    # the sign of noise about 0 changes only at half of the steps. A signal with more jumps has another fault.
     if not len(rows) or len(rows) > 0.5 * len(values):
         return None
     jump, typical = float(np.median(np.abs(steps[rows]))), _typical_step(np.abs(steps))
@@ -275,10 +283,11 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
 
 def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
-    """Return candidates for the period or sign bit of register words (see `Word`): 2^k revolutions or 2^k steps.
+    """Return candidates for the size of register words, the value at which they overflow or of their sign bit.
 
-    The steps are the quantisation steps of ``values``, the signal (T,) in the unit of the log. turn: one revolution in
-    this unit; None if the joint does not rotate.
+    Drives have words of 2^k steps (k = 10 to 17) or of 2^k revolutions (k = 0 to 8). A step is the quantisation step of
+    ``values``, the signal (T,) in the unit of the log. turn: one revolution in this unit; None if the joint does not
+    rotate.
     """
     sizes = [] if turn is None else [turn * 2.0**k for k in range(9)]
     levels = np.unique(values)

@@ -94,7 +94,8 @@ def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[Log
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
     """Return the table of one recording of an archive; `recording` is its name, None if it is the only one.
 
-    A matrix (T, n) of an archive replaces n arrays, one per joint: the column `q_<joint>` may be `q[2]`.
+    An archive may contain a matrix `q` (T, n) in place of n arrays `q_<joint>`. The mapping of the table then has names
+    such as `q[2]`, column 2 of the matrix, in place of the name `q_<joint>`.
     """
     columns: dict[str, dict[str, str | None]] = {joint: {} for joint in joints}
     for quantity in mapping.quantities if joints else ():
@@ -104,7 +105,8 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
             for joint, index in zip(joints, order, strict=True):
                 columns[joint][quantity] = f"{matrix}[{index}]"
     mapping = mapping.with_joint_columns(columns)
-    # `vectors`: columns in the mapping that are vectors, or elements of a matrix, such as data[0].
+    # `vectors`: names of all columns in the mapping. A name is the name of an array that is a vector (T,), or of a
+    # column of a matrix, such as data[0].
     vectors = {mapping.columns.t, *starmap(mapping.column, mapping.signals(joints))}
 
     def read(names: list[str] | None) -> pa.Table:
@@ -131,8 +133,8 @@ def _equally_long(arrays: NpzArrays, names: Sequence[str], vectors: Collection[s
         if length != samples or not (is_matrix or arrays.is_vector(name)):
             expected, do = f"a value for each of the {samples} times", "resample it to these times"
             raise arrays.error(name, f"an array of shape {array.shape}", expected, do)
-        # The array is converted to double precision and native byte order, since Arrow rejects other types and byte
-        # orders.
+        # Arrow has no floating-point numbers of more than 64 bits, and accepts only the native byte order.
+        # Floating-point numbers are therefore converted to double precision, others to the native byte order.
         wide = float if array.dtype.kind == "f" else array.dtype.newbyteorder("=")
         values = pa.array(array.astype(wide).ravel())
         table[name] = pa.FixedSizeListArray.from_arrays(values, array.shape[1]) if is_matrix else values
@@ -158,9 +160,9 @@ def _longest(arrays: NpzArrays) -> pa.Table:
     columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
     chosen = [x for x in columns if samples == (arrays[x].size if x in vectors else len(arrays[x]))]
     for name, shape in sorted(shapes.items(), key=lambda item: -len(item[1])):
-        # Other arrays with a row per time, such as images, are no signals. But a dimension of `samples` elsewhere is a
-        # transposed signal, and a dimension of `samples` +- 1 is a signal of other times: a simulation may have one
-        # state more than inputs.
+        # Arrays whose first axis has the length `samples`, but which are no columns (such as images), are skipped. If
+        # another axis has this length, the array is a transposed signal. If an axis is longer or shorter by one, the
+        # array is a signal at other times: a simulation may return one state more than inputs. Both are errors.
         if name not in chosen and shape[:1] != (samples,) and any(abs(x - samples) < 2 for x in shape):
             do = (
                 "transpose it: rows are times"

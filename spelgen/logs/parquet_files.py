@@ -63,7 +63,10 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
     """Return a list of one table, from a JSON file with a list of objects (rows), or with lists of values (columns).
 
     The longest list states the number of rows; shorter lists are omitted. Names of nested values are joined by points,
-    such as `joints.elbow.position`; an object in a list is named by its value `name`, else by its index.
+    such as `joints.elbow.position`; an object in a list is named by its value `name`, else by its index. A file with
+    one object per line is read by `read_json_lines`.
+
+    joints: names of the joints. mapping: mapping of the columns, which is added to the table.
     """
     try:
         document = json.loads(file.read_bytes())
@@ -85,7 +88,11 @@ def read_json_document(file: Path, joints: Sequence[str], mapping: LogMapping) -
 
 
 def _lists(document: object, name: str) -> Iterator[tuple[str, list[object]]]:
-    """Yield (name, items) of the lists in a JSON document; lists within a sample (a value per joint) are omitted."""
+    """Yield (name, items) of the lists in a JSON document, such as lists with an item per sample.
+
+    Lists within a sample, such as the positions of all joints, are not yielded. If a list contains joints, each with
+    lists of samples, the lists of the joints are yielded in place of this list.
+    """
     items: Iterable[tuple[str, object]] = document.items() if isinstance(document, dict) else ()
     if isinstance(document, list):
         objects = [x for x in document if isinstance(x, dict)]
@@ -216,7 +223,8 @@ def _with_scale(
     data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
     may be normalised, if neither a unit nor a calibration is given.
     """
-    # Only the positions of the arm's joints are searched. Other elements may be of a gripper, or may be velocities.
+    # `largest` is the largest magnitude of the positions of the arm's joints. Other elements of the state are not used:
+    # they may belong to a gripper, or be velocities.
     largest, used = 0.0, {mapping.column("q", joint) for joint in joints}
     for states in (_column(file, STATE) for file in files):
         if states is None:

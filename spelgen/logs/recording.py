@@ -203,9 +203,10 @@ def _remove_delays(rows: Rows) -> None:
 def outlier_rows(quantity: str, values: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of lost samples and outliers in a signal `values` (T,) of one joint.
 
-    Velocities of exactly 0 are no lost samples: a joint at rest has them. Genuine commands may jump, or be 0 in
-    successive samples. Commands are therefore removed from the mask if they are 0 next to another 0, or if they are
-    close to the position: at most twice as far as the farthest command that is no outlier.
+    A lost sample is a 0 between values far from 0. Velocities of exactly 0 are no lost samples: a joint at rest has
+    them. Genuine commands may jump, or be 0 in successive samples. Commands are therefore removed from the mask if they
+    are 0 next to another 0, or if their distance from the position is at most twice the largest such distance of the
+    commands outside the mask.
 
     quantity: "q", "qd", "tau" or "u". q: (T,) positions of the joint [rad, m].
     """
@@ -223,8 +224,9 @@ def stale_rows(
 ) -> np.ndarray:
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
-    A torque that remains at the largest or smallest torque of the recording is not stale, since the drive limits the
-    torque. A torque with the last value of the recording is not stale: the motor may be off while the joint moves.
+    Two kinds of constant torque are not stale. A torque equal to the largest or smallest torque of the recording may be
+    limited by the drive. A torque equal to the torque of the last sample may be the torque of a motor that was switched
+    off while the joint moved.
 
     Args:
         quantity: name of the signal, "q", "qd", "tau" or "u". Commands are never stale.
@@ -234,7 +236,8 @@ def stale_rows(
         qd: (T,) velocities of the joint [rad/s, m/s]; empty if they were not logged.
         u: (T,) commanded positions of the joint [rad, m]; empty for joints without position servo.
     """
-    # Stale blocks have more than 20 samples (see `is_stale`). Data sets may have thousands of shorter recordings.
+    # Stale blocks have more than 20 samples (see `is_stale`), so shorter recordings have none. Returning here saves
+    # time in data sets of thousands of short recordings.
     if len(t) <= 20:
         return np.zeros(len(t), bool)
     if u.size:
@@ -262,10 +265,11 @@ def listed_times(t: np.ndarray) -> str:
 def _order_in_time(rows: Rows) -> None:
     """Sort the rows by time and remove or correct equal times; a message is added about each repair.
 
-    Rows are sorted by time, unless positions are then less smooth, or velocities opposite. Of several rows with equal
-    times only the first is kept. If many rows have the time of the row before but other values, the resolution of the
-    clock is too low: all rows are kept, and evenly spaced times are reconstructed. Raises LogError for a clock that
-    restarts or falls, and for times that cannot be reconstructed.
+    If sorting makes the positions less smooth, the clock was set back: the rows keep their order, and the times are
+    made continuous. Of several rows with equal times only the first is kept. If many rows have the time of the row
+    before but other values, the resolution of the clock is too low: all rows are kept, and evenly spaced times are
+    reconstructed. Raises LogError if the clock restarts without a continued motion, if it counts down (the velocities
+    are then opposite to dq/dt after sorting), and for times that cannot be reconstructed.
     """
     rows.leave_out(_is_timeless(rows.t), "left out, with times far from those of all other rows")
     # Times that are dates (seconds since 1970) are converted to seconds since the first row with a time. The reader of
@@ -276,10 +280,13 @@ def _order_in_time(rows: Rows) -> None:
     if late:
         order = np.argsort(rows.t, kind="stable")
         message = f"{counted(late, 'time')} before that of the row above: the rows were sorted"
-        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues, the clock
-        # was set back, or its counter overflowed; else the file has several recordings, which sorting would interleave.
+        # If positions are rougher after sorting, the clock restarted in the file. If the motion continues at the
+        # restart, the clock was set back, or its counter overflowed. If the motion does not continue, the file has
+        # several recordings, which sorting would interleave.
         if 2 * late > len(rows.t):
-            # Rows in reverse order have the velocities of the sorted positions; a time that remains has the opposite.
+            # Most times are before the time of the row above. Either the rows are in reverse order, or the clock counts
+            # down (remaining time). The logged velocities decide: in the first case they agree with dq/dt of the sorted
+            # rows. In the second case they have the opposite sign of dq/dt, and sorting would reverse the motion.
             joints, quantities = len(rows.layout.joints), rows.layout.mapping.quantities
             velocities = (
                 rows.data[order, 1 + joints : 1 + 2 * joints] if "qd" in quantities else np.zeros((2, 1))
@@ -330,7 +337,9 @@ def _join_signals(rows: Rows) -> None:
     base = finite[:, 1 + int(finite[:, 1:].sum(axis=0).argmin())]
     complete = finite.all(axis=1)
     if complete.sum() > 0.9 * base.sum():
-        rows.leave_out(~complete, "without all signals left out: signals have different rates")
+        rows.leave_out(
+            ~complete, "without all signals left out: of other joints, or signals have different rates"
+        )
         return
     order = np.argsort(data[:, 0], kind="stable")
     data, finite, base = data[order], finite[order], base[order]
@@ -391,11 +400,11 @@ def _roughness(positions: np.ndarray) -> float:
 
 
 def _continues(rows: Rows) -> bool:
-    """Return True if the motion continues at each row whose time is before the time of the row above.
+    """Return True if the motion is continuous at each row at which the time steps back, so that the clock was set back.
 
-    The motion continues at a row if a joint moves in the rows around it, and each position changes by at most twice its
-    largest change in these rows. If the time steps forward by a gap and then back, only one time is wrong and the clock
-    was not set back: False is returned.
+    The motion is continuous at such a row if a joint moves in the rows around it, and if no position changes by more
+    than twice its largest change in the rows around it. If the time steps forward by a gap and then back, a single time
+    is wrong and the clock was not set back: False is returned.
     """
     changes, steps = np.abs(np.diff(rows.positions, axis=0)), np.diff(rows.t)
     if len(changes) < 2 * TUNING.jump_window:
@@ -429,9 +438,12 @@ def _pieces(t: np.ndarray) -> Iterator[slice]:
 
 
 def earlier(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Return a delayed signal (T, ...), sampled at times t (T,) [s], shifted back by its delay [s]: values(t + delay).
+    """Return a logged signal without its delay, (T, ...): the returned value at time t was logged at t + delay.
 
-    At the ends of a gap-free piece, the first or last value of the piece replaces values that were not logged.
+    A positive delay [s] means that the signal was logged later than it occurred. Near the ends of a gap-free piece,
+    where t + delay is outside the piece, the first or last value of the piece is returned.
+
+    t: times of the samples (T,) [s]. values: logged signal (T, ...).
     """
     if not delay:
         return values

@@ -34,6 +34,7 @@ from spelgen.logs.column_selection import (
 )
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
+from spelgen.logs.row_names import first_list, rows_by_names
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.logs.unit_checks import time_unit
@@ -60,8 +61,9 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError for a file that cannot be
-    read, is a ROS bag, has joint names in a column, or has only torques or only commands. If `commands` is False, the
-    error is also raised for a file with only positions, or with commanded positions and no torques.
+    read, is a ROS bag, has joint names in a column, has positions of several arms, or has no positions but only torques
+    or only commands. If `commands` is False, LogError is also raised for a file without torques that has commanded
+    positions, or only times, positions and velocities.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
@@ -88,6 +90,9 @@ def _names_signals(values: Sequence[object], joints: int) -> bool:
 
 def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands: bool) -> Suggestion:
     """Return the draft of the column mapping for a table of the log `file`; for `commands` see `suggest_mapping`."""
+    # Of rows with different lists of joint names, such as rows of two arms, only rows with the arm's list are used.
+    for rows in list(rows_by_names(table, dict(zip(joints, joints, strict=True)), file).values())[:1]:
+        table = table.filter(rows)
     dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
@@ -106,17 +111,20 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     ):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
-    moving = [x for x in columns_of["q"] if len(set(_numbers(table, x.name).tolist())) > 1]
+    moving = _changing(columns_of["q"], table)
     require_one_arm(moving, len(joints), file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
-    # to a base or gripper at rest.
+    # to a base or gripper at rest. A base at rest has seven positions, but six velocities and torques.
     moved = {x.number for x in best_signal(moving, len(joints))}
     if len(moved) == len(joints):
+        count = len(columns_of["q"])
         for quantity, named in columns_of.items():
-            complete = [x for x in named if x.number in moved]
-            columns_of[quantity] = complete if {x.number for x in complete} == moved else named
+            complete = (
+                [x for x in named if x.number in moved] if len(named) == count else _changing(named, table)
+            )
+            columns_of[quantity] = complete if len({x.number for x in complete}) == len(moved) else named
     # The order of numbered columns may differ from the order of the arm's joints: ROS often sorts joints by name. If
     # cells of the log contain joint names, they state the order.
     order = _order_in_cells(table, joints)
@@ -187,9 +195,10 @@ def _unknown_units(by_joint: ByJoint) -> list[tuple[str, str]]:
 
 
 def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) -> list[ColumnName]:
-    """Return the columns with quantities of a state [q; qd], such as x0, x1, ..., of which the names state nothing.
+    """Return the columns; columns of a state [q; qd], such as x0, x1, ..., get the quantities "q" and "qd".
 
-    The last half of the state's columns are the derivatives of the first half. joints: number of joints.
+    The names of a state's columns do not state their quantities. n = `joints` columns are positions and the next n are
+    velocities if the correlation of the velocities with the derivatives of the positions is above 0.9.
     """
     unstated = [x for x in columns if x.number >= 0 and not x.words & (COMMANDED | OTHERS)]
     unstated = [x for x in unstated if x.quantity in ("q", None)]
@@ -205,9 +214,11 @@ def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) ->
 
 
 def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table) -> tuple[float, float]:
-    """Return the correlation of columns x with the derivatives of columns q, and the relative distance of x and q.
+    """Return two similarities of columns x, of an unknown quantity, to columns q of positions.
 
-    Both are medians over the pairs (q, x) that move; NaN if none does.
+    The first is the correlation of x with the derivative of q: it is near 1 if x is a velocity. The second is the
+    distance std(x - q) / std(q): it is small if x is a commanded position. Both are medians over the pairs (q, x) in
+    which both columns change; NaN if there is no such pair.
     """
     values = [(_numbers(table, q.name), _numbers(table, x.name)) for q, x in pairs]
     moving = [(q, x) for q, x in values if len(q) == len(x) > 2 and np.ptp(q) * np.ptp(x) > 0]
@@ -220,8 +231,13 @@ def _similarity(pairs: Sequence[tuple[ColumnName, ColumnName]], table: pa.Table)
 def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
     """Return the columns, with quantities for ambiguous names such as `t0`, `v0` and `u0`, derived from their values.
 
-    Numbered columns `t` are torques. `v` and `u` are velocities if they are correlated with the derivatives of the
-    positions; otherwise `u` are commanded positions if they are close to the positions, or torques.
+    A name has a letter and a number. Its values are compared with the position column of the same number; without such
+    a column it gets no quantity. A quantity that other columns already have is not assigned. Letters mean:
+
+    - `t`: torque.
+    - `v`: velocity if its correlation with the derivative of the position is above 0.9; otherwise none.
+    - `u`: velocity if this correlation is above 0.9. Otherwise torque if it differs from the position by more than 0.3
+      standard deviations of the position; a smaller difference shows a commanded position, which gets no quantity here.
     """
     result = list(columns)
     of_number = {
@@ -243,9 +259,11 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
 
 
 def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: int, file: Path) -> None:
-    """Raise LogError if one of the columns `names` states the joint or the signal of each row (see `_names_signals`).
+    """Raise LogError for a log in long format: a row per time and joint, or per time and signal, not a row per time.
 
-    joints: number of joints. file: path of the log, for the error.
+    In such a log one of the columns `names` states the joint or the signal of each row. Its values repeat in cycles,
+    with at least as many different values as there are `joints` (see `_names_signals`). file: path of the log, for the
+    error.
     """
     for name in names:
         if name in table.column_names and _names_signals(table[name].to_pylist(), joints):
@@ -257,14 +275,20 @@ def _require_joints_in_columns(table: pa.Table, names: Sequence[str], joints: in
             raise LogError(got, file=file, expected="all joints in each row", do=do)
 
 
+def _changing(columns: Sequence[ColumnName], table: pa.Table) -> list[ColumnName]:
+    """Return the columns whose values are not all the same."""
+    return [x for x in columns if len(set(_numbers(table, x.name).tolist())) > 1]
+
+
 def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: pa.Table) -> ColumnName:
     """Return the column of times, the best of the candidates ``clocks``; a column named "" if the log has no times.
 
-    Without candidates, a column whose values rise like a clock is returned. If the column contains whole seconds, and
-    another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
+    Without candidates, a column whose values rise by regular steps is returned. If the column contains whole seconds,
+    and another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
-    # The stamp in a message header is preferred to other columns of times, which may be times of receipt and not of
-    # measurement. Without a stamp, the name with the fewest words is used, or of several the most regular times.
+    # Of several columns of times, the best is searched in this order: (1) the stamp in a message header, since other
+    # times may be times of receipt and not of measurement, (2) the column whose name has the fewest words, (3) the
+    # column with the most regular time steps.
     nanoseconds = [x for x in columns if re.search(r"n(?:anos|(?:ano)?sec(?:ond)?s?)$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
@@ -303,7 +327,10 @@ def _is_rising(values: np.ndarray) -> bool:
 
 
 def _numbers(table: pa.Table, name: str) -> np.ndarray:
-    """Return the numbers of a column, or of an element of lists, without nulls; an empty array for other values."""
+    """Return the numbers of the column `name`, such as "q", "q[2]" (item 2 of lists) or "sec + nsec", without nulls.
+
+    The result is empty if the table has no such column, or its values are no numbers.
+    """
     is_stored = name and stored_names(name, table.column_names)
     values = logged_column(table, name).drop_null() if is_stored else pa.chunked_array([[]])
     is_numeric = pa.types.is_integer(values.type) or pa.types.is_floating(values.type)
@@ -347,12 +374,17 @@ def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
 
 
 def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Return {joint: {quantity: unit}} from the units and words of columns. by_joint: {quantity: {joint: column}}."""
+    """Return {joint: {quantity: unit}} from the stated units of columns; joints without a known unit have {}.
+
+    A column states its unit in its name or in a line below the header. If it does not, velocities have the unit of the
+    positions per second, and torques whose column name has a word for currents have the unit A. by_joint: {quantity:
+    {joint: column}}.
+    """
     units: dict[str, dict[str, str]] = {joint: {} for joint in joints}
     for quantity, named in by_joint.items():
         for joint, column in named.items():
             unit = mapped_unit(quantity, column.unit)
-            if unit is None and quantity == "qd" and "q" in units[joint]:
+            if not column.unit and quantity == "qd" and "q" in units[joint]:
                 unit = f"{units[joint]['q']}/s"
             if unit is None and quantity == "tau" and column.words & CURRENT:
                 unit = "A"
@@ -372,23 +404,26 @@ def _unit_of_times(name: str, table: pa.Table) -> str | None:
     """Return the unit in which the median time step of a column is plausible for a log; None if there is none."""
     times = _numbers(table, name)
     steps = np.diff(times)
-    # Ticks of 100 ns since 1601 (Windows) or the year 1 (.NET), in years from 2000 to 2080.
+    # Windows counts ticks of 100 ns since the year 1601, and .NET since the year 1. 3.2e14 ticks are 1.014 years, so
+    # dates from the year 2000 on are above 394 times 3.2e14 ticks (399 years) or 1972 times 3.2e14 ticks (1999 years).
+    # The upper bounds are 81 years later.
     if times.size and any(low < times[0] / 3.2e14 < low + 80 for low in (394, 1972)):
         return "0.1 us"
     return time_unit(float(np.median(steps[steps > 0]))) if (steps > 0).any() else None
 
 
 def _order_in_cells(table: pa.Table, joints: Sequence[str]) -> dict[str, int]:
-    """Return {joint: number of its columns}, such as 2 for the column `q[2]`, from joint names in the first row.
+    """Return {joint: the number in the names of its columns}, such as 2 for the columns `q[2]` and `q2`.
 
-    The names are cells of columns `name0`, `name1`, ..., or elements of a list: "elbow" in the column `name2` gives
-    {"elbow": 2}. Joints whose names are not in the row are omitted.
+    Joint names in the first row of the log state the numbers: in cells of columns `name0`, `name1`, ..., or in a list.
+    Example: "elbow" in the column `name2`, or as item 2 of a list, gives {"elbow": 2}. Joints without a name in the log
+    are omitted.
     """
     listed_names = json.loads((table.schema.metadata or {}).get(JOINTS_KEY, "[]"))
     order = {name: position for position, name in enumerate(listed_names) if name in joints}
     for name, column in zip(table.schema.names, table.columns if len(table) else (), strict=False):
         numbers, first = re.findall(r"\d+", name), column[0].as_py()
-        for position, text in enumerate(_first_list(column)):
+        for position, text in enumerate(first_list(column)):
             if text in joints:
                 order[str(text)] = position
         if numbers and first in joints:
@@ -404,13 +439,5 @@ def _names(table: pa.Table) -> list[str]:
     names: list[str] = []
     for name, column in zip(table.column_names, table.columns, strict=True):
         if table.column_names.count(name) == 1 and column.null_count < len(column):
-            names += [f"{name}[{index}]" for index in range(len(_first_list(column)))] or [name]
+            names += [f"{name}[{index}]" for index in range(len(first_list(column)))] or [name]
     return names
-
-
-def _first_list(column: pa.ChunkedArray) -> list[object]:
-    """Return the first list of a column of lists, which may be texts such as "[0.1, 0.2]"; [] for other columns."""
-    first = next(iter(column.drop_null().slice(0, 1).to_pylist()), None)
-    if isinstance(first, str) and (match := re.fullmatch(r"[^\[({]*[\[({]+(.*?)[\])}]+", first.strip())):
-        first = [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
-    return first if isinstance(first, list) else []

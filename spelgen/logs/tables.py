@@ -21,7 +21,7 @@ UNITS_KEY = b"units"  # key of the units in a Parquet file's metadata
 # Codes of the checks of units, which are omitted if a file declares its units.
 UNIT_CODES = ("degrees", "time-unit", "torque-unit", "torque-beyond-drive")
 STATED_KEY = b"stated units"  # key of {column: unit} in a table's metadata, from a line below a header
-JOINTS_KEY = b"joints"  # key of the joint names of a table's numbered columns, in their order
+JOINTS_KEY = b"joints"  # key, in a table's metadata, of the joint names in the order of the columns `q[0]`, `q[1]`, ...
 UNITS = b"t s, q rad or m, qd rad/s or m/s, tau Nm or N"  # units declared in logs that spelgen writes
 
 LFS = b"version https://git-lfs"  # first bytes of a file whose content Git LFS has not fetched
@@ -36,14 +36,15 @@ class Layout:
     """Layout of a log table: the columns that contain the quantities of an arm, and the mapping with their units.
 
     Attributes:
-        file: path of the log, for errors and trajectories.
+        file: path of the log; errors and trajectories contain it.
         columns: names of the columns of t, of q of all joints, of qd of all joints, and of tau of all joints; without
-            qd if velocities are differentiated, and with u instead of qd and tau for logs of commands.
+            qd if velocities are differentiated, and with u (commanded positions of servos) instead of qd and tau for
+            logs of commands.
         labels: column with the names of recordings; None if the table has none.
         joints: names of the joints in the URDF.
         mapping: mapping of the columns, with units, signs and offsets.
-        accepted: codes of checks that are omitted.
-        recording: name of the recording, if the table contains a single one of several in the file.
+        accepted: codes of checks whose findings the user has accepted; they are not run.
+        recording: name of the recording if the file has several and the table contains only one; otherwise None.
         remarks: messages about properties of the file.
         header: number of lines before the values; None if the file does not consist of lines.
     """
@@ -254,9 +255,14 @@ def _naming(unused: Collection[str]) -> str:
 def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
     """Return {joint: pattern that finds its name as a separate word}: the joint 1 is found in `q_1`, but not in `q_12`.
 
-    A joint may be named without the words that all joints share, or without its number: `shoulder_pan` and `S` are the
-    joints shoulder_pan_joint and joint_1_s. The first of these three forms in which all joints are found in `names`,
-    the column names, is used.
+    Three forms of the joint names are searched in `names`, the column names. The first form that finds all joints is
+    used:
+
+    1. The full name.
+    2. The name without the words that all joints share: `shoulder_pan` for shoulder_pan_joint.
+    3. The name without these words and without numbers: `S` for joint_1_s.
+
+    If no form finds all joints, the full name is used.
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()

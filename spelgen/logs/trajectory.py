@@ -280,7 +280,8 @@ LogRows = tuple[Trajectory, slice]
 
 def steps_between(trajectory: Trajectory, longest: float = 3.4e-3) -> int:
     """Return the number of integration steps per mean sample interval, so that a step is at most ``longest`` [s]."""
-    # `longest` is 3.4 ms by default: with longer steps, fits of position servos had armatures biased by a few per cent.
+    # The default of 3.4 ms was chosen because fits of position servos with longer integration steps gave armatures that
+    # were biased by a few per cent.
     return max(1, math.ceil(1 / (trajectory.sample_rate * longest) - 1e-6))
 
 
@@ -293,11 +294,13 @@ def delayed_commands(trajectory: Trajectory, rows: slice, delay: float, steps: i
     """
     samples = trajectory.t[rows]
     earliest, latest = np.searchsorted(trajectory.t, samples[[0, -1]] - delay)
-    # `held_rows`: rows whose commands act between the times samples[0] - delay and samples[-1] - delay. A command acts
-    # until the next one, so the row before samples[0] - delay is included.
+    # With the delay, the motion between the first and the last selected sample depends on the commands between the
+    # times samples[0] - delay and samples[-1] - delay. `held_rows` are the H rows of these commands. A command is held
+    # until the next row, so the last row before samples[0] - delay is included.
     held_rows = slice(max(0, earliest - 1), latest + 1)
     t, u = trajectory.t[held_rows], require_commands(trajectory)[held_rows]
-    # `previous`: (H, n) [rad, m], for each of the H held rows the command of the row before, which acts until this row.
+    # `previous`: (H, n) [rad, m], the command that is held until the time of each of the H rows: the command of the row
+    # before.
     previous = np.concatenate([u[:1], u[:-1]])
     # [s] Before the recording, the first command is assumed to have been constant for 1,000 s.
     corners = np.concatenate([t[:1] - 1e3, t])

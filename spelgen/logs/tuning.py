@@ -9,7 +9,7 @@ class LogTuning:
 
     # [B] Memory limit of the log samples that a fit keeps. It suffices for 25 minutes of seven joints at 1 kHz, from
     # which a torque fit makes 76,000 samples, about the number that its last iterations use. If a fit cuts the samples
-    # into windows of five, the windows need five times this memory.
+    # into windows of five samples that overlap, one for each sample, the windows need five times this memory.
     kept_bytes: int = 2**28
     # [1] Largest number of samples of a segment. Logs that exceed `kept_bytes` are divided into segments, of which only
     # some are kept. 16 s at 1 kHz is long compared with filter transients.
@@ -18,9 +18,11 @@ class LogTuning:
     npz_bytes: int = 2**30
     # [rad, rad/s, Nm; m, m/s, N] Largest magnitude of a signal; larger values have a wrong unit.
     largest_value: float = 1e9
-    # [s] Largest time, so that the fourth power of a time does not overflow.
+    # [s] Largest time. Splines and divided differences (`noise_level`) multiply up to six time differences. The product
+    # is then at most 1e144, far below the largest floating-point number.
     latest: float = 1e24
-    # [s] Shortest time between samples, so that the fourth power of a time step does not underflow.
+    # [s] Shortest time between samples. The product of six time steps (see `latest`) is then at least 1e-90, far above
+    # the smallest floating-point number.
     shortest_step: float = 1e-15
     # [1] A step of a signal that exceeds this multiple of the typical step is a jump. A value of 0 between samples
     # whose magnitudes exceed the same multiple of the typical step is a lost sample: continuous signals approach 0

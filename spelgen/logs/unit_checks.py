@@ -61,7 +61,10 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_units(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd."""
+    """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd.
+
+    The finding is `Advice` with the settings that correct it; if they are unknown, only a message. None: no fault.
+    """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
     if signals.step > SIGNALS.slowest_step:
@@ -83,8 +86,10 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     distance, keys = min(readings, key=lambda reading: round(reading[0], 3), default=(np.inf, {}))
     registers = signals.qd / mapping.scale("qd", joint)
     is_register = bool((registers == registers.round()).all())
-    # Any other common multiple of all joints is of the times, unless the velocities are values of registers: 0.1 of
-    # 0.1 us in us is no rpm, which is 0.105.
+    # If dq/dt is the same multiple of qd at all joints, and no combination of units explains this multiple within a few
+    # per cent, the times are wrong and not the units: `find_time_unit` reports this fault. Example: times in units of
+    # 0.1 us that are read as us give the multiple 0.1, which differs from the 0.105 of velocities in rpm. An exception
+    # are velocities that are whole numbers: they may be values of registers, in any unit.
     is_other = bool(keys) and not is_far and distance > 0.03 + 0.02 * len(keys["units"])
     if is_other and not is_register and _rate_by_velocities(signals):
         return None
@@ -107,7 +112,7 @@ def find_units(signals: JointSignals) -> str | Advice | None:
 
 def _knows_ratio(signals: JointSignals) -> bool:
     """Return True if velocities qd were logged and are proportional to dq/dt: the ratio qd : dq/dt then shows units."""
-    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments
+    is_known = abs(signals.correlation) > SIGNALS.agreement and len(signals.q) > SIGNALS.increments + 1
     return is_known and "qd" in signals.trajectory.mapping.quantities
 
 
@@ -129,8 +134,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     # If all joints move by less than 0.1 rad or m, the unit of positions in the mapping may be wrong, such as deg for
     # positions in rad. Other units of positions are then preferred to other units of velocities.
     largest = float(np.ptp(signals.trajectory.q, axis=0).max())
-    # A unit of positions in which no joint would move by 0.05 rad or m is not tested: a wrong unit of times is then a
-    # better explanation.
+    # Units of positions in which no joint would move by 0.05 rad or m are not tested. If only such a unit explains the
+    # ratio of dq/dt to qd, a wrong unit of times is more likely.
     smallest = 0.05 / largest if is_known and largest > 0 else 0.0
     for unit in positions if stated and is_known and largest < 0.1 else ():
         ratio = SCALES.get(unit, 1.0) / SCALES.get(stated or unit, 1.0)
@@ -152,11 +157,13 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
             yield distance + 0.02 * len(units), {"units": units} if units else {}
     gear = abs(signals.factor)
     if is_far and is_known and not signals.is_whole and np.abs(signals.q).max() < TURNS * gear:
-        # If q is measured at the motor of a gear, any ratio of dq/dt to qd is possible. The correlation shows how exact
-        # the measured ratio is.
+        # If q is measured at the motor of a gear, the ratio of dq/dt to qd is the gear ratio, which may be any number.
+        # The better dq/dt and qd are correlated, the more exact is the measured ratio. The distance (implausibility) of
+        # this explanation therefore decreases with the correlation.
         keys = {"units": {"q": "counts"}, "counts_per_turn": plain_number(2 * np.pi * gear)}
         if signals.factor < 0:
-            # The setting `sign` also reverses the torque, which is assumed to have the sense of the velocity.
+            # dq/dt and qd have opposite signs, so q is reversed by the setting `sign`. This setting also reverses the
+            # torque, which is assumed to have the sense of qd already. A negative gain undoes this.
             keys |= {"sign": -mapping.joint(joint).sign, "gain": -(mapping.joint(joint).gain or 1.0)}
         yield 0.05 + 1 - signals.correlation**2, keys
     is_encoder = is_known and "turns" in positions and (signals.is_whole or not is_far)
@@ -200,8 +207,8 @@ def find_time_unit(signals: JointSignals) -> str | Advice | None:
 def _rate_by_velocities(signals: JointSignals) -> float | None:
     """Return the sample rate [Hz] at which dq/dt would be equal to qd at all joints, for logs with wrong times.
 
-    Return None if the times may be right, or if the ratio of dq/dt to qd is the ratio of two units of time, such as
-    1000.
+    None is returned if the times may be right. None is also returned if the ratio of dq/dt to qd is the ratio of two
+    units of time, such as 1000: the caller then advises the unit of the times instead of a sample rate.
     """
     factors = signals.factors[~np.isnan(signals.factors)]
     mapping, steps = signals.trajectory.mapping, np.diff(signals.trajectory.t)
@@ -246,9 +253,9 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         message = f"qd that is {1e3 * abs(lag):.3g} ms {order} than dq/dt"
         return Advice(message, keys={"velocity": "differentiated"})
     message = f"qd is not dq/dt: the best factor is {factor:.3g}, the correlation {correlation:.3g}"
-    if len(signals.q) <= SIGNALS.increments:
-        # The correlation is computed from changes over ten samples. A log of at most ten samples has only one such
-        # change, so that the correlation is always 1 or -1 and does not justify advice.
+    if len(signals.q) <= SIGNALS.increments + 1:
+        # The correlation is computed from changes over ten samples. In a log of at most 11 samples it is computed from
+        # a single change, so that it is always 1 or -1 and does not justify advice.
         return message
     if abs(factor + 1) <= tolerance and correlation < -SIGNALS.agreement:
         # If only the sign of qd is wrong, q is correct, and its derivative can replace qd.
@@ -288,7 +295,8 @@ def _velocity_sum(signals: JointSignals) -> str:
     products = velocity_products(signals.trajectory)
     n, power = len(signals.joints), products[signals.number, signals.number]
     gram, target = products[n:, n:], products[n:, signals.number]
-    # `factors` are rounded to the coefficients of a differential: -1, -1/2, 0, 1/2 or 1.
+    # In a wrist with a differential gear, the velocity of a motor is a sum or difference of joint velocities, with
+    # coefficients -1, -1/2, 1/2 or 1. `factors` are therefore rounded to multiples of 1/2.
     factors = np.round(2 * np.linalg.lstsq(gram, target, rcond=1e-9)[0]) / 2
     terms = np.flatnonzero(factors).tolist()
     residual = power - 2 * factors @ target + factors @ gram @ factors

@@ -11,6 +11,7 @@ import pyarrow.compute
 
 from spelgen.errors import LogError
 from spelgen.logs.jumps import signed
+from spelgen.logs.row_names import RowsByNames, rows_by_names
 from spelgen.logs.tables import Layout, list_element, stored_names
 from spelgen.logs.tuning import TUNING
 from spelgen.settings.log_mapping import TIMES
@@ -42,8 +43,9 @@ def values_in_si(table: pa.Table, layout: Layout, start: pa.Scalar | None, rows:
         times = pa.compute.subtract(times, start)
     logged = [_floats(times, layout.columns[0], layout, rows)]
     mapping, signals = layout.mapping, layout.mapping.signals(layout.joints)
+    by_names = rows_by_names(table, {x: mapping.log_name(x) for x in layout.joints}, layout.file)
     for name, signal in zip(layout.columns[1:], signals, strict=True):
-        values = _floats(logged_column(table, name), name, layout, rows)
+        values = _floats(logged_column(table, name, by_names), name, layout, rows)
         sign_bit = mapping.word("sign_bit", *signal)
         logged.append(signed(values, sign_bit) if sign_bit else values)
     factors = np.array([unit, *starmap(mapping.scale, signals)])
@@ -85,8 +87,10 @@ def foreign_rows(data: np.ndarray, joints: int) -> np.ndarray:
     """
     signals = data[:, 1 + joints :]
     empty, zero = np.isnan(signals).all(axis=1), (signals == 0).all(axis=1)
-    # Rows of zeros may also be genuine. If the arm is at rest and its motors are off, they are in long runs. If a
-    # moving arm reverses and its signals are coarse, they are less than 2 % of all rows.
+    # Rows whose velocities and torques are all 0 may be genuine in two cases. If the arm is at rest and its motors are
+    # off, such rows form long runs. If a moving arm reverses and its signals are coarse, they are less than 2 % of all
+    # rows. Rows of zeros count as rows of another publisher only if they are more than 2 % of all rows, in more than
+    # eight runs with fewer than four rows on average.
     if signals.shape[1] > joints and zero.sum() > max(TUNING.jump_window, 0.02 * len(data)):
         runs = int(np.count_nonzero(np.diff(zero.astype(int)) > 0))
         if runs > TUNING.jump_window and zero.sum() < 4 * runs:
@@ -183,12 +187,15 @@ def _numbers(texts: Column) -> np.ndarray:
     return np.asarray(texts.cast(pa.float64()).to_numpy(zero_copy_only=False))
 
 
-def logged_column(table: pa.Table, name: str) -> Column:
+def logged_column(table: pa.Table, name: str, by_names: RowsByNames | None = None) -> Column:
     """Return a column of a log by its name; `position[2]` is element 2 of each list in the column `position`.
 
     A list may also be written as text, such as "[0.1, 0.2]". A name "sec + nsec" is a time: seconds plus nanoseconds.
     If the log has no times and the mapping has a `sample_rate`, row numbers are returned as the column of times, and
     the caller converts them to times.
+
+    by_names: result of `rows_by_names`. If the lists of joint names differ between rows, `position[2]` is the element
+    with the same name in each row; it is null in rows without this name.
     """
     stored = stored_names(name, table.schema.names)
     if len(stored) != 1:
@@ -197,6 +204,19 @@ def logged_column(table: pa.Table, name: str) -> Column:
     if element is None:
         return table.column(name)
     lists, index = table.column(element[0]), element[1]
+    if not by_names:
+        return _elements(lists, index)
+    joint = next(iter(by_names))[index : index + 1]
+    values = pa.nulls(len(table))
+    for names, rows in by_names.items():
+        if set(joint) <= set(names):
+            index_in_row = names.index(*joint) if joint else index
+            values = pa.compute.if_else(rows, _elements(lists, index_in_row), values)
+    return values
+
+
+def _elements(lists: Column, index: int) -> Column:
+    """Return the element `index` of each list in a column; null for shorter lists."""
     is_text = not pa.types.is_nested(lists.type)
     if is_text:
         bare = pa.compute.replace_substring_regex(lists.cast(pa.string()), r"^.*[\[({]\s*|\s*[\])}].*$", "")

@@ -50,7 +50,7 @@ class Windows:
         return Windows(*(x.to(device) for x in self.columns()))
 
     def columns(self) -> list[torch.Tensor]:
-        """Return the tensors dt, q, qd, tau and, if it is not None, z."""
+        """Return the attributes as a list: dt, q, qd, tau and, if they were computed, the friction states z."""
         columns = [self.dt, self.q, self.qd, self.tau]
         return columns if self.z is None else [*columns, self.z]
 

@@ -350,7 +350,7 @@ def stacks(
         t: Times, (T,) [s].
         rows: The charts of a column, from top to bottom.
         joints: Names and units of the joints.
-        motion: Name of the animated motion with the same time axis.
+        motion: Name of the animation of this motion on the page; a script marks its current time in the charts.
     """
     panels = []
     for k, joint in enumerate(joints):

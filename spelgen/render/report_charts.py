@@ -109,7 +109,7 @@ def trajectory_panels(example: PredictedMotion, joints: Sequence[NamedJoint], mo
     Args:
         example: A measured motion and its prediction.
         joints: Names and units of the joints.
-        motion: Name of the animated motion with the same time axis.
+        motion: Name of the animation of this motion on the page; a script marks its current time in the charts.
     """
     rows = []
     position = ("position", example.q, example.predicted_q)
@@ -256,7 +256,8 @@ def coverage_panels(
         charts = []
         for key, quantity in (("q", "position"), ("qd", "velocity")):
             bands = [_histogram(name, covered[key][k]) for name, covered in logs.items() if covered]
-            # Without least squares and without an evaluation there are no histograms, and the charts are omitted.
+            # `bands` has the histogram of the training logs if the run has results of least squares, and the histogram
+            # of the test logs if the model was evaluated. Without both there is nothing to show.
             if not bands:
                 return []
             marks: list[Mark] = list(bands)

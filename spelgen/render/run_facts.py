@@ -83,7 +83,8 @@ def commands(run: RunFolder, spec: ModelSpec, record: Record) -> list[str]:
     """
     # Options of `spelgen build` with default values are omitted, to keep the command short.
     options = asdict(spec.options)
-    # The run folder has no copy of the design's YAML file, so the command names a file of the user.
+    # A design is a preset of the user, in a YAML file. The run folder has no copy of this file, so the printed command,
+    # `spelgen build`, names it as `--preset NAME.yaml`.
     if spec.options.design is not None:
         options["preset"] += ".yaml"
     # The command names the URDF without its folder, as it may be a folder of another machine.

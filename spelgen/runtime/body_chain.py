@@ -15,8 +15,8 @@ class ChainConfiguration(NamedTuple):
     """Configuration cache of ``BodyChain``: its quantities that depend on q only, in the base frame.
 
     Four point masses represent a rigid body (see ``BodyChain``). Coordinates and velocities of a point
-    mass are multiplied by the square root of its mass. The product of two such coordinates is a second
-    moment of mass, and the product of two such velocities is twice a kinetic energy.
+    mass are multiplied by the square root of its mass. The sum of all squared velocities is then twice
+    the kinetic energy, and a sum of products of two coordinates is a second moment of mass.
     """
 
     place: Tensor  # positions of the point masses times sqrt(mass), (..., 3, B bodies, 4 points) [m kg^(1/2)]
@@ -26,8 +26,8 @@ class ChainConfiguration(NamedTuple):
     # body, times sqrt(mass), (..., B, 12 B). The last axis is a flattened array (3 coordinates, B bodies,
     # 4 point masses).
     jacobian: Tensor
-    # Minus the acceleration of gravity, times sqrt(mass), for 3 coordinates of 4 point masses of each of
-    # B bodies, (..., 12 B) [m/s^2 kg^(1/2)].
+    # Minus the acceleration of gravity for each of the 3 coordinates of each point mass, times
+    # sqrt(mass), (..., 12 B) for B bodies of 4 points each [m/s^2 kg^(1/2)].
     weight: Tensor
 
 
@@ -86,7 +86,8 @@ class BodyChain(nn.Module):
         # `carriers`, (bodies, bodies): entry (i, j) is 1 if body i carries body j or i = j, else 0.
         self.carriers = nn.Buffer(carriers)
         # `carried`, (bodies, 12 bodies): `carriers`, with 12 columns for the coordinates of the four
-        # point masses of a body; it is a mask of the Jacobian.
+        # point masses of a body. The Jacobian of the point masses with respect to the joint displacements
+        # is multiplied by it, and is then zero for points that a joint does not carry.
         self.carried = nn.Buffer(carriers.repeat_interleave(4, dim=1).repeat(1, 3))
         # `base`: minus the acceleration of gravity, in the base frame, (3, 1, 1) [m/s^2].
         self.base = nn.Buffer(-vector(gravity)[:, None, None])
@@ -139,7 +140,9 @@ class BodyChain(nn.Module):
         velocity = torch.unflatten(applied(cache.jacobian.mT, rates), -1, (3, -1, 4))
         twists = (cache.axes * rates.unsqueeze(-2)) @ self.carriers
         (w, u), (a, m) = twists.chunk(2, dim=-2), cache.axes.chunk(2, dim=-2)
-        # A joint axis (a, m) that moves with the twist (w, u) has the time derivative (w x a, w x m + u x a).
+        # The axis of a joint is a twist (a, m) per unit rate: a is the angular velocity, m the linear
+        # velocity at the origin of the base. If the axis moves with the twist (w, u), also (angular,
+        # linear), its time derivative is (w x a, w x m + u x a).
         linear = torch.linalg.cross(w, m, dim=-2) + torch.linalg.cross(u, a, dim=-2)
         return velocity, twists, torch.cat([torch.linalg.cross(w, a, dim=-2), linear], dim=-2)
 
@@ -174,10 +177,11 @@ class BodyChain(nn.Module):
         velocity, _, turning = self.motion(cache, qd)
         # Angular momentum about the origin of the base, and linear momentum, of each point mass.
         momenta = [torch.linalg.cross(cache.place, velocity, dim=-3), cache.mass * velocity]
-        # The derivative of the kinetic energy with respect to a joint's displacement is the scalar
-        # product of the momentum of all bodies that the joint carries and the time derivative of the
-        # joint's axis. A rotation about the axis a also rotates the velocity v of each point, which
-        # contributes nothing: (a x v) . v = 0.
+        # The derivative of the kinetic energy with respect to the displacement of joint i is h_i .
+        # da_i/dt, a product of 6-vectors (angular, linear). h_i is the momentum of all bodies that joint
+        # i carries, and a_i the twist of joint i per unit rate, with the time derivative da_i/dt. The
+        # displacement also rotates the velocity v of each carried point about the axis w of the joint,
+        # which does not change the energy: (w x v) . v = 0.
         carried = torch.cat(momenta, dim=-3).sum(dim=-1) @ self.carriers.mT
         return (turning * carried).sum(dim=-2) @ self.ratios
 
@@ -206,11 +210,14 @@ def chain_of_links(joints: Sequence[Joint], links: Sequence[Link], gravity: Row)
 def body_factor(parameters: Tensor) -> Tensor:
     """Return the upper triangular factor T of the pseudo-inertia C T T^T C^T of a body, (..., 4, 4).
 
-    C C^T is the initial pseudo-inertia of the body (see ``InertialParameters``).
+    C C^T is the initial pseudo-inertia of the body (see ``InertialParameters``). T is diag(s) (1 + U),
+    with the elements U of ``parameters`` above the diagonal. From the parameters d_1 ... d_4 on the
+    diagonal, s_i = exp(d_i + d_4 / 2) for i < 4, and s_4 = exp(d_4 / 2).
 
     Args:
-        parameters: log-Cholesky parameters as an upper triangular matrix, (..., 4, 4): logarithms of three
-            extents and of the mass on the diagonal, shears and displacement of the center of mass above it.
+        parameters: log-Cholesky parameters as an upper triangular matrix, (..., 4, 4): logarithms of
+            three extents and of the mass on the diagonal, shears and displacement of the center of mass
+            above it.
     """
     logarithms = parameters.diagonal(dim1=-2, dim2=-1)
     sizes, mass = logarithms[..., :3], logarithms[..., 3:] / 2

@@ -72,7 +72,7 @@ class ConstantMass(LinearMass):
         return self.constant_scale * (self.raw_constants.abs() + 1e-6)
 
     def prepare(self) -> Tensor:
-        """Return the parameter cache, which is M itself, (n, n)."""
+        """Return M, (n, n) [kg m^2, kg m, kg], as the parameter cache: it depends on parameters only."""
         return self.entries(*self.constants().unbind()) + torch.diag(self.armature())
 
     def forward(self, encoded: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,11 +85,19 @@ class ConstantMass(LinearMass):
         return parameters.expand(*encoded.shape[:-1], *parameters.shape), encoded
 
     def kinetic_vjp(self, qd: Tensor, intermediates: Tensor) -> Tensor:
-        """Return the gradient of 1/2 qd^T M qd with respect to the encoding of q, (..., 2 n): zeros."""
+        """Return zeros, (..., 2 n): the gradient of 1/2 qd^T M qd for a constant M.
+
+        The gradient is with respect to the encoding of q (see ``JointEncoding``), ``intermediates``,
+        which has the same shape.
+        """
         return torch.zeros_like(intermediates)
 
     def jvp(self, rate: Tensor, intermediates: Tensor) -> Tensor:
-        """Return dM/dt, (..., n, n): zeros. rate: time derivative of the encoding of q, (..., 2 n)."""
+        """Return zeros, (..., n, n): the time derivative of M, which does not depend on q.
+
+        rate: time derivative of the encoding of q (see ``JointEncoding``), (..., 2 n); it gives the
+        shape.
+        """
         n = len(self.raw_armature)
         return rate.new_zeros(*rate.shape[:-1], n, n)
 
@@ -103,12 +111,16 @@ class DerivedMass(LinearMass):
 
     For some q and parameters M may be indefinite. The model therefore uses M' = C + t (M - C), which is
     positive definite for all q and all parameters. C = L L^T is a constant matrix: ``entries`` with the
-    nominal mean of each function (``Function.mean``) and the initial constants, without armature. The
-    factor t is 1, and M' equals M, if M - margin C is positive definite, where ``margin`` is below 1.
-    Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| + margin <= 1, where |X| is an upper
-    bound of the spectral norm of L^-1 X L^-T. Since t is piecewise constant, the derivatives of M' are t
-    times the derivatives of M. The zeros of M and the linear relations between entries of M are valid for
-    C, and therefore also for M'.
+    nominal mean of each function (``Function.mean``) and the initial constants, without armature.
+    ``margin`` is between 0 and 1.
+
+    - If M - margin C is positive definite, t is 1, and M' equals M.
+    - Otherwise t is the largest of 1/2, 1/4, 1/8, ... with t |M - C| <= 1 - margin, where |X| is an upper
+      bound of the spectral norm of L^-1 X L^-T. The eigenvalues of L^-1 M' L^-T = 1 + t L^-1 (M - C) L^-T
+      are then at least ``margin``.
+
+    Since t is piecewise constant, the derivatives of M' are t times the derivatives of M. The zeros of M
+    and the linear relations between entries of M are valid for C, and therefore also for M'.
     """
 
     def __init__(
@@ -124,15 +136,17 @@ class DerivedMass(LinearMass):
         super().__init__(joints, entries, constants=constants, functions=functions)
         self.network = network
         center = self._by_outputs()[-1].detach()
-        # `center` is the constant matrix C of the class, `smallest` is `margin` times C. `forward`
-        # corrects M (t < 1) if M - `smallest` is not positive definite.
+        # `center` is the constant matrix C of the class, `smallest` is `margin` times C. If M -
+        # `smallest` is not positive definite, `forward` replaces M by M' = C + t (M - C), with a factor t
+        # < 1.
         self.center, self.smallest = nn.Buffer(center), nn.Buffer(margin * center)
         size = center.diagonal().rsqrt()
         relative = size.unsqueeze(-1) * size
         eigenvalue = torch.linalg.eigvalsh(relative * center)[0]
-        # |X| of the class is computed as ||D X D||_F / (smallest eigenvalue of D C D), D =
-        # diag(C)^(-1/2). `unit`, (n, n), contains the factors of the entries of X, so that |X| / (1 -
-        # margin) is the Frobenius norm of the elementwise product of `unit` and X.
+        # The spectral norm of L^-1 X L^-T, with L L^T = C, has the upper bound |X| = ||D X D||_F / s.
+        # Here D = diag(C)^(-1/2), and s is the smallest eigenvalue of D C D. `forward` compares |X| for X
+        # = M - C with 1 - margin: with unit_ij = D_ii D_jj / s / (1 - margin), |X| / (1 - margin) is the
+        # Frobenius norm of the elementwise product of `unit` and X.
         self.unit = nn.Buffer(relative / eigenvalue / (1 - margin))
 
     def _by_outputs(self) -> Tensor:
@@ -140,14 +154,15 @@ class DerivedMass(LinearMass):
 
         For each output the matrix is dM / d output; the last matrix is M at zero outputs, without armature.
         """
-        # A function is mean + scale * output. All but the last column of `functions` are derivatives of the
-        # functions with respect to one output each; the last column has the means of the functions.
+        # A learned function f_k of M is mean_k + scale_k * output_k, with the network output k. Column k
+        # of `functions`, (functions, outputs + 1), is the derivative of all functions with respect to
+        # output k. The last column has the means.
         functions = torch.cat([torch.diag(self.function_scale), self.function_mean.unsqueeze(-1)], dim=1)
         constants = F.pad(self.constants().unsqueeze(-1), (len(functions), 0))
         return self.entries(*functions.unbind(), *constants.unbind())
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: the layers of a network whose outputs are the n n entries of M."""
+        """Return the parameter cache: network layers whose outputs are the n^2 entries of M."""
         rows = self._by_outputs()
         # The linear map from the learned functions to the entries of M is multiplied into the weights of the
         # last layer, which saves an operation per evaluation.
@@ -175,27 +190,32 @@ class DerivedMass(LinearMass):
         # For a batch with an indefinite matrix, cholesky would raise an error; cholesky_ex reports which
         # matrices are indefinite.
         indefinite = torch.linalg.cholesky_ex(mass - self.smallest).info != 0
-        # `norm` is |M - C| / (1 - margin), with the norm of the class: t is the largest power of 1/2 with
-        # t `norm` <= 1, at most 1/2.
+        # `norm` is |M - C| / (1 - margin), see `unit`. The factor t of M' = C + t (M - C) is the largest
+        # of 1/2, 1/4, ... for which the product of t and `norm` is at most 1.
         norm = torch.linalg.vector_norm(self.unit * (mass - self.center), dim=(-2, -1))
         return torch.where(indefinite, torch.exp2(-torch.ceil(torch.log2(norm)).clamp(min=1.0)), 1.0)
 
     def kinetic_vjp(self, qd: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
         """Return the gradient of 1/2 qd^T M' qd with respect to the encoding of q, (..., 2 n).
 
-        M' is the corrected mass matrix (see the class). intermediates: second result of ``forward`` at q.
+        M' = C + t (M - C) is the positive definite mass matrix of the class: M is the network's matrix, C
+        the constant nominal matrix, and t the factor (1, 1/2, 1/4, ...). The encoding of q is cos q and
+        sin q (see ``JointEncoding``). qd: velocities, (..., n). intermediates: second result of
+        ``forward`` at q.
         """
         network, fraction = intermediates
-        # The gradient of 1/2 qd^T M' qd with respect to the entries of M is t/2 qd qd^T: M' = C + t (M -
-        # C) has dM' = t dM, since t is piecewise constant. The network's outputs are the entries of M.
+        # The network's outputs are the entries of M, and M' = C + t (M - C) has dM' = t dM: C is constant
+        # and t piecewise constant. The gradient of 1/2 qd^T M' qd with respect to the entries of M is
+        # therefore t/2 qd qd^T.
         half = 0.5 * fraction.unsqueeze(-1) * qd
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the time derivative of the corrected mass matrix M', (..., n, n) (see the class).
+        """Return the time derivative of the mass matrix M' = C + t (M - C), (..., n, n).
 
-        rate: time derivative of the encoding of q, (..., 2 n). intermediates: second result of
-        ``forward``.
+        M is the network's matrix. C, the constant nominal matrix, and t, a piecewise constant factor,
+        make M' positive definite (see the class). rate: time derivative of the encoding of q (see
+        ``JointEncoding``), (..., 2 n) [1/s]. intermediates: second result of ``forward`` at q.
         """
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
@@ -205,13 +225,13 @@ class DerivedMass(LinearMass):
 class DenseIntermediates(NamedTuple):
     """Intermediate values of ``DenseMass.forward``, from which the derivatives of M are computed.
 
-    M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives e > 0 and the factor U, a lower triangular matrix;
-    A is constant (see ``DenseMass``).
+    M is (U^-1 A)^T diag(1 / e) U^-1 A. A network gives e > 0 and the factor U, a lower triangular matrix
+    with ones on the diagonal; A is constant (see ``DenseMass``).
     """
 
     network: Intermediates
     factor: Tensor  # U of `DenseMass` without its diagonal of ones, (..., 3 n, 3 n)
-    moved: Tensor  # U^-1 A, with the constant A of `DenseMass`, (..., 3 n, n)
+    moved: Tensor  # U^-1 A, from which M is computed with e, (..., 3 n, n)
     scale: Tensor  # e, the diagonal factor of `DenseMass`, (..., 3 n)
 
 
@@ -259,19 +279,26 @@ class DenseMass(nn.Module):
         # Indices of the entries below the diagonal of the lower triangular factor U (see the class), in
         # row-major order.
         self.below = nn.Buffer(row * self.size + column)
-        # At zero outputs of the network U is the identity, and e = softplus(log(exp(1) - 1)) = 1.
+        # `initial` is added to the outputs of the network. At zero outputs, U of the class is the
+        # identity and each entry of e is softplus(log(exp(1) - 1)) = 1: M is then the nominal mass
+        # matrix.
         initial = vector([0.0] * len(row) + [math.log(math.e - 1)] * self.size)
         self.initial = nn.Buffer(initial)
         self.network = network
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of the network that gives U and e (see the class)."""
+        """Return the parameter cache: layers of the network that gives the triangular U and the vector e.
+
+        M is computed from U and e (see the class).
+        """
         return self.network.prepare(torch.diag(0 * self.initial + 1), self.initial)
 
     def inverse(self, encoded: Tensor, layers: Layers) -> Tensor:
-        """Return the inverse C U diag(e) U^T C^T of the large matrix, (..., 3 n, 3 n).
+        """Return C U diag(e) U^T C^T, (..., 3 n, 3 n), the inverse of the large matrix that contains M.
 
-        M is a block of the large matrix; C, U and e are defined in the class.
+        The large matrix has a row and a column for the x, y and z axis of each joint; M is its block of
+        the z axes. C is the constant ``nominal_factor``. The network gives U, lower triangular with ones
+        on the diagonal, and e > 0, (..., 3 n).
         encoded: encoding of q, (..., 2 n). layers: parameter cache.
         """
         factor, scale = self._factor(self.network.forward(encoded, layers)[0])
@@ -279,10 +306,11 @@ class DenseMass(nn.Module):
         return (lower * scale.unsqueeze(-2)) @ lower.mT
 
     def _factor(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the lower triangular factor U without its unit diagonal, and the diagonal factor e.
+        """Return U without its diagonal of ones, (..., 3 n, 3 n), and the vector e, (..., 3 n).
 
-        The shapes are (..., 3 n, 3 n) and (..., 3 n). M is computed from both factors (see the class).
-        raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and softplus^-1(e).
+        U is lower triangular, and M = (U^-1 A)^T diag(1 / e) U^-1 A with the constant A of the class.
+        raw: outputs of the network, (..., outputs): the entries of U below its diagonal, and
+        softplus^-1(e).
         """
         entries, scale = raw.tensor_split((len(self.below),), dim=-1)
         return self._lower(entries), F.softplus(scale)
@@ -323,8 +351,9 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # For the kinetic energy T = 1/2 qd^T M qd, with U, A and e of the class, w = U^-1 A qd and
-        # p = w / e: dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
+        # M = (U^-1 A)^T diag(1 / e) U^-1 A, with a constant A. The kinetic energy T = 1/2 qd^T M qd is
+        # therefore the sum of w^2 / (2 e), with w = U^-1 A qd (`speed`). With p = w / e (`momentum`),
+        # dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).
@@ -333,14 +362,16 @@ class DenseMass(nn.Module):
         return self.network.vjp(intermediates.network, cotangent)
 
     def jvp(self, rate: Tensor, intermediates: DenseIntermediates) -> Tensor:
-        """Return dM/dt, (..., n, n), for ``rate``, the time derivative of the encoding of q, (..., 2 n).
+        """Return dM/dt, (..., n, n).
 
+        rate: time derivative of the encoding of q (see ``JointEncoding``), (..., 2 n) [1/s].
         intermediates: second result of ``forward`` at q.
         """
         _, factor, moved, scale = intermediates
         pushed = self.network.jvp(intermediates.network, rate)
         entries, raw_rate = pushed.tensor_split((len(self.below),), dim=-1)
-        # The differential of U^-1 A of `DenseMass` is -U^-1 dU U^-1 A.
+        # M is (U^-1 A)^T diag(1 / e) U^-1 A with a constant A. The differential of U^-1 A is -U^-1 dU
+        # U^-1 A.
         turned = self._unit_solved(factor, self._lower(entries) @ moved)
         by_factor = moved.mT @ (turned / scale.unsqueeze(-1))
         by_scale = raw_rate * torch.expm1(-scale) / scale**2

@@ -82,9 +82,9 @@ class FrictionConstants(NamedTuple):
 
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
-        # Each bristle is a spring of stiffness coulomb * fraction / breakaway. The Stribeck and load
-        # terms of dry friction vary with velocity and load, and are counted as dissipation, which may
-        # therefore be slightly negative.
+        # Each bristle is a spring of stiffness coulomb * fraction / breakaway: only the Coulomb term of
+        # dry friction stores energy. The Stribeck and load terms vary with velocity and load. Their power
+        # counts as dissipation, which may be slightly negative when a bristle relaxes.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
 
@@ -169,8 +169,9 @@ class FrictionLaws(nn.Module):
         # |gravity torque| has no derivative at zero: `load` smooths it below 1 % of typical friction.
         load = 0.01 * torch.where(friction > 0, friction, 1.0)
         fractions = self.raw_bristle_fractions.softmax(dim=-1) * (1 - self.memoryless).unsqueeze(-1)
-        # The smooth sign has a width of 0.1 % of the typical speed (`SlidingFriction` trains the width): a
-        # wider transition at joints without bristles would be confounded with hysteresis.
+        # The smooth sign of joints without bristles has a fixed width of 0.1 % of the typical speed
+        # (`SlidingFriction` trains the width). With a wider transition, a fit could not distinguish it
+        # from the hysteresis of bristles.
         rounding, sharp = self.stribeck_rounding, 0.001 * speed
         return FrictionConstants._make(
             [*constants, rounding, sharp, load, fractions, self.reach, self.memoryless]

@@ -53,14 +53,17 @@ class MotorInputs(nn.Module):
         return self.constant_gains + gain.unsqueeze(-1) * self.trained_gains
 
     def force(self, tau: Tensor) -> Tensor:
-        """Return the joint torques G tau, (..., n) [Nm, N], at inputs tau, (..., n)."""
+        """Return the joint torques G tau, (..., n) [Nm, N], with the input matrix G of ``gains``.
+
+        tau: inputs of the motors, (..., n), usually motor torques [Nm, N].
+        """
         return applied(self.gains(), tau)
 
     def torque(self, force: Tensor) -> Tensor:
-        """Return the inputs tau, (..., n), that solve G tau = force, for joint torques ``force``, (..., n).
+        """Return the motor inputs tau, (..., n), that solve G tau = force, with the input matrix G.
 
-        A passive joint has no input. Its element of the result is its element of ``force``: the torque that
-        no motor provides.
+        force: joint torques, (..., n) [Nm, N]. A passive joint has no input. Its element of the result is
+        its element of ``force``: the torque that no motor provides.
         """
         matrix = self.gains() + torch.diag(self.passive)
         tau: Tensor = torch.linalg.solve(matrix, force.unsqueeze(-1))

@@ -183,9 +183,11 @@ class JointFrictionParameters(NamedTuple):
 class JointFriction(NetworkFriction):
     """A diagonal, positive definite dissipation matrix D(q, qd): viscous and dry friction of each joint.
 
-    The diagonal is viscous + typical friction * softplus(output) / sqrt(qd^2 + w^2), with the output of a
-    network for each joint and a trained smoothing velocity w, below which dry friction changes its sign
-    smoothly. The inputs of the network are the encoding of q, qd and qd / sqrt(qd^2 + w^2).
+    The diagonal is b + f softplus(output) / sqrt(qd^2 + w^2), with a network that has one output per
+    joint. The viscous coefficient b [Nm s/rad, N s/m] and the smoothing velocity w of each joint are
+    trained; f is the constant typical friction of its ``Joint`` [Nm, N]. At velocities below w, dry
+    friction changes its sign smoothly. The inputs of the network are the encoding of q, qd and qd /
+    sqrt(qd^2 + w^2).
     """
 
     parameter_groups = (
@@ -229,12 +231,13 @@ class JointFriction(NetworkFriction):
 
 
 class DenseFriction(NetworkFriction):
-    """A dense, positive semi-definite dissipation matrix D(q, qd) = L L^T with a network for L.
+    """A dense, positive semi-definite dissipation matrix D(q, qd), (..., n, n), computed by a network.
 
-    L is a lower triangular matrix. It has one row per joint (``axes`` = 1), or one row per axis of each
-    joint frame (``axes`` = 3, the model of Duong et al., IEEE T-RO 40:3695, 2024). A joint moves only
-    about or along its last axis, so only the row of this axis is computed for each joint, (n, axes n),
-    and D is (..., n, n). The inputs of the network are the encoding of q, and qd / typical speed.
+    ``axes`` = 1: D = L L^T with a lower triangular matrix L, (n, n). ``axes`` = 3, the model of Duong et
+    al., IEEE T-RO 40:3695, 2024: L L^T, (3 n, 3 n), is the dissipation matrix for all three axes of each
+    joint frame. A joint moves only about or along its last axis. D is therefore K K^T, where K, (n, 3 n),
+    has one row of L per joint, for this axis; the network does not compute the other rows. The inputs of
+    the network are the encoding of q, and qd / typical speed.
     """
 
     def __init__(self, joints: Sequence[Joint], network: MaskedNetwork, axes: int) -> None:
@@ -245,14 +248,16 @@ class DenseFriction(NetworkFriction):
         # row-major order, to the matrix L.
         spread = torch.eye(rows * rows).double()[:, rows * row + column].reshape(rows, rows, -1)
         self.entries = nn.Buffer(spread[axes - 1 :: axes])
-        # The initial L is diagonal, in units of the square root of typical friction / typical speed.
+        # The initial value of L is 0.35 times the identity matrix, in units of the square root of typical
+        # friction / typical speed.
         self.initial = nn.Buffer(0.35 * torch.eye(rows).double()[axes - 1 :: axes])
 
     def prepare(self) -> Layers:
-        """Return the parameter cache: layers of a network whose outputs are n rows of L in D = L L^T.
+        """Return the parameter cache: layers of a network whose outputs are the entries of a factor of D.
 
-        Each joint has ``axes`` rows in L (see the class), of which D needs only the last one. A row has n
-        * axes entries [sqrt(Nm s/rad), sqrt(N s/m)].
+        The factor K, (n, axes n) [sqrt(Nm s/rad), sqrt(N s/m)], gives the dissipation matrix D = K K^T,
+        (n, n). It has one row per joint, for the axis of the joint frame about or along which the joint
+        moves: a row of the lower triangular matrix L, (axes n, axes n), of the class.
         """
         size = torch.sqrt(self.nominal / self.speed).unsqueeze(-1)
         output_map = (size.unsqueeze(-1) * self.entries).flatten(0, 1)

@@ -43,11 +43,11 @@ class JointEncoding(nn.Module):
         return torch.cat([(self.slope - second) * qd, self.revolute * first * qd], dim=-1)
 
     def vjp(self, encoded: Tensor, cotangent: Tensor) -> Tensor:
-        """Return the gradient of a scalar with respect to q, (..., n), from its gradient in the encoding.
+        """Return the gradient of a scalar function of q with respect to q, (..., n), by the chain rule.
 
         Args:
-            encoded: encoding of q, (..., 2 n).
-            cotangent: gradient of the scalar with respect to the encoding, (..., 2 n).
+            encoded: encoding of q, (..., 2 n): cos q, then sin q (for prismatic joints see the class).
+            cotangent: gradient of the function with respect to the encoding, (..., 2 n).
         """
         first, second = encoded.chunk(2, dim=-1)
         by_first, by_second = cotangent.chunk(2, dim=-1)
@@ -96,12 +96,13 @@ def joint_masks(
 
     Args:
         joints: joints of the arm.
-        scales: scales of the network's inputs; a row (n,) has the scales of one input of each joint, for
-            example of cos q.
+        scales: scales of the network's inputs, (inputs per joint, n); the inputs of each joint are, for
+            example, cos q and sin q.
         outputs: names of the joints that each output depends on.
         width: number of units of each hidden layer.
         depth: number of hidden layers.
-        min_units: smallest number of units of a hidden layer for each group of outputs with equal joints.
+        min_units: smallest number of hidden units per layer for all outputs that depend on the same
+            joints.
     """
     number = {joint.name: index for index, joint in enumerate(joints)}
     numbers = [tuple(number[name] for name in names) for names in outputs]
@@ -123,12 +124,13 @@ class MaskedNetwork(nn.Module):
     Args:
         generator: random generator of the initial weights; the weights of the last layer are zero.
         joints: joints of the arm.
-        scales: one row (n,) per input of a joint, with its scale for each joint. The inputs are cos q or
-            the scaled q (see ``JointEncoding``), sin q, and any others, such as qd.
+        scales: factors of the inputs, (inputs per joint, n). The inputs of each joint are cos q or the
+            scaled q (see ``JointEncoding``), sin q, and any others, such as qd.
         outputs: names of the joints that each output depends on; masks set the weights of all paths from
             other joints to zero.
         width, depth: number of units of a hidden layer, and number of hidden layers.
-        min_units: smallest number of units of a hidden layer for each group of outputs with equal joints.
+        min_units: smallest number of hidden units per layer for all outputs that depend on the same
+            joints.
     """
 
     points = 0  # number of Gaussians in the function of an edge (input to unit); 0: the edge is one weight

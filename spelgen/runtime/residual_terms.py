@@ -19,8 +19,10 @@ from spelgen.runtime.rows import Joint, vector
 
 # Number of cubic B-splines over the range of a joint, for its torque term and its friction factor.
 SPLINES = 34
-# Number of harmonics of the joint's revolution in the torque ripple. For a gear ratio above this number,
-# the first two harmonics of the motor's revolution are added, which represent errors of gear and motor.
+# The torque ripple of each joint has HARMONICS + 2 harmonics. With a gear ratio above HARMONICS, they are
+# the harmonics 1 to HARMONICS of the joint's revolution, and the harmonics 1 and 2 of the motor's
+# revolution, which represent errors of gear and motor. With a smaller gear ratio, they are the harmonics
+# 1 to HARMONICS + 2 of the joint's revolution.
 HARMONICS = 64
 # Largest magnitude of the logarithm of the friction factor, so that the factor is between 0.1 and 10.
 LARGEST = math.log(10.0)
@@ -30,7 +32,7 @@ class ResidualParameters(NamedTuple):
     """Parameter cache of ``ResidualTerms``: quantities that depend on trained parameters only."""
 
     splines: Tensor  # spline coefficients of torque [Nm, N] and of log friction factor, (n, SPLINES, 2)
-    ripple: Tensor  # amplitudes of the torque ripple: cosines, then sines [Nm], (n, 2 (HARMONICS + 2))
+    ripple: Tensor  # amplitudes of HARMONICS + 2 cosines, then of the sines [Nm], (n, 2 (HARMONICS + 2))
     constant: Tensor  # constant part of the residual R of M, flattened, (n n,)
     functions: Tensor  # flattened matrices dR / d tanh(output) of R's network, (functions, n n)
     mass: Layers | None
@@ -102,8 +104,9 @@ class ResidualTerms(nn.Module):
         self.middles = nn.Buffer(center + spacing * knots)
         self.unit = nn.Buffer(vector(joint.friction for joint in joints).unsqueeze(-1))
         self.revolute = nn.Buffer(vector(joint.joint_type == "revolute" for joint in joints).unsqueeze(-1))
-        # `frequencies`: number of ripple periods per revolution of the joint, (n, HARMONICS + 2); the
-        # last two are of the motor if ``gear`` exceeds HARMONICS.
+        # `frequencies`: numbers of ripple periods per revolution of the joint, (n, HARMONICS + 2): 1, 2,
+        # ..., HARMONICS + 2. If the gear ratio ``gear`` of a joint exceeds HARMONICS, the last two are
+        # gear and 2 gear: one and two periods per revolution of the motor.
         frequencies = torch.arange(1.0, HARMONICS + 3).double().repeat(n, 1)
         for index, joint in enumerate(joints):
             if joint.gear > HARMONICS:
@@ -116,13 +119,15 @@ class ResidualTerms(nn.Module):
         self.mass, self.potential = network, potential
         self.scale = nn.Buffer(torch.full((1, 1), potential_scale, dtype=torch.float64))
         size = self._by_entry(torch.ones(functions + constants, dtype=torch.float64)).abs()
+        # R is the residual part of M: each entry is a sum of functions and constants times coefficients.
         # `inverse`, (functions + constants, n, n): 1 / |coefficient| of each function and constant in
-        # each entry of R. `bounds` computes minima over the entries; 1e30 for a coefficient of zero has
-        # no influence on the minima.
+        # each entry. `bounds` bounds a function or constant by a minimum over the entries; 1e30 for a
+        # coefficient of zero has no influence on the minimum.
         self.inverse = nn.Buffer(torch.where(size > 0, 1 / size, 1e30))
-        # R may reduce the armature by at most 90 %. A term is a function or constant times its
-        # coefficient. Each term may reduce the armature by the fraction `part`: 0.9 / largest number of
-        # terms in a row of R.
+        # R may reduce the armature by at most 90 %, so that armature + R is positive definite. A term of
+        # R is a function or constant times its coefficient. The terms in a row of R add up, so each may
+        # reduce the armature by the fraction `part` only: 0.9 divided by the largest number of terms in a
+        # row.
         self.part = 0.9 / float((size > 0).sum(dim=(0, 2)).max())
         self.raw_constants = nn.Parameter(torch.zeros(constants, dtype=torch.float64))
 
@@ -137,15 +142,17 @@ class ResidualTerms(nn.Module):
     def bounds(self, armature: Tensor) -> Tensor:
         """Return bounds of the functions and constants in R, (functions + constants,), with A + R > 0.
 
-        R is the residual term of M, linear in its functions and constants (see the class). The bound of a
-        function or constant with the coefficients k_ij in R_ij is part * min_ij sqrt(d_i d_j) / |k_ij|,
-        with ``part`` = 0.9 / (largest number of terms in a row of R) and d_i = 1 / (sum of row i of
-        |A^-1|). A + R is positive definite if no function or constant exceeds its bound.
+        R is the residual term of M: R_ij = sum_k c_ijk x_k, with the functions and constants x_k and
+        their coefficients c_ijk. A + R is positive definite if no |x_k| exceeds its bound
 
-        Proof: A + R is the sum of A - diag(d) and diag(d) + R. Since diag(1 / d) - A^-1 is diagonally
-        dominant, the first matrix is positive semi-definite. With the bounds, all row sums of |R_ij| /
-        sqrt(d_i d_j) are less than one. The second matrix, scaled to a unit diagonal, is therefore strictly
-        diagonally dominant.
+            |x_k| <= part * min_ij sqrt(d_i d_j) / |c_ijk|,    1 / d_i = sum_j |A^-1|_ij,
+
+        where ``part`` = 0.9 / (largest number of terms in a row of R).
+
+        Proof: A + R = (A - D) + (D + R) with D = diag(d). D^-1 - A^-1 is diagonally dominant, so D^-1 >=
+        A^-1 and A - D >= 0. The bounds give sum_j |R_ij| / sqrt(d_i d_j) <= 0.9 for each row i: D^(-1/2)
+        (D + R) D^(-1/2), which is the identity plus a matrix with these row sums, is strictly diagonally
+        dominant, and D + R > 0.
 
         Args:
             armature: matrix A, (n, n): rotor inertia on the joint side.
@@ -161,8 +168,8 @@ class ResidualTerms(nn.Module):
     def prepare(self, armature: Tensor) -> ResidualParameters:
         """Return the parameter cache: quantities that depend on trained parameters only.
 
-        armature: rotor inertia on the joint side, (n, n), from which ``bounds`` computes the largest
-        functions and constants of R, the residual term of M.
+        armature: rotor inertia on the joint side, (n, n). The functions and constants in R, the residual
+        part of M, get upper bounds that make armature + R positive definite (see ``bounds``).
         """
         splines = [self.unit * self.raw_torque_splines, self.friction_logarithms()]
         rows = self._by_entry(self.bounds(armature)).flatten(1)
@@ -319,7 +326,10 @@ class ResidualDynamics(RigidBodyDynamics):
         return cache.gravity - self.residuals.gradient(cache.residual, 0 * cache.gravity)
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return d/dq of 1/2 qd^T M(q) qd - V(q), with residual terms, (..., n) [Nm, N]."""
+        """Return the gradient of 1/2 qd^T M(q) qd - V(q) with respect to q, (..., n) [Nm, N].
+
+        M and V include the residual terms. qd: velocities, (..., n) [rad/s, m/s].
+        """
         cache: RigidConfiguration = self.at(q, qd)
         gradient = super().lagrangian_gradient(cache, qd)
         return gradient if self.residuals is None else gradient + self.residuals.gradient(cache.residual, qd)

@@ -17,7 +17,7 @@ from spelgen.runtime.rows import Joint, Link, vector
 class RigidParameters(NamedTuple):
     """Parameter cache of ``RigidBodyDynamics``: quantities that depend on trained parameters only."""
 
-    points: Tensor  # block diagonal matrix of the point masses Q of each body (``BodyChain``), (4 B, 4 B)
+    points: Tensor  # block diagonal, (4 B, 4 B): a block Q per body, with its pseudo-inertia Q Q^T
     armature: Tensor  # rotor inertia on the joint side, added to M, (n, n)
     friction: FrictionConstants
     residual: Parameters = None  # parameter cache of the residual terms
@@ -129,7 +129,7 @@ class RigidBodyDynamics(PortHamiltonian):
 
     @property
     def friction_compensation(self) -> Tensor:
-        """Coefficient k, (n,) [Nm s/rad, N s/m]: drives add the torque k qd to the measured torque."""
+        """Coefficient k, (n,) [Nm s/rad, N s/m]: drives apply k qd in addition to the measured torque."""
         return self.raw_friction_compensation * self.friction.nominal / self.friction.speed * self.actuated
 
     def prepare(self) -> RigidParameters:
@@ -150,10 +150,10 @@ class RigidBodyDynamics(PortHamiltonian):
         return RigidConfiguration(chain, mass, applied(chain.jacobian, chain.weight) @ ratios, prepared)
 
     def potential_energy(self, q: Tensor | RigidConfiguration, z: Tensor | None = None) -> Tensor:
-        """Return the potential energy V(q), plus the elastic energy of the bristles at z, (...) [J].
+        """Return the potential energy, (...) [J]: gravity V(q), plus the elastic energy of the bristles.
 
-        V is zero for a mass at the origin of the base frame. z: friction state, (..., n, K) [rad, m]; None:
-        V(q) only.
+        V(q) is the sum over the bodies of -m g . c, with mass m, gravity g, and center of mass c in the
+        base frame. z: displacements of the bristles, (..., n, K) [rad, m]; None: V(q) only.
         """
         cache: RigidConfiguration = self.at(q)
         energy = (cache.chain.place.flatten(-3) * cache.chain.weight).sum(dim=-1)
@@ -165,7 +165,10 @@ class RigidBodyDynamics(PortHamiltonian):
         return cache.gravity
 
     def lagrangian_gradient(self, q: Tensor | RigidConfiguration, qd: Tensor) -> Tensor:
-        """Return the gradient of 1/2 qd^T M(q) qd - V(q) (Lagrangian) with respect to q, (..., n) [Nm, N]."""
+        """Return the gradient of 1/2 qd^T M(q) qd - V(q) with respect to q, (..., n) [Nm, N].
+
+        The armature is a constant part of M and has no effect. qd: velocities, (..., n) [rad/s, m/s].
+        """
         cache: RigidConfiguration = self.at(q, qd)
         return self.chain.kinetic_gradient(cache.chain, qd) - cache.gravity
 
@@ -211,11 +214,14 @@ class RigidBodyDynamics(PortHamiltonian):
         return qd if self.motors is None else qd @ self.motors.mT
 
     def memory(self, qd: Tensor) -> Tensor:
-        """Return the friction state z, (..., n, K) [rad, m], after a long motion at constant qd, (..., n).
+        """Return the displacements z of the bristles after a long motion at constant qd.
 
-        It is the initial z of simulations if the past motion is unknown. Friction with this z exceeds
-        friction without a state by at most 7.4 % of dry friction: the maximum of tanh x - x / sqrt(1 +
-        x^2), at x = qd / smoothing velocity = 1.6. The difference vanishes at high velocities.
+        z, (..., n, K) [rad, m], for K bristles per motor, is the initial friction state of simulations if
+        the past motion is unknown. qd: joint velocities, (..., n) [rad/s, m/s]. z is the break-away
+        displacement times tanh(x), with x = motor velocity / smoothing velocity; the motor velocities are
+        qd, or C qd for coupled motors. Friction without a state has the factor x / sqrt(1 + x^2) in place
+        of tanh(x): the difference is at most 7.4 % of dry friction, at x = 1.6, and vanishes at high
+        velocities.
         """
         # z is tanh(qd / smoothing velocity) times the break-away displacement: tanh reaches 1 at a few times
         # the smoothing velocity. The smooth sign of ``FrictionConstants.torque`` reaches 1 slowly: with it, z

@@ -23,7 +23,7 @@ class Joint(NamedTuple):
     joint_type: Literal["revolute", "prismatic"]
     lower: float | None  # position limits [rad, m]; None: unlimited
     upper: float | None
-    speed: float  # typical velocity [rad/s, m/s]
+    speed: float  # typical velocity of the joint in motion [rad/s, m/s]
     friction: float  # typical magnitude of the friction torque [Nm, N]
     armature: float  # nominal rotor inertia times gear^2 [kg m^2, kg]
     gear: float = 1.0  # gear ratio: motor revolutions per revolution of the joint
@@ -63,7 +63,7 @@ class Link(NamedTuple):
     rotation: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     ratio: float = 1.0
     offset: float = 0.0  # displacement about or along the joint axis at q = 0 [rad, m]
-    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of `joint`
+    joint_type: Literal["revolute", "prismatic"] | None = None  # None: type of the joint named by `joint`
 
 
 class Function(NamedTuple):

@@ -70,10 +70,10 @@ class GaussianPrior(Group):
         shared_friction: Logarithm of a factor on all friction of all joints.
         friction_compensation: Torque per velocity with which a drive compensates friction, divided by typical friction
             per typical speed. It is fitted only if the logs, or implausible masses, indicate such a torque.
-        degrees_of_freedom: Not a standard deviation but a weight: in the estimate of a standard deviation, its initial
-            value has the weight of this number of fitted parameters. The standard deviation of each single body is
-            estimated with the same weight, so that the prior of its parameters is a Student-t distribution with this
-            number of degrees of freedom.
+        degrees_of_freedom: Not a standard deviation but the weight c of the initial values: a standard deviation s is
+            estimated by s^2 = (sum of squares + c s0^2) / (k + c), with its initial value s0 and the effective number k
+            of its fitted parameters. The standard deviation of each single body is estimated with the same c, so that
+            the prior of its parameters is a Student-t distribution with c degrees of freedom.
     """
 
     bodies: Positive = 0.75

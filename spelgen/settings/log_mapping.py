@@ -30,8 +30,8 @@ CURRENTS = ("A", "mA", "percent", "permille")
 COUNTS = ("counts", "counts/s")
 # Unit of positions in LeRobot's default format: the ends of the calibrated range of a motor are -100 and 100.
 NORMALISED = "normalised"
-# For each quantity: units as written in logs, in the form of `plain_unit`, and the corresponding units of a mapping,
-# which may have a factor.
+# {quantity: {unit of a log in the form of `plain_unit`: unit of a mapping}}. A unit of a mapping may have a factor:
+# positions in "cdeg" have the unit "0.01 deg".
 UNIT_NAMES: dict[str, dict[str, str]] = {
     quantity: {name: unit for unit, names in units for name in names.split()}
     for quantity, units in {
@@ -47,6 +47,9 @@ UNIT_NAMES: dict[str, dict[str, str]] = {
     }.items()
 }  # fmt: skip
 UNIT_NAMES["qd"] |= {f"{name}/s": f"{unit}/s" for name, unit in UNIT_NAMES["q"].items()}
+for _name, _unit in UNIT_NAMES["q"].items():
+    _factor, _, _plain = _unit.rpartition(" ")
+    UNIT_NAMES["qd"].setdefault(f"{_name}/min", f"{float(_factor or 1) / 60:.11g} {_plain}/s")
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
@@ -67,13 +70,18 @@ Accepted = Literal[
 
 
 def _scaled(value: object, validate: Callable[[object], str], info: ValidationInfo) -> str:
-    """Return a validated unit, which may have a factor, such as "0.01 deg", or another spelling, such as "degrees"."""
+    """Return a unit of a mapping in its standard spelling: "degrees" becomes "deg", "0.01 degrees" "0.01 deg".
+
+    value: unit in the settings, with an optional factor. validate: pydantic's check that a unit without factor is
+    allowed. info: has the name of the field, which is the quantity ("t", "q", "qd", "tau" or "u").
+    """
     text = value if isinstance(value, str) else ""
     match = re.fullmatch(r"((?:\d*\.?\d+(?:e[+-]?\d+)? ?)?)([^\d\s.].*)", text)
     if not match or (match[1] and not float(match[1])):
         return validate(value)
     factor, name = match[1].strip(), match[2]
-    # "grad" is a degree in German, and 0.9 degrees in English: drafts are tested, but a mapping must be unambiguous.
+    # "grad" is a degree in German, and 0.9 degrees in English. A mapping must be unambiguous, so it is an unknown unit
+    # here. Drafts of mappings, which are tested with the logs, may read it as degrees.
     plain = "" if name.lower().startswith("grad") else plain_unit(name)
     multiple, _, unit = (mapped_unit(str(info.field_name), plain) or "").rpartition(" ")
     if factor and multiple:
@@ -97,7 +105,8 @@ Decoding = Literal["period", "sign_bit"]
 def plain_unit(text: str) -> str:
     """Return a unit as written in a log, in lower case, without brackets and signs of products.
 
-    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm", and so is "N·m x1000".
+    Examples: N·m is nm; deg_s, deg/sec and deg s^-1 are deg/s; 1e-3 N·m is "0.001 nm". In "N·m x1000", the logged
+    values are torques in N·m multiplied by 1000: the unit is also "0.001 nm".
     """
     unit = text.strip(" []()").lower().replace("\u00d7", "x")
     number = r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
@@ -110,13 +119,15 @@ def plain_unit(text: str) -> str:
         size = float(match[2] or match[5])
         factor = f"{1 / size if size > 1 and (match['x'] or match[5]) else size:.9g} "
     unit = re.sub(r"([\s_/]|[\s_]per[\s_])s(ec(ond)?)?(\^?-1|⁻¹)?$", "/s", unit)
+    unit = re.sub(r"(/|[\s_]per[\s_])min(utes?)?$", "/min", unit)
     return factor + re.sub(r"[\s.·⋅*-]", "", unit)
 
 
 def mapped_unit(quantity: str, unit: str) -> str | None:
-    """Convert a unit from the form of `plain_unit` to the form of a mapping, such as "0.01 deg"; None if unknown.
+    """Convert a unit of a log in the form of `plain_unit` to a unit of a mapping; None if the unit is unknown.
 
-    quantity: "t", "q", "qd", "tau" or "u".
+    Examples: "degrees" becomes "deg", "0.001 nm" becomes "0.001 Nm", "2 cdeg" becomes "0.02 deg". quantity: "t", "q",
+    "qd", "tau" or "u"; a unit of another quantity is unknown.
     """
     factor, _, name = unit.rpartition(" ")
     mapped = UNIT_NAMES["q" if quantity == "u" else quantity].get(name)
@@ -190,9 +201,9 @@ class JointUnits(Group):
 
 
 class LogUnits(JointUnits):
-    """Units of the times and of the columns of all joints; default: SI units.
+    """Units of the times and of the columns of all joints, one per quantity; default: SI units.
 
-    If no unit of positions is set, positions in degrees are detected.
+    If no unit of positions is set, positions in degrees are reported as an error.
 
     Attributes:
         t: Time.
@@ -311,15 +322,15 @@ class LogMapping(Group):
 
     Attributes:
         topic: Topic to read, for a ROS bag with joint states in several topics.
-        columns: Names of the columns.
-        units: Units of the columns.
+        columns: Names of the columns, one per quantity.
+        units: Units of the columns, one per quantity.
         input: "position" for position servos: u is read instead of qd and tau.
         velocity: "differentiated" for logs without velocities.
         torque_delay: Delay of the logged torques relative to the positions; `spelgen logs` suggests a value [s].
         joints: Columns of single joints, by the joint's name in the URDF.
         accept: Codes of errors of `spelgen logs` to ignore.
-        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for a moment, and
-            rows that repeat the row before.
+        dropouts: "dropped" removes rows in which a signal falls to 0 or deviates from its neighbours for at most five
+            samples, and rows that repeat the row before.
         sample_rate: Rate of evenly spaced rows, whose times are ignored [Hz].
         calibration: Calibration of the motors by their names in the log, the content of LeRobot's calibration file, for
             the unit "normalised".
@@ -425,9 +436,9 @@ class LogMapping(Group):
         `input` and `accept` are unchanged. For joints whose logged positions wrap around after a period, the period of
         positions becomes one turn, 2 pi rad.
         """
-        # If the positions of a joint wrap around in the log, the positions in a file that spelgen writes may wrap
-        # around after one turn. For each joint with a period of positions, the new mapping therefore has a period of
-        # one turn.
+        # A joint with a period of positions may turn without limits. Its positions in the file with SI units may still
+        # wrap around, then after one turn (2 pi rad) and not after the period of the log. The returned mapping
+        # therefore has a period of one turn for such joints.
         turning = [name for name in self.joints if self.word("period", "q", name)]
         return LogMapping(input=self.input, accept=self.accept).with_turns(turning)
 
@@ -446,7 +457,10 @@ class LogMapping(Group):
         return abs(self.scale(quantity, joint)) * (self.word("period", quantity, joint) or 0.0)
 
     def _unit(self, quantity: str, joint: str) -> tuple[float, str | None]:
-        """Return factor and unit of the logged "q", "qd", "tau" or "u" of a joint; 1 and None without a unit."""
+        """Return the unit of a logged quantity of a joint as (factor, unit): (0.01, "deg") for "0.01 deg".
+
+        Without a unit in the mapping, the result is (1, None). quantity: "q", "qd", "tau" or "u".
+        """
         text: str | None = getattr(self.joint(joint).units, quantity) or getattr(self.units, quantity)
         # The default unit of commanded positions is the unit of measured positions, because one controller logs both.
         if text is None and quantity == "u":
@@ -455,7 +469,7 @@ class LogMapping(Group):
         return float(factor or 1), unit or None
 
     def unit(self, quantity: str, joint: str) -> str | None:
-        """Return the unit, without factor, of a logged quantity of a joint; None if the settings contain none."""
+        """Return the unit of a logged quantity of a joint, "deg" for the setting "0.01 deg"; None if it is not set."""
         return self._unit(quantity, joint)[1]
 
     @property

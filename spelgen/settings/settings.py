@@ -106,8 +106,9 @@ class Unusable:
         self.errors = tuple(errors)
 
     def __getattr__(self, name: str) -> NoReturn:
-        # copy and pickle test whether attributes such as `__deepcopy__` exist, and expect AttributeError if they do
-        # not. pydantic reads the values of a group through its attributes `__pydantic...`: this raises the errors.
+        # Python's copy and pickle look for optional methods such as `__deepcopy__`, and expect AttributeError if there
+        # is none. Attributes `__pydantic...` are different: pydantic reads them when it reads the values of a group,
+        # so that the errors of the group must be raised.
         if not name.startswith("__") or name.startswith("__pydantic"):
             collect(self.errors)
         raise AttributeError(name)
@@ -183,9 +184,9 @@ class Settings(Group):
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """One warning per error in a group of keys that only one step uses, such as `training`.
+        """Warnings about errors in groups of keys that only one step uses, such as `training`: one per error.
 
-        These errors are only warnings, because all other steps can use the settings.
+        They are warnings because all other steps can use the settings; the step that uses the group raises the errors.
         """
         unusable = [group for _, group in self if isinstance(group, Unusable)]
         errors = [error for group in unusable for error in group.errors]

@@ -52,7 +52,7 @@ class SimulationSettings(Group):
 
 
 class ControlledSimulation(SimulationSettings):
-    """Defaults if neither `protocol` nor `inputs` is set; the simulated motions are then controlled motions."""
+    """Defaults of simulations for which neither `protocol` nor `inputs` is set, so that controllers track motions."""
 
     protocol: Literal["random-inputs", "tracking", "prescribed"] = "tracking"
     trajectories: Count = 4

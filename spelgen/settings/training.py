@@ -19,8 +19,8 @@ class TrainingSettings(Group):
     Attributes:
         objective: Objective of the fit; default: torque for models with rigid bodies, rollout for models of networks
             only, servo for arms with position servos. If it is set, options of other objectives are errors.
-        cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, and
-            no filter for windows of logs at 50 Hz or less [Hz].
+        cutoff: Cutoff frequency of the zero-phase low-pass filter on q, qd and tau; 0: no filter; default: 8 Hz, but
+            no filter in fits to windows (short segments of logs) if a log has a sample rate of 50 Hz or less [Hz].
         decimation: A window contains every n-th sample of a log; default: the largest n that the filter allows.
         gap: A recording is split at time steps longer than this number of median steps.
         torque_delay: Delay of the logged torques relative to the positions; default: estimated in a torque fit [s].

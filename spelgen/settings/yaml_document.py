@@ -252,9 +252,12 @@ def _group_at(group: type[BaseModel], location: Location) -> type[BaseModel]:
 
 
 def _groups_with(group: type[BaseModel], location: Location) -> list[str]:
-    """Return the nearest groups that have the last key of a location, such as "under 'logs'"; [] if nowhere.
+    """Return the groups in which a misplaced key is valid, as texts for its error, such as "under 'logs'".
 
-    group: class of the root of the document.
+    location: path of the key, which ends with the key. The search starts in the group that contains the key, with all
+    groups inside it, and continues with each enclosing group up to the root until a group has such a key. Of several
+    groups with the key, only the groups with the shortest path are returned; [] if no group has it. group: class of the
+    document's root.
     """
     paths: list[Location] = []
     level = len(location)
@@ -320,6 +323,6 @@ Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
 
 
 class Group(BaseModel):
-    """Base class of a group of keys in a settings file; an unknown key is an error."""
+    """Base class of a group of keys in a settings file: the keys are fields of the class; other keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -38,7 +38,7 @@ def as_built(arm: Arm, seed: int, path: Path | str) -> Arm:
         raise SpelgenError(
             "the URDF of the arm itself", file=path, expected="another file for the arm as built"
         )
-    # At this point, the error names the user's URDF, and no file has been written.
+    # Absent inertials are an error here already: the message names the user's URDF, and no file has been written.
     require_inertials(arm.chain, arm.robot.path)
     settings = _settings(arm, seed)
     write_bytes(path, perturbed_urdf(arm.robot.path, AS_BUILT.inertial_error, seed))

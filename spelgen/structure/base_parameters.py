@@ -44,7 +44,10 @@ class BaseParameter:
 
 @lru_cache(maxsize=16)
 def base_parameter_count(arm: Chain) -> int:
-    """Return the number of base parameters, which is the rank of the energy regressor over random positions."""
+    """Return the number of base parameters: the rank of the energy regressor at random positions.
+
+    The regressor has rows for V(q) and for each entry of M(q), and needs no velocities (see the module).
+    """
     points = 7  # Enough random positions for most arms of at most seven joints; the loop doubles them.
     while True:
         rows = regressor_rows(arm, points + 2)

@@ -1,14 +1,15 @@
 """Minimal exact form M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints.
 
-A_k and B_j are constant matrices, c_k constants and f_j functions of q. Each f_j is a linear functional of M: a
-weighted sum of the entries of M. A functional depends only on the joints in a set J if and only if it vanishes on all
-changes M(q) - M(q') caused by joints outside J. Together, the f_j must determine every change of M; U is the span of
-all changes.
+A_k and B_j are constant matrices, c_k constants and f_j functions of q. U is the span of all changes M(q) - M(q'). Each
+f_j is a linear functional of M: a weighted sum of the entries of M. A functional depends only on the joints in a set J
+if and only if it vanishes on all changes of M caused by joints outside J. Together, the f_j must determine every change
+in U.
 
-The f_j are selected greedily. The sets J are sorted in two steps. The first criterion is their joint closest to the
-root: sets with only joints at the tip are tried first. The second criterion is their size, small sets first. For each
-set, single entries of M are tried before sums of entries. The sets of functionals that are linearly independent on U
-form a matroid, for which the greedy selection is optimal.
+The f_j are selected greedily from functionals that depend only on a set J of joints, for one set after another. Sets
+without joints near the root are first; of the sets with the same joint closest to the root, small sets are first. For
+three joints, the order is {3}, {2}, {2, 3}, {1}, {1, 2}, {1, 3}, {1, 2, 3}. For each set, single entries of M are tried
+before sums of entries. The sets of functionals that are linearly independent on U form a matroid, for which the greedy
+selection is optimal.
 """
 
 from collections.abc import Iterator
@@ -87,8 +88,9 @@ def smallest_form(spans: Spans) -> tuple[tuple[Term, ...], tuple[Term, ...]]:
     for r, row, row_values in zip(functionals, basis, basis_values, strict=True):
         functional = _weights(spans, r.weights, r.values)
         outputs.append(Term(r.joints, functional, _weights(spans, row, row_values)))
-    # The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does not depend on q. `constant` (prime
-    # field) and `constant_values` (double precision), (S, entries), are samples of this difference.
+    # M(q) = sum_k c_k A_k + sum_j f_j(q) B_j. The matrices A_k are a basis of the span of M - sum_j f_j B_j, which does
+    # not depend on q. `constant` (prime field), (S, entries), and `constant_values` (double precision), (2 S, entries),
+    # are samples of this difference at random positions.
     constant = field.difference(spans.mass, field.product(field.product(spans.mass, weights.T), basis))
     constant_values = spans.floats[0] - spans.floats[0] @ values.T @ basis_values
     # Row reduction of these samples gives the A_k; the entry of M at the pivot of row k defines the constant c_k.
@@ -136,8 +138,9 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
         while missing:
             pairs = next(candidates)
             weights = np.array([w for w, _ in pairs], dtype=np.uint64).reshape(-1, len(spans.keys))
-            # Each row of `rows` is a functional, represented by its values for the basis `spans.varying` of all changes
-            # of M. Functionals whose difference does not depend on q have equal rows.
+            # A functional is a linear function of M: a weighted sum of its entries. A row of `rows` has the values of
+            # one functional for the matrices of `spans.varying`, a basis of all changes of M with q. Functionals whose
+            # difference does not depend on q have equal rows.
             rows = np.concatenate([chosen, field.product(weights, spans.varying.T)])
             # The pivot columns of the transpose of `rows` are the rows that are linearly independent of earlier rows.
             independent = field.pivots(field.row_basis(rows.T))
@@ -148,13 +151,14 @@ def _functionals(spans: Spans) -> Iterator[_Functional]:
 
 
 def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
-    """Yield the sets of joints on which a function f_j may depend, in the order of the greedy selection of the f_j.
+    """Yield the sets of joints for which functions f_j(q) of M are searched that depend on this set only, in order.
 
-    A set is sorted first by its joint closest to the root: joints near the tip come first. Sets with the same joint
-    closest to the root are sorted by size, small sets first (see the module). spans: samples of M and the spans of its
-    changes.
+    M is sum_k c_k A_k + sum_j f_j(q) B_j (see the module). Sets without joints near the root are first; of the sets
+    with the same joint closest to the root, small sets are first. For three joints, the order is {3}, {2}, {2, 3}, {1},
+    {1, 2}, {1, 3}, {1, 2, 3}. spans: joints without changes of M are in no set.
     """
-    # An arm of more than eight joints has too many subsets of joints: only sets of consecutive joints are tried.
+    # For arms of at most eight joints, all subsets of joints are yielded. Larger arms have too many subsets: their sets
+    # consist of consecutive joints.
     all_subsets_up_to = 8
     active = [k for k in range(spans.n) if len(spans.change_bases[k])]
     for position in reversed(range(len(active))):
@@ -167,20 +171,21 @@ def _joint_sets(spans: Spans) -> Iterator[frozenset[int]]:
 def _candidates(
     spans: Spans, joints: frozenset[int], kernel: np.ndarray, bound: list[int], tried: set[int]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Yield two lists of candidates for a function f_j of ``joints`` only: single entries of M, then sums of entries.
+    """Yield two lists of functions of q that depend on ``joints`` only: single entries of M, then sums of entries.
 
-    f_j is a function in the minimal form of M (see the module). A candidate is a weighted sum of the entries of M,
-    which varies only with the positions of ``joints``. It is given by its weights, (entries,), in the prime field and
-    in double precision. Sums of few entries are first.
+    They are candidates for the functions f_j in the minimal form of M (see the module). Each is a weighted sum of the
+    entries of M, given by its weights, (entries,), twice: in the prime field and in double precision.
+
+    A single entry depends on ``joints`` only, or is no candidate. A sum is M_e - sum_b w_b M_b with one entry e outside
+    `bound` and the entries b in `bound`. If other joints move, the changes of M_e are a linear combination of the
+    changes of the M_b, with the weights w_b: the sum does not change. Sums of few entries are first.
 
     Args:
         spans: samples of M and the spans of its changes.
         joints: the only joints that the candidates may depend on.
-        kernel: (m, entries), weights of a basis of all sums that do not change if other joints move. Each row has the
-            coefficient 1 for one entry of M that is not in `bound`; its other nonzero coefficients belong to entries in
-            `bound`.
-        bound: indices of the entries of M that are pivots of an echelon basis of the changes by other joints.
-        tried: indices of the entries that were candidates for an earlier set of joints, and are skipped. The single
+        kernel: weights of the sums in the prime field, (m, entries), one row per entry e outside `bound`.
+        bound: indices of as many entries of M as possible whose changes by the other joints are linearly independent.
+        tried: indices of entries that were candidates for an earlier set of joints, and are skipped. The single
             entries of this call are added.
     """
     singles = []
@@ -194,9 +199,9 @@ def _candidates(
     coefficients = _solved(samples[:, bound], samples[:, free])
     sums = []
     for row in sorted(kernel, key=np.count_nonzero):
-        # The functional `row` is a difference: M at `entry`, the only entry outside `bound`, minus a weighted sum of
-        # the entries in `bound`. If joints outside `joints` move, both change equally, so the difference is constant.
-        # `coefficients` are the weights of the sum in double precision.
+        # The weights `row` (prime field) give M_e - sum_b w_b M_b: e = `entry` is the only entry outside `bound`, the
+        # entries b are in `bound`. If joints outside `joints` move, M_e and the sum over b change equally, so that
+        # their difference is constant. `coefficients` has the weights w_b in double precision.
         (entry,) = set(np.flatnonzero(row).tolist()) - set(bound)
         values = np.zeros(len(row))
         values[entry] = 1.0
@@ -206,10 +211,10 @@ def _candidates(
 
 
 def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients of the functional that is a single entry of M, (entries,): 1 at ``index``, else 0.
+    """Return the one-hot weights of the entry ``index`` of M, (entries,): 1 for this entry, 0 for all others.
 
-    The first array has elements of the prime field, the second one the same numbers in double precision. The rows and
-    columns of the entries are ``spans.keys``.
+    The weights are returned twice, like all weights in this module: as elements of the prime field, for exact ranks,
+    and as floats, for values of the functions. The row and column of each entry are ``spans.keys``.
     """
     weights = np.zeros(len(spans.keys), dtype=np.uint64)
     weights[index] = 1
@@ -228,24 +233,26 @@ def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 def _weights(spans: Spans, exact: np.ndarray, values: np.ndarray) -> Weights:
     """Return a symmetric matrix as `Weights`: row, column and rational value of each nonzero element.
 
-    spans: `keys` has row and column of each element of the lower triangle. exact, values: the elements, (entries,), in
-    the prime field and in double precision.
+    The rational value is reconstructed from both given forms of an element (see `_fraction`). exact: elements of the
+    lower triangle in the prime field, (entries,). values: the same elements in double precision. spans: `keys` has the
+    row and column of each element.
     """
     nonzero = np.flatnonzero(exact).tolist()
     return tuple((*spans.keys[k], _fraction(int(exact[k]), float(values[k]))) for k in nonzero)
 
 
 def _fraction(element: int, value: float) -> Fraction:
-    """Return the rational number that an element of the prime field represents (rational reconstruction).
+    """Return the fraction n / d with n = d * ``element`` modulo PRIME and the approximate ``value``.
 
-    It succeeds if numerator and denominator are below 2^30 (von zur Gathen and Gerhard, *Modern Computer Algebra*,
-    section 5.10). Geometry with irrational lengths gives longer fractions; ``value`` is then returned, which is as
-    accurate as the URDF.
+    Such a fraction can be found if n and d are below 2^30 (rational reconstruction: von zur Gathen and Gerhard, *Modern
+    Computer Algebra*, section 5.10). Geometry with irrational lengths gives longer fractions: ``value`` is then
+    returned, which is as accurate as the URDF.
 
-    element: element of the prime field. value: the same number in double precision.
+    element: the number as an element of the prime field. value: the same number in double precision.
     """
-    # Extended Euclidean algorithm for (PRIME, element), stopped as soon as the remainder is at most 2^30. Each
-    # remainder is a possible numerator, with numerator = denominator * element modulo PRIME.
+    # Rational reconstruction by the extended Euclidean algorithm for (PRIME, element). Each step gives a numerator (the
+    # remainder) and a denominator with numerator = denominator * element modulo PRIME. The numerators decrease and the
+    # denominators grow, so the first numerator of at most 2^30 has the smallest denominator.
     previous, current = (field.PRIME, 0), (element, 1)
     while current[0] > 2**30:
         quotient = previous[0] // current[0]

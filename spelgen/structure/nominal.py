@@ -57,7 +57,11 @@ class Nominal:
 
 
 def nominal(arm: Chain, structure: Structure) -> Nominal:
-    """Return the `Nominal` of an arm over random positions; ``structure`` has the terms f_j B_j and c_k A_k of M."""
+    """Return typical values of M, V and torques of an arm, by which models are scaled.
+
+    They are means, standard deviations and root mean squares over random positions (see `Nominal`). structure: terms of
+    M = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions f_j and constant matrices A_k and B_j.
+    """
     # The seed is constant, because nominal values are part of the emitted module, which must be reproducible.
     rng = np.random.default_rng(0)
     ranges = [x.working_range for x in arm.coordinates]
@@ -225,7 +229,7 @@ def _sensitivities(magnitudes: np.ndarray) -> tuple[float, ...]:
 
 
 def _rounded(values: np.ndarray, digits: int = 6, zero_below: float = 1e-12) -> tuple[float, ...]:
-    """Return the values, (n,), each rounded to ``digits`` significant digits by ``_round``."""
+    """Return the values, (n,), each rounded to ``digits`` significant digits; magnitudes up to ``zero_below`` are 0."""
     return tuple(_round(value, digits, zero_below) for value in values.tolist())
 
 

@@ -121,7 +121,8 @@ def energies(
             total = _sum(total, moved)
         else:
             composites[body.parent] = _sum(composites[body.parent], moved)
-    # V = -g . sum_b m_b c_b. The sum is the first moment of the composite inertia of all bodies at the root.
+    # The potential energy is V = -g . sum_b m_b c_b, with the gravity g, and masses m_b and centers of mass c_b of the
+    # bodies in the frame of the root link. The sum is `total.moment`, the first moment of all bodies together.
     gravity = _vector(arm.gravity, number)
     return Energies(mass, -_dot(gravity, total.moment))
 
@@ -129,17 +130,16 @@ def energies(
 def coefficients(
     arm: Chain, positions: Sequence[Position], units: Sequence[Element], number: Number
 ) -> list[Element]:
-    """Return the coefficients of the 10 B inertial parameters of B bodies in each entry of M, and in V.
+    """Return the coefficients of the inertial parameters in each entry of the mass matrix M and in the potential V.
 
-    M is the mass matrix, V the potential energy. The recursion computes with vectors of 10 B numbers in place of
-    numbers: since M and V are linear in the inertial parameters, each entry becomes the row of its coefficients if unit
-    vector k replaces the inertial parameter k.
+    M and V are linear in the 10 B inertial parameters of B bodies. If unit vector k, (10 B,), replaces the inertial
+    parameter k in ``energies``, each entry of the result is a vector: its coefficients, in place of its value.
 
     Args:
         arm: the arm.
-        positions: position of each coordinate.
+        positions: cosine, sine and value of each coordinate.
         units: the 10 B unit vectors, (10 B,) each, in place of the inertial parameters.
-        number: conversion of the exact constants of the arm to the numbers of the recursion.
+        number: conversion of the exact constants of the arm to the number type of `positions` and `units`.
 
     Returns:
         n(n+1)/2 + 1 vectors, (10 B,) each: the entries of the lower triangle of M, row after row, then V.
@@ -206,7 +206,7 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
     # 1. This takes fewer products than repeated addition: factors are as large as 20.
     for bit in bin(abs(factor))[2:]:
         x, y = result
-        # The complex number (x + i y)^2 has twice the angle of x + i y.
+        # The square of the complex number x + i y has twice its angle: (x + i y)^2 = x^2 - y^2 + 2 i x y.
         result = (x * x - y * y, 2 * (x * y))
         if bit == "1":
             x, y = result
@@ -219,10 +219,10 @@ def _multiple_angle(c: Element, s: Element, factor: int) -> tuple[Element, Eleme
 def _column(
     arm: Chain, poses: Sequence[_Pose], transforms: Sequence[_Pose], index: int, inertia: _Inertia
 ) -> Iterator[tuple[Body, Element]]:
-    """Yield (ancestor, entry of M) for a body itself, and then for each of its ancestors.
+    """Yield the entries of M in the column of a body's joint, as pairs (body of the row, entry).
 
-    The entry is in the row of the body's joint and the column of the ancestor's joint. M is the mass matrix of all
-    joints, before mimic joints are eliminated.
+    The first entry is the diagonal one, in the row of the body itself. The next entries are in the rows of its
+    ancestors, from the parent to the root. M is the mass matrix of all joints, before mimic joints are eliminated.
 
     Args:
         arm: the arm.
@@ -255,10 +255,10 @@ def _sum(a: _Inertia, b: _Inertia) -> _Inertia:
 
 
 def _inertia_at_zero(transform: _Pose, inertia: _Inertia) -> _Inertia:
-    """Return the inertia of a body, displaced by its joint, about the fixed axes of the joint's frame at q = 0.
+    """Return the inertia of a body that its joint has displaced, expressed in the joint frame at q = 0, which is fixed.
 
-    inertia: inertia of the body in the frame that moves with it. transform: rotation about z, or translation along z,
-    from the moving frame to the frame at q = 0.
+    inertia: inertia of the body in the frame that moves with it. transform: pose of this moving frame in the fixed
+    frame, a rotation about z or a translation along z.
     """
     s, c, _ = transform.rotation[1]
     # An integer c indicates a prismatic joint: its rotation is the identity, with integers, so no rotation is needed.
@@ -302,8 +302,9 @@ def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
     (x, y, z), mass, (hx, hy, hz) = offset, inertia.mass, inertia.moment
     xx, xy, xz, yy, yz, zz = inertia.tensor
     moment = (hx + x * mass, hy + y * mass, hz + z * mass)
-    # With the mass m and first moment h, the inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with
-    # p = `offset` and k = 2 h + m p.
+    # All points of the body have the position r + p about the new origin, with r about the old one and p = `offset`.
+    # The inertia tensor I becomes I + (p.k) 1 - (p k^T + k p^T) / 2, with k = 2 h + m p, the mass m and the first
+    # moment h about the old origin.
     dx, dy, dz = (p * (old + new) for p, old, new in zip(offset, inertia.moment, moment, strict=True))
     xy = xy - x * hy - y * hx - x * y * mass
     xz = xz - x * hz - z * hx - x * z * mass
@@ -312,7 +313,7 @@ def _translated(offset: Vector, inertia: _Inertia) -> _Inertia:
 
 
 def _vector(values: Sequence[Fraction], number: Number) -> Vector:
-    # The elements 0, 1 and -1 of a vector remain integers, with which products are skipped.
+    # The elements 0, 1 and -1 of a vector become Python integers: products with 0 and 1 then need no multiplication.
     return tuple(int(x) if x in (0, 1, -1) else number(x) for x in values)
 
 

@@ -1,8 +1,10 @@
-"""Samples of M and V at random positions, and the spans of M and of its changes, from which the structure is derived.
+"""Samples of M and V at random positions, and linear spans of them, from which the structure of an arm is derived.
 
-Samples are elements of the prime field of ``field``, or floating-point numbers. They form 1 + n blocks of equal size
-for n coordinates. Block 0 has random positions; the positions of block 1 + k differ from block 0 in coordinate k only
-(k from 0). An entry of M that differs between block 0 and block 1 + k depends on coordinate k.
+M is the mass matrix, V the potential energy. The spans are spans of samples of M, and of differences of two samples
+between which one coordinate changes. Samples are elements of the prime field of ``field``, or floating-point numbers.
+They form 1 + n blocks of equal size for n coordinates. Block 0 has random positions; the positions of block 1 + k
+differ from block 0 in coordinate k only (k from 0). An entry of M that differs between block 0 and block 1 + k depends
+on coordinate k.
 """
 
 from collections.abc import Sequence
@@ -55,11 +57,12 @@ def field_samples(arm: Chain, assume: Assume, samples: int) -> tuple[np.ndarray,
 
 
 def regressor_rows(arm: Chain, points: int) -> np.ndarray:
-    """Return the energy regressor at random positions, in the prime field, (m points, 10 B) for B bodies.
+    """Return the energy regressor at random positions, (m points, 10 B) for B bodies, in the prime field.
 
-    There are m = n(n+1)/2 + 1 rows per position: the coefficients of the inertial parameters in the entries of M(q) and
-    in V(q) - V(q0), with q0 the first position. M and V are linear in the inertial parameters and determine the torque:
-    the rank of the rows is the number of base parameters (Gautier and Khalil 1990).
+    The elements are integers modulo 2^61 - 1, so that ranks need no tolerances. There are m = n(n+1)/2 + 1 rows per
+    position: the coefficients of the inertial parameters in the entries of M(q) and in V(q) - V(q0), with q0 the first
+    position. M and V are linear in the inertial parameters and determine the torque: the rank of the rows is the number
+    of base parameters (Gautier and Khalil 1990).
 
     points: number of random positions.
     """
@@ -80,10 +83,11 @@ def regressor_rows(arm: Chain, points: int) -> np.ndarray:
 
 
 def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np.ndarray:
-    """Return lower triangles of M in double precision, (1 + n, samples, n(n+1)/2).
+    """Return lower triangles of M at random positions in double precision, (1 + n, samples, n(n+1)/2).
 
-    On the first axis, index 0 has random positions, and the positions of index 1 + k differ in coordinate k only. arm,
-    assume and samples are as for ``field_samples``. seed: seed of the random positions and inertial parameters.
+    Index 0 of the first axis has random positions. The positions at index 1 + k differ from them in coordinate k only.
+    assume: ``kinematics``: each of the samples has other random inertial parameters; ``inertials``: all samples have
+    the inertial parameters of the URDF. samples: samples per index. seed: seed of positions and inertial parameters.
     """
     rng = np.random.default_rng(seed)
     n = len(arm.coordinates)
@@ -139,9 +143,10 @@ def _residue_values(element: Residues | int, shape: tuple[int, ...]) -> np.ndarr
 class Spans:
     """Linear spans of M and of its changes, from which the structure of an arm is derived.
 
-    The spans are computed in the prime field, in which ranks and zeros need no tolerances. A vector of the spans has
-    the n(n+1)/2 entries of the lower triangle of M. W is the span of all M(q), T_i the span of the changes of M if only
-    coordinate i moves, and U the sum of all T_i. A basis has a row per dimension.
+    M is the mass matrix, V the potential energy. The spans are computed in the prime field (integers modulo 2^61 - 1),
+    in which ranks and zeros need no tolerances. A vector of the spans has the n(n+1)/2 entries of the lower triangle of
+    M. W is the span of all M(q), T_i the span of the changes of M if only coordinate i moves, and U the sum of all T_i.
+    A basis has a row per dimension.
 
     Attributes:
         n: Number of coordinates.
@@ -153,7 +158,9 @@ class Spans:
         change_bases: Echelon basis of each T_i, (dim T_i, entries), with the entries in the order ``order``.
         varying: Basis of U, (dim U, entries).
         floats: Samples of M in double precision, (1 + n, 2 S, entries): in block 1 + k, only coordinate k differs from
-            block 0. They determine the values of nonzero coefficients.
+            block 0. The structure has functions that are weighted sums of entries of M (see `structure.basis`). The
+            prime field determines the entries with nonzero weights; a least-squares fit to these samples determines the
+            weights as floats. 2 S samples give the fit a better condition than S.
     """
 
     def __init__(self, arm: Chain, assume: Assume):
@@ -175,10 +182,11 @@ class Spans:
         self.floats = float_samples(arm, assume, 2 * count)
 
     def float_changes(self, joints: frozenset[int]) -> np.ndarray:
-        """Return samples of the changes of M caused by each of ``joints``, in double precision, (samples, entries).
+        """Return changes of M if one of ``joints`` moves, in double precision, (2 S joints, entries).
 
-        With S samples per block (see the module), each joint has 2 S rows, in increasing order of the joints. A row is
-        M in the block of ``floats`` in which only this joint has moved, minus M in block 0.
+        The rows are ordered by increasing joint; each joint has 2 S rows. A row is a difference of two samples of
+        ``floats``: M with another position of this joint (block 1 + joint) minus M at the same positions of all other
+        joints (block 0). A block has 2 S samples.
         """
         base = self.floats[0]
         return np.concatenate([base[:0], *(self.floats[k + 1] - base for k in sorted(joints))])
@@ -186,8 +194,9 @@ class Spans:
     def outside(self, joints: frozenset[int]) -> np.ndarray:
         """Return an echelon basis of the changes of M if joints other than ``joints`` move, (dimension, entries).
 
-        It is a basis, in the prime field, of the sum of the spans T_i (see the class) of these other joints i. The
-        columns are the entries of M in the order of the attribute ``order``.
+        T_i is the span of all changes M(q) - M(q') if only joint i moves. The result is a basis, in the prime field, of
+        the sum of T_i over all joints i that are not in ``joints``. The columns are the entries of M in the order of
+        the attribute ``order``.
         """
         others = [basis for k, basis in enumerate(self.change_bases) if k not in joints]
         return field.row_basis(np.concatenate([self.varying[:0], *others]))

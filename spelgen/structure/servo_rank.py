@@ -62,14 +62,15 @@ def servo_rank(arm: Chain) -> ServoRank:
     _, null = _row_and_null_space(system / norms)
     changes = (null / norms[:, None])[: n * len(PARAMETERS)].reshape(n, len(PARAMETERS), -1)
     changes = changes / np.abs(changes).max()
-    # [1] Two relative changes of parameters along a null vector, at most 1, count as equal if they differ by less than
-    # `equal`. Rounding errors are far smaller: about 1e-16 in the system matrix, and 1e-13 in its null vectors.
+    # [1] Two relative changes of parameters count as equal if they differ by less than `equal`. `changes`, (n,
+    # parameters, null vectors): relative changes of the servo parameters along each null vector, scaled to a largest
+    # magnitude of 1. Rounding errors are far smaller: about 1e-16 in the system matrix, and 1e-13 in its null vectors.
     equal, kp = 1e-6, changes[:, :1]
-    # `same`, (n, n): True for two joints whose kp change by the same factor in the whole null space.
+    # `same`, (n, n): True for two joints whose kp have equal relative changes along each null vector.
     same = np.abs(kp - changes[None, :, 0]).max(axis=-1) < equal
     groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in same)
-    # `differs`, (n, parameters of a joint): False for a parameter that changes by the same factor as kp of its joint
-    # along all null vectors of `system`.
+    # `differs`, (n, parameters of a joint): False for a parameter whose relative change equals the relative change of
+    # the kp of its joint along each null vector.
     differs = np.abs(changes - kp).max(axis=-1) > equal
     undetermined = [(PARAMETERS[k], joint) for k, joint in np.argwhere(differs.T).tolist()]
     return ServoRank(tuple(groups), tuple(undetermined))
@@ -89,19 +90,21 @@ def torque_rows(arm: Chain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> n
     """
     samples, n = q.shape
     step = 1e-30
-    # q is shifted in n + 1 `directions`, (S, n + 1, n), for derivatives: the n coordinate axes, for d/dq, and last qd,
-    # for d/dt.
+    # q is shifted by an imaginary step in n + 1 `directions`, (S, n + 1, n), for derivatives: the n coordinate axes,
+    # for d/dq, and last qd, for d/dt.
     directions = np.concatenate([np.tile(np.eye(n), (samples, 1, 1)), qd[:, None]], axis=1)
     inertias = np.split(np.eye(10 * len(arm.bodies)), len(arm.bodies))
     shifted = q[:, None, None] + 1j * step * directions[:, :, None]
     triangles, potential = float_energies(arm, shifted, [list(ten) for ten in inertias])
-    # `mass`: M per unit inertial parameter at positions shifted in each of the n + 1 directions, (S, n + 1, 10 B, n,
-    # n).
+    # `mass`, (S, n + 1, 10 B, n, n): M per unit of each of the 10 B inertial parameters of the B bodies, for S samples,
+    # at the complex positions q + i step d for each of the n + 1 `directions` d. Its imaginary part divided by `step`
+    # is the derivative of M in the direction d.
     mass = np.zeros((*potential.shape, n, n), dtype=complex)
     for entry, (row, column) in enumerate(triangle(n)):
         mass[..., row, column] = mass[..., column, row] = triangles[..., entry]
-    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq. Complex step: in the time `step`, q changes by step qd (the last
-    # of `directions`) and qd by step qdd, so the imaginary part of M qd, `momentum`, is step d/dt (M qd).
+    # tau = d/dt (M qd) - d/dq (qd^T M qd / 2) + dV/dq, with complex-step derivatives. For d/dt, `momentum` is the
+    # product of M at q + i step qd (the last of `directions`) and qd + i step qdd: its imaginary part is
+    # step d/dt (M qd). For d/dq, M and V are evaluated at q + i step e_k, with the unit vectors e_k.
     momentum = np.einsum("spij,sj->sip", mass[:, n], qd + 1j * step * qdd)
     kinetic = np.einsum("skpij,si,sj->skp", mass[:, :n], qd, qd) / 2
     return np.asarray((momentum - kinetic + potential[:, :n]).imag / step)

@@ -1,12 +1,16 @@
 """Structure of an arm: zero, constant and varying entries of M, the joints that M and V depend on, minimal form of M.
 
 V is the potential energy. The minimal form is M(q) = sum_k c_k A_k + sum_j f_j(q) B_j, with constants c_k, functions
-f_j and constant matrices A_k and B_j. Let W be the span of M(q), T_i the span of the changes M(q) - M(q') when only
-joint i moves, each for all q and all assumed inertial parameters, and U the sum of all T_i. The minimal number of
-functions f_j is dim U, and the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only
-on the joints in a set J if and only if it vanishes on T_i for every i outside J; this test selects the functionals that
-define the f_j. All tests compute ranks or zeros of random samples of M and its changes in a prime field (``field``):
-exact with an error probability of about 1e-16, without tolerances.
+f_j and constant matrices A_k and B_j.
+
+Let W be the span of M(q), and T_i the span of the changes M(q) - M(q') when only joint i moves, each for all q and for
+all inertial parameters or the parameters of the URDF (see `Structure.assume`). U is the sum of all T_i. Every change of
+M is a linear combination of the B_j, so the minimal number of functions f_j is dim U. The A_k and B_j together span W,
+so the minimal number of constants c_k is dim W - dim U. A linear functional of M depends only on the joints in a set J
+if and only if it vanishes on T_i for every i outside J; this test selects the functionals that define the f_j.
+
+All tests compute ranks or zeros of random samples of M and its changes in a prime field (``field``): exact with an
+error probability of about 1e-16, without tolerances.
 """
 
 from dataclasses import dataclass
@@ -71,7 +75,8 @@ class Structure:
 def derive(arm: Chain, assume: Assume = "kinematics") -> Structure:
     """Return the structure of the mass matrix M and the potential energy V of ``arm``.
 
-    It has the zero, constant and varying entries of M, the minimal form of M, and the joints that V depends on. assume:
+    It has the zero, constant and varying entries of M, the minimal form of M, and the joints that V depends on. The
+    minimal form is M = sum_k c_k A_k + sum_j f_j(q) B_j, in which each f_j depends on a minimal set of joints. assume:
     ``kinematics`` for a structure that is valid for all values of the inertial parameters, ``inertials`` for the values
     in the URDF. Raises ArmError if ``assume`` is ``inertials`` and a body has no inertial with mass.
     """

@@ -35,8 +35,8 @@ def _read_inertial(inertial: Element) -> Inertial | None:
     if inertial.xml is None:
         return None
     mass_element = inertial.child("mass")
-    # Origin and tensor are read before the mass is checked, so that their defects are reported also if the mass is
-    # absent.
+    # Origin and inertia tensor are read first, because an absent <mass> ends this function: errors in them would then
+    # not be reported.
     com, rpy = _read_origin(inertial)
     tensor = _read_tensor(inertial)
     if mass_element.xml is None:

@@ -22,8 +22,9 @@ _LARGEST_COM = 5.0
 # [m] Largest plausible radius of gyration of a link. In 200 URDFs of arms only placeholders have a larger one.
 _LARGEST_GYRATION = 3.0
 # [kg/m^3] Largest plausible density of a sphere with the mass and the largest radius of gyration of a link. Metals are
-# below 2.3e4; of 1,296 links in 200 URDFs only a placeholder, 1 kg with a radius of 2 mm, exceeds 2e5. With masses in
-# grams the density of a link is 3e7 times as large.
+# below 2.3e4; of 1,296 links in 200 URDFs only a placeholder, 1 kg with a radius of 2 mm, exceeds 2e5. With a mass in
+# grams and an inertia in kg m^2, the radius of gyration is smaller by sqrt(1000), so the density is 1000^2.5 = 3e7
+# times as large.
 _LARGEST_DENSITY = 1e6
 
 Finding = tuple[str, str, int, str]

@@ -109,7 +109,8 @@ def _unique(notes: Notes, elements: Sequence[Part | None]) -> list[Part]:
     for element in elements:
         if element is None:
             continue
-        # Only the first element of a name is kept, so that later checks do not report errors caused by the second.
+        # Of several elements with the same name, only the first is kept: later checks would report errors that the
+        # other elements cause.
         first = by_name.setdefault(element.name, element)
         if first is not element:
             kind = "link" if isinstance(element, UrdfLink) else "joint"
@@ -156,10 +157,11 @@ def _check_mimics(notes: Notes, joints: Sequence[UrdfJoint]) -> None:
 
 
 def _is_in_cycle(joint: UrdfJoint, by_name: dict[str, UrdfJoint]) -> bool:
-    """Whether ``joint`` is part of a cycle of mimic joints."""
+    """Return True if ``joint`` is part of a cycle of mimic joints. by_name: {name: joint} of all joints."""
     seen: set[str] = set()
     leader: UrdfJoint | None = joint
-    # `seen` ends the loop if the leaders form a cycle that does not contain the joint.
+    # `seen` contains the joint and its leaders up to here. It ends the loop in a cycle: at the joint if the cycle
+    # contains it, otherwise at another leader.
     while leader is not None and leader.mimic is not None and leader.name not in seen:
         seen.add(leader.name)
         leader = by_name.get(leader.mimic.joint)

@@ -25,9 +25,10 @@ MAX_NAME = 256
 # [rad, m; Nm, N; rad/s, m/s] A limit of at least this magnitude means that the joint has no limit: exporters write 1e9,
 # 1e16 or DBL_MAX in this case.
 UNLIMITED = {"lower": 1e3, "upper": 1e3, "effort": 1e5, "velocity": 1e3}
-# {element of a joint or inertial: its optional attributes}. An attribute with a similar name is an error, because a
-# misspelt optional attribute would be ignored silently. Text or children in these elements, which SDF has, are errors.
-# The list for <origin> is empty, because `elements` refuses all its unknown attributes.
+# {element of a joint or inertial: its optional attributes}. An attribute with a name similar to an optional attribute
+# is an error, because a misspelt optional attribute would be ignored silently. Text or children in these elements,
+# which SDF has, are errors. <origin> has optional attributes, xyz and rpy, but its list is empty, because
+# `elements._read_origin` refuses all other attributes.
 _LEAVES = {
     "origin": (),
     "axis": (),
@@ -118,7 +119,11 @@ class Element:
         return child
 
     def _find_ignored(self, tag: str, parent: etree._Element) -> None:
-        """Add errors for content that would be ignored: a misspelt element ``tag`` in ``parent``, or content in it."""
+        """Add errors for content that would be ignored.
+
+        If the element ``tag`` is absent, this is a misspelt element in ``parent``. If it is present, this is text or
+        elements inside it, and its misspelt attributes.
+        """
         if self.xml is None:
             for sibling in parent.iterchildren(etree.Element):
                 name = etree.QName(sibling).localname

@@ -41,7 +41,8 @@ def expand(path: Path, max_bytes: int) -> tuple[bytes, tuple[str, ...]]:
             raise UrdfError(f"xacro still running after {MAX_SECONDS} s", file=path, do=_BY_HAND) from None
         lines = run.stderr.decode(errors="replace").splitlines()
         warnings = tuple(line.removeprefix("warning: ") for line in lines if line.startswith("warning: "))
-        # All messages that xacro prints before a failure are part of the error, because they often state its cause.
+        # If xacro fails, all lines that it has printed, except warnings, are part of the error: they often state the
+        # cause of the failure.
         if run.returncode:
             raise _failure(path, run.returncode, [line for line in lines if not line.startswith("warning: ")])
         size = output.seek(0, 2)

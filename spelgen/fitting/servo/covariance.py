@@ -13,21 +13,22 @@ from spelgen.identification.intervals import QUANTILE
 
 
 def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
-    """Return `Checkpoint.posterior` of a servo fit: the covariance (K, K) of the parameters of a `ParameterVector`.
+    """Return the posterior of a servo fit for the checkpoint: `covariance` (K, K), and `delay_std` of the delay [s].
 
-    The fit determines the covariance of k parameters. The derivatives of the K parameters of the model with respect to
-    these k parameters give the covariance (K, K). The covariance is scaled such that 1.96 standard deviations are half
-    the width of the 95 % interval of Student's t distribution.
+    The K parameters are the parameters of a `ParameterVector`. The fit estimates k parameters (`ServoParameters`):
+    joint parameters, coordinates of the bodies, and the delay. Their covariance (k, k) is converted by the derivatives
+    of the K parameters with respect to the k parameters. It is scaled such that 1.96 standard deviations are half the
+    width of the 95 % interval of Student's t distribution. Three variances are increased, since the fit underestimates
+    them:
 
-    Two covariances are added: the variance of kd, armature and friction due to errors of the friction model
-    (`ServoTuning.model_deviation`), and the prior covariance of the body parameters orthogonal to the directions that
-    the fit changes (`ParameterMap.directions`).
-
-    If no kp is known, positions do not depend on a common factor of gains, masses, friction and offsets, except by
-    effort limits. The limits in URDFs often differ from the limits of the motors. The variance of the logarithm of this
-    factor is therefore raised to at least the prior variance of the logarithm of a mass.
-
-    The result also has the standard deviation of the delay, `delay_std` [s].
+    - kd, armature and friction: the variance due to errors of the friction model is added
+      (`ServoTuning.model_deviation`).
+    - bodies: the prior covariance is added for directions orthogonal to `ParameterMap.directions`, which are not
+      fitted.
+    - common factor of gains, masses, friction and offsets, if no kp is known: only effort limits [Nm, N] determine this
+      factor, and the limits in URDFs are often wrong. The variance of the logarithm of the factor is therefore
+      increased until the mean variance of log kp is at least `ServoTuning.bodies`^2, the prior variance of the
+      logarithm of a mass.
     """
     parameters, model = problem.parameters, problem.rollouts.model
     vector, directions = ParameterVector(model), parameters.directions
@@ -55,11 +56,13 @@ def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content
 def _common_factor(vector: ParameterVector) -> Tensor:
     """Return the derivative (K,) of the parameters with respect to the logarithm of a common factor of all torques.
 
-    Positions under servos do not depend on this factor of gains, masses, friction and torque offsets.
+    Positions under servos do not depend on this factor of gains, masses, friction and torque offsets. The
+    parameters of gains, masses and friction are logarithms and have the derivative 1. The parameter of a torque offset
+    is proportional to the factor: its derivative is its value.
     """
     logarithms = vector.mask("stiffness", "damping", "armature", "sizes", "effects").double()
     derivatives = vector.unflatten(logarithms)
-    derivatives[vector.bodies][:, -1] = 1.0  # the last parameter of a body is the logarithm of its mass
+    derivatives[vector.bodies][:, -1] = 1.0  # log(mass), with derivative 1 by log(factor)
     for name in vector.names("offset"):
         derivatives[name].copy_(vector.initial[name])
     return logarithms

@@ -54,9 +54,10 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
         model.raw_armature.copy_((armature / model.nominal_armature).log())
         friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
-        # Logs of positions determine only the sum of viscous friction and kd. The sum is fitted as kd, and viscous
-        # friction is set to a negligible value, exp(-6) times the nominal friction. The initial guess of the Stribeck
-        # effect is exp(-2) times the nominal friction.
+        # The parameters are logarithms of friction constants, divided by the initial values of `FrictionLaws`. Logs of
+        # positions determine only the sum of kd and viscous friction, both its linear and its saturating part. The sum
+        # is fitted as kd, and both parts are set to exp(-6) times their initial values, which is negligible. The fit of
+        # the Stribeck effect starts at exp(-2) times its initial value.
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
@@ -70,12 +71,12 @@ def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
     samples of a window count as one independent error.
 
     Args:
-        columns: (W, K, n, 5), regressors of each joint: velocity, acceleration, dry friction divided by its magnitude
-            (-1 to 1), torque of the bodies except for the inertial torque of the joint's own acceleration
-            (`BodyLoad.bias`), and 1.
-        errors: (W, K, n), command errors u - q [rad, m] at the K intervals of each of W windows.
+        columns: (W, K, n, 5), regressors of each joint at K samples of each of W windows: velocity, acceleration, dry
+            friction divided by its magnitude (-1 to 1), torque of the bodies except for the inertial torque of the
+            joint's own acceleration (`BodyLoad.bias`), and 1.
+        errors: (W, K, n), command errors u - q [rad, m] at the same samples.
     """
-    matrix = columns.flatten(0, 1).transpose(0, 1)  # matrix: (n, W K, 5), joint first
+    matrix = columns.flatten(0, 1).transpose(0, 1)  # (n, W K, 5): per joint, 5 regressors at W K samples
     target = errors.flatten(0, 1).mT.unsqueeze(-1)
     # The least-squares driver is gelsd, because torch's default driver chooses its pivots differently in each run.
     solution = torch.linalg.lstsq(matrix, target, driver="gelsd").solution
@@ -108,8 +109,8 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
     def delayed_error(delay: float) -> float:
         return float(np.square(commands(delay) - measured).mean())
 
-    # A bounded scalar search suffices for the delay of the commands: commands change little within the bounds, so the
-    # error has one minimum.
+    # A bounded scalar search suffices for the delay: within `max_delay`, 0.4 s, commands change so little that the
+    # error, as a function of the delay, has one minimum.
     late = minimize_scalar(delayed_error, bounds=(0, TUNING.max_delay), method="bounded").x
     # The unknowns x of a joint's linear servo: log of the natural frequency [rad/s], log of the damping ratio, delay
     # [s], offset [rad, m].

@@ -128,9 +128,10 @@ class ServoObjective(Objective):
         return result.state.x
 
     def _finish(self, x: ServoParameters) -> None:
-        """Take a last Gauss-Newton step from x, with half the integration step length.
+        """Take a last Gauss-Newton step from x, with twice as many integration steps as in the fit; store the results.
 
-        Its result is written to `results` and to the checkpoint.
+        The step corrects most of the integration error of x. The parameters after the step are written to the model
+        and, with their intervals, to `results`; their covariance is written to the checkpoint.
         """
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)

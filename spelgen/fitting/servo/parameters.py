@@ -103,11 +103,12 @@ class ParameterMap:
         return self.names.index(name)
 
     def named(self, joints: Tensor) -> dict[str, Tensor]:
-        """Return {name: tensor} for P sets of joint parameters (P, p, n).
+        """Return {name: tensor} for P sets of joint parameters (P, p, n): p parameters for each of n joints.
 
-        The tensors are (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint.
+        A tensor is (P, 1, n), or (P, 1, n, K) for a parameter with K values per joint. In rollouts, the axis of length
+        1 is broadcast over the windows.
         """
-        # columns: one tensor (P, 1, n, K) per name, for K values per joint
+        # `columns` has a tensor (P, 1, n, K) for each parameter name: P sets, n joints, K values per joint
         columns = joints.unsqueeze(1).mT.split(self._widths, dim=-1)
         named = {}
         for (name, tensor), column in zip(self.tensors.items(), columns, strict=True):
@@ -125,7 +126,7 @@ class ParameterMap:
     def precision(self, x: ServoParameters) -> Tensor:
         """Return the inverse prior variances of all parameters, (k,); the parameters are independent in the prior.
 
-        They depend on ``x.active``: a parameter that is not fitted has a variance of practically zero.
+        A parameter that is not fitted according to ``x.active`` has a variance of practically zero.
         """
         joints = torch.where(x.active, self._deviations, TUNING.fixed)
         shared = torch.tensor([1.0] * len(x.bodies) + [TUNING.delay]).double()
@@ -147,11 +148,12 @@ class ParameterMap:
         return parameters
 
     def _body_directions(self, q: Tensor) -> Tensor:
-        """Return the r directions of log-Cholesky parameters with the largest effect on gravity, (10 B, r).
+        """Return the r directions of log-Cholesky parameters of B bodies with the largest effect on gravity, (10 B, r).
 
-        The directions are right singular vectors of the derivative of the gravity torques at q (M, n) with respect to
-        the log-Cholesky parameters of B bodies, times the prior standard deviation; r is at most
-        `ServoTuning.body_directions`.
+        Let A (M n, 10 B) be the derivative of the gravity torques at M positions with respect to the log-Cholesky
+        parameters. A direction is a right singular vector of A, multiplied by the prior standard deviation
+        `ServoTuning.bodies`. The vectors of the largest singular values are used, at most
+        `ServoTuning.body_directions`; vectors of negligible effect are omitted. q: (M, n), the positions [rad, m].
         """
         zero = torch.zeros_like(q)
         # torch.func is not used, since its Jacobians import torch's compiler, which takes more than a second.

@@ -48,7 +48,10 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def base_parameters(self) -> tuple[Interval, ...]:
-        """95 % intervals of the base parameters or, if no kp is known, of their ratios to kp of `scale_joint`."""
+        """95 % intervals of the base parameters; if no kp is known, of their ratios to the kp of one joint.
+
+        This joint is `scale_joint`.
+        """
         if self._scale_index is None:
             return super().base_parameters
         values, roots = self._ratios(self._scale_index)
@@ -65,8 +68,9 @@ class ServoPosterior(Posterior):
     def unidentifiable(self) -> tuple[str, ...]:
         """Names of the quantities that logs determine only in combinations, or not at all.
 
-        Masses and first moments are tested, and pairs of quantities (`SUMS`): a pair is listed if its sum has a smaller
-        error than either quantity. If no kp is known, the common factor of all torques and inertias is listed, too.
+        A mass or first moment is listed if it is not itself one of the base parameters. A pair of quantities (`SUMS`)
+        is listed if the standard deviation of their sum is smaller than the standard deviation of either quantity. If
+        no kp is known, the common factor of all torques and inertias is listed, too.
         """
         pairs, delays = [], (self.delay,) * self.model.n
         for name, (first, second) in SUMS.items():
@@ -94,7 +98,10 @@ class ServoPosterior(Posterior):
         ]
 
         def ratios(model: ArmModel) -> Tensor:
-            """Return kp, kd/kp, ..., offset/kp of all joints, (8, n), in the order of `SERVO_UNITS`."""
+            """Return the eight quantities of n joints, (8, n), in the order and the units of `SERVO_UNITS`.
+
+            The quantities are kp, kd/kp, lag, armature/kp, coulomb/kp, dead zone, static error and offset/kp.
+            """
             servo, kp = model.servo, model.servo.kp()
             damping, dry = servo.kd() / kp, line(model)[1] / kp
             return torch.stack([
@@ -106,7 +113,10 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _scale_index(self) -> int | None:
-        """Index of `scale_joint`, whose kp divides the base parameters; None if a kp is known (no division)."""
+        """Index (0 to n - 1) of `scale_joint`, the joint whose kp divides the base parameters; None if a kp is known.
+
+        If no kp is known, positions determine only the ratios of base parameters to kp.
+        """
         if not self.model.servo.trained.all():
             return None
         ratios = map(self._ratios, range(self.model.n))
@@ -114,11 +124,15 @@ class ServoPosterior(Posterior):
 
     @cached_property
     def _stiffness(self) -> Propagated:
-        """kp of all servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance."""
+        """kp of all n servos, (n,) [Nm/rad, N/m], with a square root (n, k) of their covariance (see `Propagated`)."""
         return self.propagate(lambda model: model.servo.kp())
 
     def _ratios(self, joint: int) -> Propagated:
-        """Return r ratios, base parameter / kp of a joint, (r,), with a square root (r, k) of their covariance."""
+        """Return r ratios (base parameter / kp of a joint), (r,), and a square root (r, k) of their covariance.
+
+        joint: index of the joint. The unit of a ratio is the unit of the base parameter divided by the unit of kp. k is
+        the rank of the covariance of the fitted parameters (see `Propagated`).
+        """
         values, (kp, kp_root) = self._base_values, self._stiffness
         ratio = values.value / kp[joint]
         return Propagated(ratio, (values.root - ratio.outer(kp_root[joint])) / kp[joint])

@@ -38,10 +38,11 @@ class Likelihood:
 
     @classmethod
     def of(cls, errors: Tensor, noise: Tensor, max_samples: int) -> Likelihood:
-        """Return the likelihood whose ``scale`` and ``samples_per_error`` are estimated from errors.
+        """Return the likelihood with ``scale`` and ``samples_per_error`` estimated from position errors.
 
         Args:
-            errors: (W, K', n), position errors [rad, m].
+            errors: (W, K', n), position errors [rad, m] of n joints at the K' samples of each of W windows after the
+                burn-in.
             noise: (n,), lower bound of the scale [rad, m].
             max_samples: upper bound of ``samples_per_error``, the number of samples per independent error.
         """
@@ -102,9 +103,10 @@ class ServoProblem:
         return self.of(self.rollouts, self.noise, self.residual(x))
 
     def refined(self, steps: int, difference_step: float) -> ServoProblem:
-        """Return the problem with other integration steps and other finite-difference steps.
+        """Return the same problem with shorter or longer integration steps and another step of the finite differences.
 
-        steps: number of integration steps per sample interval. difference_step: step of the finite differences.
+        steps: number of integration steps per sample interval. difference_step: step of each parameter in the finite
+        differences [1].
         """
         windows = replace(self.rollouts.windows, steps=steps)
         return replace(
@@ -117,7 +119,10 @@ class ServoProblem:
         return self.rollouts.parameters
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions for parameters x, (W, K', n) [rad, m].
+
+        Each of the W windows has K' samples after the burn-in.
+        """
         return self.rollouts.residual(x)
 
     def joint_costs(self, x: ServoParameters, errors: Tensor) -> Tensor:
@@ -172,8 +177,8 @@ class ServoProblem:
         descent = torch.zeros(count, p * n + r).double()
         for joint in range(n):
             # The errors of a joint depend only on p parameters of the joint and on r parameters that all joints share:
-            # body parameters and delay. `jacobian`, (W, p + r, K'), has the derivatives of the joint's K' errors in
-            # each window with respect to these p + r parameters.
+            # here r includes the coordinates of the bodies and the delay. `jacobian`, (W, p + r, K'), has the
+            # derivatives of the joint's K' errors in each window with respect to these p + r parameters.
             jacobian = torch.cat([of_joints[..., joint], of_shared[..., joint]]).transpose(0, 1)
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]

@@ -100,13 +100,13 @@ def solution(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParameters
     # of the prior add up to zero, as the jackknife requires.
     blocks = blocks._replace(descent=blocks.descent - blocks.curvature @ step)
     end = x.after(step)
-    # The step may raise the cost if a joint is near its break-away torque, where errors are not linear in the
-    # parameters.
+    # The Gauss-Newton step from x to `end` may raise the cost if a joint is near its break-away torque, where the
+    # position errors are not linear in the parameters. In this case, x is returned.
     if problem.cost(end, problem.residual(end)) > problem.cost(x, errors):
         end = x
     _, covariance = jackknife_covariance(*blocks, torch.diag(precision))
-    # The last solver step, with shorter integration steps than the fit, estimates the integration error of x. It counts
-    # as an error of one standard deviation, so its outer product is added to the covariance.
+    # The Gauss-Newton step, with shorter integration steps than the fit, estimates the integration error of x. It
+    # counts as an error of one standard deviation, so its outer product is added to the covariance.
     return end, ServoSolution(blocks, precision, covariance + torch.outer(step, step))
 
 

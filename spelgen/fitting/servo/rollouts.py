@@ -48,7 +48,10 @@ class ServoRollouts:
 
     @classmethod
     def of(cls, model: ArmModel, windows: ServoWindows) -> ServoRollouts:
-        """Return the rollouts from the measured states of `windows`; x0 of the class are the model's parameters."""
+        """Return the rollouts that start at the first measured positions and velocities of each window.
+
+        The parameters x0, for which the load is computed (see the class), are the current parameters of the model.
+        """
         q = windows.q.flatten(0, 1)
         parameters = ParameterMap(model, q[:: max(1, len(q) // TUNING.gravity_samples)])
         motion = windows.motion()
@@ -56,36 +59,44 @@ class ServoRollouts:
         return cls(model, windows, parameters, motion, body_load(model, motion), inertial)
 
     def linearized(self, x: ServoParameters, motion: MidpointMotion) -> ServoRollouts:
-        """Write x to the model; return the rollouts with the load recomputed for x along the fixed motion ``motion``.
+        """Write x to the model; return the rollouts with x as the new x0 and ``motion`` as the new fixed motion.
 
-        The load is the torque of the bodies: gravity, inertia, Coriolis forces. x replaces x0 of the class.
+        The load of the bodies along the fixed motion (gravity, inertia, Coriolis forces) is recomputed for x. At
+        parameters other than x0, a rollout adds Y (phi - phi(x0)) to this load, where Y is the torque regressor along
+        the fixed motion, and phi are the inertial parameters of the bodies.
         """
         self.parameters.write(x)
         load, inertial = body_load(self.model, motion), self.parameters.inertial(x.bodies)
         return replace(self, motion=motion, load=load, inertial=inertial)
 
     def residual(self, x: ServoParameters) -> Tensor:
-        """Return predicted minus measured positions after the burn-in for parameters x, (W, K', n) [rad, m]."""
+        """Return predicted minus measured positions for parameters x, (W, K', n) [rad, m].
+
+        Each of the W windows has K' samples after the burn-in.
+        """
         return self._errors(self._rollout_at(x)[0])[0]
 
     def predicted_motion(self, x: ServoParameters) -> MidpointMotion:
-        """Return measured positions with velocities and accelerations from rollouts at x, at midpoints between samples.
+        """Return positions, velocities and accelerations at midpoints between samples, for `linearized`.
 
-        The velocities are derivatives of the predicted positions, plus smoothed derivatives of the difference (measured
-        minus predicted position). The accelerations are computed in the same way. Smoothed derivatives of the measured
-        positions would attenuate fast motion (see `ServoWindows.motion`).
+        The positions are measured. The velocities are the velocities of a rollout with parameters x, corrected by
+        smoothed derivatives of measured minus predicted positions. The accelerations are derivatives of the velocities
+        of the rollout, corrected by smoothed second derivatives. Smoothed derivatives of the measured positions,
+        without a rollout, would attenuate fast motion.
         """
         q, qd = self._rollout_at(x)
         return self.windows.motion(q[0], qd[0])
 
     def jacobian(self, x: ServoParameters) -> tuple[Tensor, Tensor]:
-        """Return derivatives of the `residual` (W, K', n) of W windows with respect to joint and shared parameters.
+        """Return derivatives of the `residual` with respect to the parameters of each joint and to shared parameters.
+
+        The residual is (W, K', n): W windows, each with K' samples after the burn-in, and n joints.
 
         Returns:
-            (p, W, K', n), with respect to the p parameters of the same joint; zero for a parameter that is fixed at all
-                joints.
-            (r + 1, W, K', n), with respect to the r coordinates of the body parameters and to the delay, which all
-                joints share.
+            (p, W, K', n): derivatives of each joint's residual with respect to the p parameters of the same joint; zero
+                for a parameter that is fixed at all joints.
+            (r + 1, W, K', n): derivatives with respect to the parameters that all joints share, first the r coordinates
+                of the body parameters, then the delay.
         """
         # rows: indices of the parameters that are fitted at one joint or more
         rows = x.active.any(dim=1).nonzero().squeeze(-1)

@@ -31,7 +31,8 @@ class ServoTuning:
     # [1] Prior standard deviation of the logarithm of the Stribeck velocity. With a wider prior, friction could
     # decrease over the whole range of speeds and would then absorb offsets.
     stribeck_velocity: float = 1.0
-    # [rad, m] Prior standard deviation of half a dead zone: dead zones of the gears of hobby servos are a few mrad.
+    # [rad, m] Prior standard deviation of half the width of a dead zone. It is several times the dead zones of the
+    # gears of hobby servos, a few mrad, so that the prior is weak.
     dead_zone: float = 0.02
     # [s] Prior standard deviation of the delay of the commands.
     delay: float = 0.1
@@ -59,8 +60,8 @@ class ServoTuning:
     # [1] Largest change of any parameter in a solver step; most parameters are logarithms, for which 1 is a factor of
     # e.
     max_step: float = 1.0
-    # [1] Number of samples at whose positions the effect of body parameters on gravity is computed. The fitted
-    # directions (`body_directions`) have the largest effect.
+    # [1] Number of logged positions at which the gravity torque is differentiated with respect to the body parameters.
+    # The directions of body parameters with the largest effect on it are fitted (`body_directions`).
     gravity_samples: int = 2000
 
     # Constants of the outer iterations and their convergence (`servo.objective`).
@@ -86,7 +87,9 @@ class ServoTuning:
 
     # Constants of the selection of joints that have a dead zone (`servo.laws`).
 
-    # [1] Half the width w of the initial dead zone, as a fraction of the static error, dry friction / kp + w / 2.
+    # [1] Initial half width of a dead zone, divided by (dry friction) / kp. This quotient is the static position error
+    # of the fit without a dead zone. Coulomb friction is reduced by the same fraction of itself, so that the static
+    # error remains about the same.
     dead_zone_fraction: float = 0.25
     # [1] Largest number of Levenberg-Marquardt steps, rejected steps included, of each fit of a single joint: the fit
     # with a dead zone and the fit without.
@@ -122,15 +125,17 @@ class ServoTuning:
     # [1] The initial kp is computed from the coefficient of gravity only if it differs from the nominal kp by less than
     # this factor; otherwise kp / nominal kp is the median of the other joints.
     kp_range: float = 20.0
-    # [1] Lower bound m of three initial values: dry friction is at least m times nominal friction, kd/kp at least m^2 =
-    # 0.0025 s, and armature/kp at least m^3 = 0.000125 s^2. The last two are 5 % of 0.05 s (`ModelTuning.servo_lag`)
-    # and of 1 / (20 rad/s)^2 (`frequency`). All three are positive, since their logarithms are fitted.
+    # [1] Number f = 0.05 in the lower bounds of three initial values, whose logarithms are fitted. With the powers of
+    # f, in SI units, each bound is about 5 % of a nominal value. Dry friction: f times nominal friction. kd/kp: f^2 =
+    # 0.0025 s, 5 % of 0.05 s (`ModelTuning.servo_lag`). armature/kp: f^3 = 0.000125 s^2, 5 % of 1 / (20 rad/s)^2
+    # (`frequency`).
     min_friction: float = 0.05
-    # [s] Largest delay of linear servos.
+    # [s] Largest delay of the commands in the fit of linear second-order servos, and in the fit of a pure delay.
     max_delay: float = 0.4
-    # [s] Initial delay of linear servos.
+    # [s] Initial delay of the commands in the fit of linear second-order servos.
     initial_delay: float = 0.02
-    # [rad/s] Initial natural frequency of linear servos; the initial damping ratio is 1.
+    # [rad/s] Initial natural frequency in the fit of linear second-order servos (`LinearServos`), the baseline; the
+    # initial damping ratio is 1.
     frequency: float = 20.0
 
 

@@ -63,7 +63,11 @@ class ServoWindows:
         return float(1 / self.dt.mean())
 
     def subsampled(self, count: int) -> ServoWindows:
-        """Return at most ``count`` windows, evenly spread over all windows, with half as many integration steps."""
+        """Return at most ``count`` of these windows, evenly spread, with half as many integration steps per interval.
+
+        The number of steps is half of this object's `steps`, rounded up: a coarse fit to few windows needs less
+        accuracy.
+        """
         selection = slice(None, None, -(-len(self.q) // count))
         q, qd, dt = self.q[selection], self.qd[selection], self.dt[selection]
         return ServoWindows(self.rows[selection], q, qd, dt, self.burn_in, -(-self.steps // 2))
@@ -80,8 +84,9 @@ class ServoWindows:
         for number in range(len(names)):
             windows = np.flatnonzero(log_numbers == number)
             blocks[windows] += np.arange(len(windows)) * segments // len(windows)
-        # A log with fewer windows than segments has segments without windows. The blocks are therefore renumbered
-        # without gaps.
+        # At this point, `blocks` contains log number * segments + index of the segment. A log with fewer windows than
+        # segments has segments without windows, whose numbers do not occur. The blocks are therefore renumbered without
+        # gaps.
         return torch.from_numpy(np.unique(blocks, return_inverse=True)[1])
 
     def motion(self, q: Tensor | None = None, qd: Tensor | None = None) -> MidpointMotion:
@@ -165,7 +170,10 @@ class BodyLoad(NamedTuple):
 
 
 def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
-    """Return inertia, bias, gravity torque and regressor of the bodies at the K-1 midpoints of a motion."""
+    """Return the load of the bodies of `model` along a motion, as arrays (W, K-1, ...) with the units of `BodyLoad`.
+
+    motion: positions, velocities and accelerations of W windows at the K-1 midpoints between samples.
+    """
     batches: list[BodyLoad] = []
     with torch.no_grad():
         prepared, armature = model.prepare(), model.armature

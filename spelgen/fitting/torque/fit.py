@@ -48,15 +48,16 @@ from spelgen.settings.fits import Adaptation, GaussianPrior
 class FitComparison(NamedTuple):
     """Held-out errors of a torque fit and of simpler methods: ridge regression (see `Regression`), and no fit.
 
+    An error is the mean squared error of held-out blocks divided by the variance of the torque, averaged over joints.
+
     Attributes:
-        fit: error of the returned model: mean squared error of held-out blocks divided by the variance of the torque,
-            averaged over joints.
-        regression: the same error of the ridge regression.
-        behind: True if the regression is significantly better than the fit.
-        replaced: error of a fit from the URDF that was replaced by a better fit from the result of the regression; None
-            if the returned fit started at the URDF.
-        discarded: error of a fit that was discarded, since the model before the fit has no larger error; this model is
-            then returned. None if a fit is returned.
+        fit: error of the returned model.
+        regression: error of the ridge regression.
+        behind: True if the regression is significantly better than the returned model.
+        replaced: error of the fit from the URDF, if a fit from the result of the regression has a smaller error and
+            replaced it; otherwise None.
+        discarded: error of the fit, if the model before the fit has no larger error and is returned instead of the fit;
+            otherwise None.
     """
 
     fit: float
@@ -168,7 +169,10 @@ def _staged_fit(
     adapt: Adaptation | None = None,
     max_error: torch.Tensor = UNBOUNDED,
 ) -> _StagedFit:
-    """Run all stages and the jackknife; the prior mean is the vector of the model's current parameters.
+    """Run all stages of a torque fit, from the initial to the final fit (`_run_stages`), then a jackknife over blocks.
+
+    The blocks of the jackknife are contiguous blocks of samples. The prior mean is the vector of the model's current
+    parameters.
 
     prior: standard deviations of the prior. adapt: group of parameters to estimate; None: all parameters. max_error:
     upper bound of the root mean square torque error, (n,) [Nm, N] (see `TorqueProblem`).
@@ -188,18 +192,20 @@ def _compared_fit(
 ) -> tuple[_StagedFit, FitComparison]:
     """Fit all parameters, and fit again if ridge regression predicts held-out torques significantly better.
 
-    The second fit bounds the torque noise by the held-out error of the regression. If the regression is still better, a
-    third fit has the result of the regression as its initial guess. The fit with the smallest held-out error is
-    returned. If its nMSE (error divided by the variance of the torque) is above `TUNING.unsupported`, and its error is
-    not below the error of the model before the fit, the model before the fit is returned. The returned parameters are
-    written to the model. prior: initial standard deviations of the prior.
+    The regression has the regressors of bodies, friction and offsets (`Regression`). In the second fit, its held-out
+    error is the upper bound of the RMS torque error from which the torque noise is estimated: with a larger noise, a
+    badly fitted joint would have a small weight and remain badly fitted. If the regression is still better, a third fit
+    has its result as the initial guess. The fit with the smallest held-out error is returned. If its nMSE (squared
+    error divided by the variance of the torque) is above `TUNING.unsupported`, and its error is not below the error of
+    the model before the fit, the model before the fit is returned. The returned parameters are written to the model.
+    prior: initial standard deviations of the prior.
     """
     initial, blocks = copy.deepcopy(model.state_dict()), contiguous_blocks(samples)
     torque_std = joint_torque(model, samples.columns).std(dim=0)
     regression = best_regression(model, blocks, torque_std.numpy())
     squares = torch.from_numpy(regression.held_out)
-    # The squared lower bound of the noise is added to the held-out errors of the fit and of the regression, so that
-    # smaller differences are not significant.
+    # The held-out errors of the fit and of the regression are both increased by the squared lower bound of the noise,
+    # so that differences below this bound are not significant.
     negligible = TUNING.min_noise**2 * model.n * torch.tensor([block.count for block in blocks])
     other = squares.sum(dim=1) + negligible
 
@@ -233,8 +239,9 @@ def _compared_fit(
         restarted = _staged_fit(model, samples, prior, max_error=max_error)
         if restarted.held_out.sum() < best.held_out.sum():
             best, replaced = restarted, nmse(best.held_out)
-    # A fit whose nMSE is below the threshold is kept even if the model before the fit (URDF) is exact and predicts
-    # better: the intervals of the fit are smaller.
+    # A fit with a held-out nMSE of at most `TUNING.unsupported` is returned without a comparison with the model before
+    # the fit. The model before the fit may predict better, for example with an exact URDF, but has only the wide
+    # intervals of the prior; the fit has narrower intervals.
     if nmse(best.held_out) > TUNING.unsupported:
         model.load_state_dict(initial)
         unfitted = _unfitted(model, samples, prior, blocks)
@@ -247,9 +254,10 @@ def _compared_fit(
 def _unfitted(
     model: ArmModel, samples: TorqueSamples, prior: GaussianPrior, blocks: Sequence[TorqueSamples]
 ) -> _StagedFit:
-    """Return the model before a fit, as a result to which fits are compared; the covariance is the prior's.
+    """Return the model before a fit, in the form of a fit result, for comparison with fits.
 
-    blocks: contiguous blocks of `samples`, for which the squared errors are computed.
+    The covariance is the covariance of the prior. blocks: contiguous blocks of `samples`, for which the squared errors
+    are computed.
     """
     problem = TorqueProblem.of(TorqueJacobian(model, samples), prior)
     state, free = initial_state(problem, problem.prior.mean), problem.free

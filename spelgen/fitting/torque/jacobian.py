@@ -132,7 +132,8 @@ class TorqueJacobian:
         parameters: {name: values} of one set of parameters, or of a batch (...) of sets.
         """
         ones = torch.ones(self.model.n).double()
-        # A gain is joint torque / logged torque; the parameters are the logarithms of the gains.
+        # The parameter x is the logarithm of a motor gain (joint torque / logged torque). Initial / current gain is
+        # therefore exp(x_initial - x) = exp(-change).
         for name in self.rigid.names("gains"):
             change = parameters[name] - self.rigid.initial[name]
             return ones.expand(*change.shape[:-1], -1).index_copy(-1, self._gain_rows, (-change).exp())
@@ -228,9 +229,9 @@ class TorqueJacobian:
         """
         change = self.theta_jacobian(x)
         covariance = change @ covariance @ change.mT
-        # The projection is computed with respect to theta, which contains inertial parameters where x contains
-        # log-Cholesky parameters. The torque is linear in inertial parameters, so the projection is also valid for
-        # large torques.
+        # The projection describes how the model would absorb an added joint torque of any magnitude. It is computed
+        # with respect to theta, because the torque is linear in inertial parameters. With respect to x, which contains
+        # log-Cholesky parameters instead, the projection would be valid only for small added torques.
         rows = concatenate_blocks(self.joint_rows(x), len(noise))
         gains = []
         for joint, columns, _, _ in rows:
@@ -248,8 +249,8 @@ class TorqueJacobian:
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)
         for name in self.rigid.names(*LOGARITHMIC_GROUPS):
-            # A step s > 0 of log c becomes log(c (1 + s)) - log c = log1p(s), which equals s to first order; s < 0 is
-            # unchanged, since 1 + s could be negative.
+            # For s > 0, c becomes c (1 + s): log c changes by log1p(s). With a change by s, c would grow exponentially
+            # with s. For s < 0, log c changes by s, since 1 + s could be negative.
             parameters[name] = (
                 parameters[name]
                 - change[name]
@@ -322,15 +323,15 @@ class TorqueJacobian:
     def _compressed_jacobian(
         self, parameters: NamedTensors, block: _RegressorBlock
     ) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
-        """Return the torque residual times `logged_scale`, and the negated Jacobian of this product, compressed.
+        """Return the torque residual at the initial motor gains, and its negated Jacobian, compressed by graph colours.
 
-        The residual is measured minus modelled torque; the negated Jacobian has the sign of the modelled torque. One
-        reverse pass differentiates the sum of the torques of several joints, which have the same colour (graph
-        colouring: Curtis, Powell and Reid, J. Inst. Maths Applics 13:117, 1974). No common drive acts on joints of one
-        colour. A parameter of a drive, or the gravity torque on the drive, then affects the torque of at most one joint
-        of a colour, and the derivative of the sum is the derivative of this torque. Most arms have one colour, so one
-        pass replaces n passes. Each sample has its own copy of the parameters, so that a pass gives the derivatives of
-        all samples.
+        The residual is measured minus modelled joint torque, multiplied by initial / current motor gain
+        (`logged_scale`; 1 for fixed gains). The negated Jacobian has the sign of the modelled torque. One reverse pass
+        differentiates the sum of the torques of several joints, which have the same colour (graph colouring: Curtis,
+        Powell and Reid, J. Inst. Maths Applics 13:117, 1974). No common drive acts on joints of one colour. A parameter
+        of a drive, or the gravity torque on the drive, then affects the torque of at most one joint of a colour, and
+        the derivative of the sum is the derivative of this torque. Most arms have one colour, so one pass replaces n
+        passes. Each sample has its own copy of the parameters, so that a pass gives the derivatives of all samples.
 
         Args:
             parameters: {name: values}, the parameters at which the derivatives are computed.

@@ -38,21 +38,22 @@ LOG_FACTOR_LIMIT = 0.99 * LARGEST
 class JointFunction:
     """A residual term of one joint, as a linear model with P = L + W weights on T samples.
 
-    The term has W entries, for example the spline coefficients of the joint. The first L weights are amplitudes of
-    trends, which change all entries together, for example mean and slope of the spline coefficients. The other W
-    weights change one entry each: for the weights w (P,), the entries are trends @ w[:L] + w[L:].
+    The term has W entries e (W,), for example the spline coefficients of the joint. The weights w (P,) are L amplitudes
+    of trends, which change all entries together (for example mean and slope of the spline coefficients), and W changes
+    of single entries: e = trends @ w[:L] + w[L:].
 
-    scale: the parameter of the model is entries / scale.
+    scale: unit of the entries [Nm, N], or 1 for a friction factor; the parameter of the model is e / scale.
     position: (T,) position of the joint [rad, m].
     columns: (T, P) torque per weight [Nm, N].
     features: (T, P) columns after orthogonalization, without the part of the columns that rigid bodies and friction
-        would absorb. For a friction factor they are the columns, since the factor is applied to the whole friction.
+        would absorb. For a friction factor, the features are the columns without orthogonalization: divided by
+        `friction`, they must remain the splines from which the factor is computed.
     direction: (n,) joint torques per unit torque of the term, since a coupled drive acts on several joints.
     trends: (W, L) changes of the entries per unit weight of each trend.
     groups: (P,) index of the group of each weight; a group has one prior precision.
     friction: (T,) friction torque [Nm, N] with the current factor, if the term is a friction factor; None: the term is
-        a torque. The weights of a friction factor determine its logarithm, and columns @ weights is the linearized
-        change of the friction torque.
+        a torque. The weights of a friction factor f determine log(f) = columns @ weights / friction, and columns @
+        weights is the change of the friction torque to first order.
     visit_length: mean number of samples of a visit. A visit of a position is a run of samples in which the joint moves
         by the knot spacing of the splines; its samples count as one independent error.
     """
@@ -70,9 +71,10 @@ class JointFunction:
     visit_length: float
 
     def read(self, terms: ResidualTerms) -> torch.Tensor:
-        """Return the P = L + W weights (P,) that represent the current values of this term's W entries in `terms`.
+        """Return weights w (P,) that represent the current entries of this term in `terms`, the model's residual terms.
 
-        The weights of the L trends are zero: the W weights of single entries suffice (see the class).
+        The entries, such as spline coefficients, are trends @ w[:L] + w[L:] (see the class). Here the weights w[:L] of
+        the L trends are zero, and w[L:] are the entries.
         """
         if self.friction is not None:
             entries = terms.friction_logarithms()[self.joint]
@@ -83,8 +85,9 @@ class JointFunction:
     def write(self, terms: ResidualTerms, weights: torch.Tensor) -> None:
         """Set the term's parameter in `terms` to the values that weights (P,) of the `JointFunction` represent."""
         count = self.trends.shape[1]
-        # Trends (see the class) have a separate prior in the fit but no parameter in the model, so their part is added
-        # to the entries of the term.
+        # The model stores only the W entries, such as spline coefficients. Trends, such as a line through the
+        # coefficients, have weights of their own only in the fit, since these weights have a separate prior. Here they
+        # are added to the entries.
         entries = self.trends @ weights[:count] + weights[count:]
         if self.friction is not None:
             # The model bounds the logarithm of a friction factor by a tanh, which is inverted here.
@@ -95,8 +98,9 @@ class JointFunction:
     def torque(self, weights: torch.Tensor, rows: slice | torch.Tensor = ALL) -> torch.Tensor:
         """Return the part of the torque residual (T,) [Nm, N] that weights (P,) explain at the samples `rows`.
 
-        For a torque it is the term's torque, without the part that rigid bodies and friction would absorb (`features`).
-        For a friction factor f(weights) it is (f - 1) times the friction torque.
+        If the term is an added torque, the result is `features` @ weights: the torque without the part that rigid
+        bodies and friction would absorb. If the term is a factor f of the friction, the result is (f - 1) times the
+        friction torque.
         """
         features = self.features[rows]
         if self.friction is None:
@@ -114,8 +118,8 @@ class JointFunction:
         term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque
         noise [Nm, N].
         """
-        # The target is a weighted least-squares solution over the joints, since the friction of a coupled drive acts on
-        # several joints.
+        # The friction of a coupled drive acts on several joints, each with its own residual and noise. The returned
+        # value is the weighted least-squares solution over these joints.
         weight = self.direction / noise.square()
         return (torque_residual @ weight) / (self.direction @ weight)
 
@@ -165,10 +169,11 @@ def refit_terms(
 ) -> ProjectedTerms:
     """Refit the selected terms to the current torque residual, one after the other.
 
-    A term is fitted to the residual with its `features`. For a torque these columns are orthogonalized: the weights are
-    the same as in a simultaneous fit of torque and rigid bodies (theorem of Frisch, Waugh and Lovell). Friction factors
-    are written to the model. Position-dependent torques are returned as linear terms with the fitted penalty. The next
-    fit of the rigid-body parameters eliminates their weights; in the model, these torques are set to zero.
+    A term is fitted to the residual of the rigid-body and friction model and of the other terms. For a torque, the
+    `features` are orthogonalized: the fitted weights are the same as in a simultaneous fit of the term and the rigid
+    bodies (theorem of Frisch, Waugh and Lovell). Friction factors are written to the model. Position-dependent torques
+    are returned as linear terms, with the fitted penalty of their weights, and are set to zero in the model: in the
+    next fit of the rigid-body parameters, their weights are eliminated by variable projection.
 
     Args:
         model: model with residual terms.
@@ -212,20 +217,22 @@ def joint_functions(
 
     A smooth torque is a spline over the position of the joint. A friction factor, which multiplies the friction of the
     joint, is the exponential of such a spline. The coefficients of a spline have one common prior precision. A smooth
-    torque also has a line over the position, whose mean and slope have prior precisions of their own: the torque of a
-    spring continues at positions without samples, where the spline is near zero. Ripple is a sum of sines and cosines
-    of the position, with one precision per frequency. Frequencies with less than two periods within the samples are
-    omitted: they would fit a trend, and be wrong at other positions.
+    torque also contains a straight line over the position: at positions without samples, the spline is near zero, and
+    the line continues the torque of a spring. Mean and slope of the line have prior precisions of their own. Ripple is
+    a sum of sines and cosines of the position, with one precision per frequency. Frequencies with less than two periods
+    within the samples are omitted: they would fit a trend, and be wrong at other positions.
 
-    projection: projection onto the rigid-body and friction model. selected: (parameter, joint) of the terms to yield;
+    projection: removes from a torque the part that the rigid-body and friction model would absorb. selected:
+    (parameter, joint) of the terms to yield; None: all.
     None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():
         splines, ripple = terms.splines(samples.q), terms.revolute * terms.waves(samples.q)
     joints, unit = torch.eye(len(motors)).to(motors), terms.unit.flatten()
-    # The number of visits of positions (see `JointFunction.visit_length`) is 1 + path length of the joint / knot
-    # spacing.
+    # A visit is a run of samples in which a joint moves by one knot spacing of the splines (see
+    # `JointFunction.visit_length`). The number of visits is therefore path length / knot spacing, plus 1, since a joint
+    # at rest makes one visit.
     visits = 1 + samples.q.diff(dim=0).abs().sum(dim=0) / terms.spacing.flatten()
     one_group, frequencies = torch.zeros(SPLINES), torch.arange(ripple.shape[-1] // 2).repeat(2)
     # Ripple of a frequency needs a range of positions of at least two periods: width >= 2 * 2 pi / frequency.

@@ -105,8 +105,10 @@ class RigidProjection(NamedTuple):
         for joint, (jacobian, gain) in enumerate(zip(self.jacobian, self.posterior_gain, strict=True)):
             rows = jacobian.unflatten(0, (-1, size))
             values, vectors = torch.linalg.eigh(torch.eye(size).double() - rows @ gain @ rows.mT)
-            # If a segment determines many parameters, eigenvalues of 1 - H are near zero, and (1 - H)^(-1/2) would be
-            # too large: the eigenvalues have the lower bound 1 / size.
+            # H (size, size) is the block of the hat matrix of one segment of `size` samples. If the segment determines
+            # many parameters, some eigenvalues of 1 - H are near zero, and (1 - H)^(-1/2) would enlarge the residual
+            # too much. The eigenvalues of 1 - H therefore have the lower bound 1 / size: the residual is enlarged by at
+            # most sqrt(size).
             scale = values.clamp(min=1 / size).rsqrt().unsqueeze(-1)
             errors[..., joint] = (vectors @ (scale * (vectors.mT @ errors[..., joint : joint + 1])))[..., 0]
         return errors
@@ -242,7 +244,7 @@ def bayesian_ridge(
         lambda_ = (gamma / (member.mT @ coef.square()).clamp(min=1e-300)).clamp(max=1e14)
         residual_square = square - float(2 * coef @ moment - coef @ gram @ coef)
         previous, variance = variance, max(residual_square, 1e-12 * square) / count
-        # Three digits of the noise variance suffice.
+        # The iteration ends if the noise variance changes by less than 0.1 %, which is below its sampling error.
         converged = abs(variance - previous) < 1e-3 * previous
     return BayesianRidge(coef, penalty, 1 / max(variance, 1e-300), lambda_, gamma, n_iter, converged)
 

@@ -133,7 +133,7 @@ def _fit_network(
 
     The network is fitted to the first half of the samples, and accepted if it significantly lowers the error on the
     last half. An accepted network is refitted to all samples; a rejected one has its initial weights. The other
-    residual terms are fixed.
+    residual terms of the model are fixed; their torque is subtracted from the torque residual of the samples.
 
     samples: samples with the torque residual of the model without residual terms. correlation_length: number of samples
     per independent error.

@@ -36,7 +36,7 @@ from spelgen.settings.fits import TorqueFit
 if TYPE_CHECKING:
     from spelgen.fitting.urdf_regularizer import UrdfRegularizer
 
-SAMPLES = 5  # number of samples of a window, for validation and for the scales of the validation loss
+SAMPLES = 5  # samples per window; windows only validate a torque fit, which is made on single samples
 FITTED = {
     "load": "only a load at the tip fitted",
     "friction": "only friction and torque offsets fitted",
@@ -127,10 +127,10 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:
-    """Return the delay of the torques relative to the positions in the logs, or a motor coupling, if detected.
+    """Return the delay [s] of the torques relative to the positions, or instead the motor coupling, if one is detected.
 
     The delay is the one for which a least-squares fit of inertial and friction parameters has the smallest torque
-    residual. If a motor coupling is detected, no delay is estimated.
+    residual. With a motor coupling that the model lacks, the estimate would be biased: then no delay is estimated.
     """
     with torch.no_grad():
         inputs = model.input_matrix(torch.zeros(1, model.n).double())[0].numpy()

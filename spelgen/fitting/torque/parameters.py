@@ -125,12 +125,13 @@ def set_initial_gains(model: ArmModel, samples: TorqueSamples, deviation: float)
 
     Args:
         model: model whose motor gains are corrected.
-        samples: samples with torques as logged, (T, n) [Nm, N].
+        samples: T samples with torques as logged, (T, n): in Nm or N, or in another unit such as A for motor currents.
         deviation: prior standard deviation of the logarithm of a gain. A gain is changed only if the magnitude of the
             coefficient's logarithm exceeds three of these standard deviations.
 
     Returns:
-        `deviation` if no gain was changed, otherwise the upper bound of prior standard deviations.
+        Prior standard deviation of the logarithm of a gain: `deviation` if no gain was changed, otherwise
+            `TorqueTuning.max_width`, which is larger.
     """
     inputs, (q, qd, qdd, *_) = model.inputs, samples.columns
     if not isinstance(inputs, MotorInputs) or inputs.raw_gains is None:
@@ -272,7 +273,11 @@ class ParameterPrior:
 
     @classmethod
     def of(cls, rigid: ParameterVector, widths: GaussianPrior) -> ParameterPrior:
-        """Return the prior whose mean is the vector of the model's current parameters. widths: standard deviations."""
+        """Return the prior whose mean is the vector of the model's current parameters.
+
+        rigid: layout of this vector, and its current values. widths: initial prior standard deviations of the groups of
+        parameters.
+        """
         body_widths = torch.full_like(rigid.initial[rigid.bodies][:, 0], widths.bodies)
         return cls(rigid, widths, widths, rigid.flatten(rigid.initial), body_widths)
 
@@ -333,12 +338,16 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     has its maximum at the fixed point of s^2 = |d|^2 / gamma, where gamma = k - tr(covariance) / s^2 is the effective
     number of parameters (MacKay, Bayesian Interpolation, Neural Computation 4:415, 1992). Here s^2 also has a scaled
     inverse chi-squared hyperprior with c = `degrees_of_freedom` degrees of freedom, whose scale is the square of the
-    initial width s0. The fixed point is then s^2 = (|d|^2 + c s0^2) / (gamma + c). The width has an upper bound.
+    initial width s0. In addition, each body i has a width b_i. Its hyperprior has the same form, with s in place of s0;
+    integrated over b_i, the prior of the body is a t distribution with c degrees of freedom and scale s (Lange, Little
+    and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
 
-    Each body also has a width b of its own. Its hyperprior has the same form, with the width s of all bodies in place
-    of s0. Integrated over b, the prior of the body's parameters is a t distribution with c degrees of freedom and scale
-    s. In the fixed point for s, |d|^2 of the bodies is therefore a sum in which each body has the weight s^2 / b^2 with
-    its current width b (Lange, Little and Taylor, J. Am. Stat. Assoc. 84:881, 1989).
+    The widths are updated in this order, with the current widths on the right, and limited by an upper bound:
+
+    - bodies: s^2 = (sum of (s / b_i)^2 |d_i|^2 + c s0^2) / (sum of gamma_i + c), where gamma_i = 10 - tr(covariance of
+      body i) / b_i^2.
+    - body i: b_i^2 = (|d_i|^2 + c s^2) / (gamma_i + c), with the updated s.
+    - armatures and torque offsets: s^2 = (|d|^2 + c s0^2) / (gamma + c).
 
     Args:
         prior: current prior.
@@ -349,13 +358,14 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
     freedom, offset = prior.widths.degrees_of_freedom, x - prior.mean
 
     def width(squares: torch.Tensor, gamma: torch.Tensor, group: str, center: float) -> torch.Tensor:
-        """Return the updated width, sqrt((squares + c center^2) / (gamma + c)), limited by the group's upper bound.
+        """Return the updated prior standard deviation, sqrt((squares + c center^2) / (gamma + c)), with an upper bound.
 
-        c is the number of degrees of freedom of the hyperprior (see `update_widths`).
+        c is the number of degrees of freedom of the hyperprior of the variance (see `update_widths`).
 
         Args:
-            group: name of the group, for the upper bound.
-            center: scale of the hyperprior: the initial width s0, or for a single body the width s of all bodies.
+            group: name of the group of parameters, for the upper bound.
+            center: scale of the hyperprior: the group's initial standard deviation, or for a single body the updated
+                standard deviation of all bodies.
             squares: sum of squares of x - prior mean.
             gamma: effective number of parameters, same shape as squares.
         """
@@ -363,7 +373,7 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         return square.sqrt().clamp(max=max(TUNING.max_width, initial[group]))
 
     mask = prior.rigid.mask("bodies")
-    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |d|^2 of each body
+    squares = offset[mask].view(-1, 10).square().sum(dim=1)  # squares: (B,), |x - prior mean|^2 of each body
     gamma = 10 - covariance.diagonal()[mask].view(-1, 10).sum(dim=1) / prior.body_widths.square()
     relative = (current["bodies"] / prior.body_widths).square()
     updated = {"bodies": float(width((relative * squares).sum(), gamma.sum(), "bodies", initial["bodies"]))}
@@ -373,8 +383,9 @@ def update_widths(prior: ParameterPrior, x: torch.Tensor, covariance: torch.Tens
         count = int(mask.sum())
         centring = torch.eye(count).double()
         if group in SHARED and count:
-            # The common factor of all joints has a separate width. The width of single joints is therefore estimated
-            # from x - prior mean, minus the mean of this difference over the joints.
+            # The prior of armatures has two standard deviations: one of a factor common to all joints, and one of
+            # single joints. The latter is estimated here, from x - prior mean minus the mean of this difference over
+            # the joints.
             centring -= 1 / count
         spread = centring @ covariance[mask][:, mask] @ centring
         gamma = centring.trace() - spread.trace() / current[group] ** 2

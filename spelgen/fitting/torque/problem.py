@@ -80,21 +80,26 @@ class NoiseEstimator:
         return self.count / self.correlation_length
 
     def upper_bound(self) -> torch.Tensor:
-        """Return the largest noise (n,) [Nm, N]: the noise for an RMS residual of min(`max_error`, `torque_std`)."""
+        """Return the noise (n,) [Nm, N] for the largest allowed RMS residual, min(`max_error`, `torque_std`).
+
+        The noise is the root mean square (RMS) residual times sqrt(correlation length). A model with an RMS residual
+        above `torque_std`, the standard deviation of the torque, would be worse than a constant torque.
+        """
         return torch.minimum(self.max_error, self.torque_std) * self.correlation_length.sqrt()
 
     def estimate(
         self, squared_residual: torch.Tensor, effective_parameters: torch.Tensor | float = 0.0
     ) -> torch.Tensor:
-        """Return the noise (n,) [Nm, N] for a squared residual.
+        """Return the noise (n,) [Nm, N], s = RMS residual times sqrt(correlation length), for a squared residual.
 
-        The root mean square residual is at most `max_error`, and at least a fraction of `torque_std`, also if that
-        fraction exceeds `max_error`.
+        The correlation length is a number of samples. The root mean square (RMS) residual is corrected for the number
+        of parameters and limited: to at most `max_error`, the RMS error of a simpler method, then to at least a
+        fraction of `torque_std`, the standard deviation of the torque, also if that fraction exceeds `max_error`.
 
         Args:
             squared_residual: (n,) sum over all samples [Nm^2, N^2].
-            effective_parameters: (n,) number of parameters that each joint's torque determines. Each parameter reduces
-                the degrees of freedom of the residual by one independent error.
+            effective_parameters: (n,) number of parameters that each joint's torque determines. It is subtracted from
+                the number of independent errors, which gives the degrees of freedom of the residual.
         """
         # The degrees of freedom (independent errors minus parameters) are at least one. They could be negative
         # otherwise, since `TorqueProblem.updated` assigns an equal share of the parameters to each joint.
@@ -148,9 +153,9 @@ class TorqueProblem:
     ) -> TorqueProblem:
         """Return the problem with the model's current parameters as the prior mean.
 
-        widths: initial standard deviations of the prior. adapt: "load", "friction", "unit" or None, the estimated
-        parameters (see the class). max_error: upper bound of the root mean square torque error, (n,) [Nm, N]. The
-        initial noise is `NoiseEstimator.upper_bound`.
+        widths: initial standard deviations of the prior. adapt: parameters to estimate: "load" (the last body),
+        "friction" (friction and torque offsets), "unit" or None (all parameters). max_error: upper bound of the root
+        mean square torque error, (n,) [Nm, N]. The initial noise is `NoiseEstimator.upper_bound`.
         """
         rigid = jacobian.rigid
         correlation_time = torch.full_like(jacobian.torque_std, TUNING.correlation_time)
@@ -166,7 +171,7 @@ class TorqueProblem:
 
     @cached_property
     def noise_estimator(self) -> NoiseEstimator:
-        """Estimator of the torque noise from the residual on all samples of ``jacobian``."""
+        """Estimator of the torque noise; its samples are the samples for which ``jacobian`` was computed."""
         return NoiseEstimator.of(self.jacobian, self.correlation_time, self.max_error)
 
     @property
@@ -286,10 +291,11 @@ class TorqueEstimate:
     covariance: torch.Tensor
 
     def with_jacobian(self, jacobian: TorqueJacobian) -> TorqueEstimate:
-        """Return the estimate with the same x and another Jacobian: for other samples or changed residual terms.
+        """Return the estimate with the same parameters x and another Jacobian, for other samples or residual terms.
 
-        The squared residual is recomputed with the current friction model of each joint, with or without bristles
-        (`FrictionLaws.memoryless`).
+        The squared torque residual at x is recomputed with the new Jacobian, since it depends on the samples, the
+        residual terms and the friction model of each joint (bristles, or rate-only friction:
+        `FrictionLaws.memoryless`).
         """
         state = replace(self.state, residual=jacobian.squared_residual(self.state.x))
         return replace(self, problem=replace(self.problem, jacobian=jacobian), state=state)
@@ -355,7 +361,8 @@ def refine(
 ) -> TorqueEstimate:
     """Return the estimate for other samples, or with residual terms, refitted with ``estimate`` as the warm start.
 
-    terms: {joint: residual terms whose weights are linear and are eliminated from the fit}.
+    terms: {joint: residual terms}. Their torque is linear in their weights, which are eliminated by variable
+    projection.
     """
     estimate = estimate.with_jacobian(TorqueJacobian(estimate.problem.jacobian.model, samples, terms))
     # The noise of ``estimate`` is not used, since it was estimated from other samples or with other linear terms.

@@ -22,8 +22,8 @@ from spelgen.settings.fits import GaussianPrior
 
 # [1] Penalties for columns scaled to unit length. With the smallest penalty, ridge regression is least squares.
 PENALTIES = np.logspace(-10, 2, 13)
-# Mass, first moments and inertia of a sphere of 1 kg. Its radius of gyration is 0.1 m, and its centre is 0.1 m from the
-# axis of the joint.
+# Inertial parameters (see `pseudo_inertia`) of a sphere of 1 kg with a radius of gyration of 0.1 m. Its centre is at
+# (0.1, 0, 0.1) m in the body frame; the inertia is about the origin of this frame.
 DEFAULT_BODY = (1.0, 0.1, 0.0, 0.1, 0.02, 0.0, -0.01, 0.03, 0.0, 0.02)
 
 
@@ -40,9 +40,9 @@ class Regression(NamedTuple):
 
 
 def best_regression(model: ArmModel, blocks: Sequence[TorqueSamples], torque_std: np.ndarray) -> Regression:
-    """Return the one of two ridge regressions that has the smaller held-out error.
+    """Return the ridge regression with the smaller held-out error of two.
 
-    In one regression, Coulomb friction depends on the velocity, in the other one on the friction state z.
+    In one regression, Coulomb friction depends on the velocity; in the other, on the friction state z.
 
     Args:
         model: model whose arm, drives and gains are used.
@@ -95,12 +95,15 @@ def _regression(
         return np.concatenate([weights, np.full((*weights.shape[:-1], 1), -1.0)], axis=-1)
 
     def held_out(penalty: float) -> np.ndarray:
-        """Return the squared residual / `torque_std`^2 of each block, (blocks, n), after a ridge fit to the others."""
+        """Return the sums of (residual / `torque_std`)^2 over each block, (blocks, n), after a ridge fit to the others.
+
+        penalty: factor of |w|^2 in the cost, with the weights w of columns of unit length.
+        """
         weights = solution(total - grams.sum(axis=1), penalty)[:, None, :, None]
         return np.asarray((weights * (grams @ weights)).sum(axis=(2, 3)))
 
     penalty = min(PENALTIES, key=lambda penalty: float(held_out(penalty).sum()))
-    parameters = (solution(total, penalty) / scale)[:-1]  # parameters: weights of the unscaled columns
+    parameters = (solution(total, penalty) / scale)[:-1]  # weights of unscaled columns, without the last -1
     return Regression(held_out(penalty), lambda x: columns(x) @ parameters)
 
 

@@ -104,8 +104,9 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     over such times. The nMSE is multiplied by (degrees of freedom) / (median of this distribution).
     """
     seconds = samples.count * samples.interval / TUNING.segment
-    # The correction is important only for short logs: the factor is 1.27 for three seconds of motion, and 1.06 for
-    # twelve.
+    # The number of seconds is the number of degrees of freedom of the chi-squared distribution, `median` is its median.
+    # The nMSE is multiplied by seconds / median: by 1.27 for three seconds of motion and by 1.06 for twelve, so that
+    # the correction is important only for short logs.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
     return np.asarray(solution.held_out_nmse * seconds / median)
 
@@ -115,8 +116,8 @@ def _few_data(
 ) -> Diagnostic:
     """Return the warning that the logs have too little motion for the parameters of some joints.
 
-    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`. names: (n,), names of the joints. comparison: the text also
-    states its nMSE of ridge regression; None: no such nMSE.
+    nmse: (n,), nMSE of held-out blocks from `_likely_nmse`. names: (n,), names of the joints. comparison: comparison
+    with ridge regression, whose nMSE the text also states; None: there is no such comparison.
     """
     seconds, joints = samples.count * samples.interval, ", ".join(names[nmse > TUNING.unsupported])
     # The recommended duration assumes that the nMSE is inversely proportional to the duration of the motion. It is at

@@ -53,16 +53,21 @@ class SelectedTerm:
 
 
 def can_split(count: int, correlation_length: float) -> bool:
-    """Return True if `count` samples can be split: the gap of `split_halves` is at most as long as the first slice.
+    """Return True if `count` samples suffice for `split_halves`, that is, if the fitted slice is not too short.
 
-    correlation_length: number of samples per independent error.
+    The end of the first half is omitted, as a gap between the fitted slice and the last half. The gap must be at most
+    as long as the fitted slice. correlation_length: number of samples per independent error.
     """
     first, last = split_halves(count, correlation_length)
     return bool(last.start - first.stop <= first.stop)
 
 
 def split_halves(count: int, correlation_length: float) -> tuple[slice, slice]:
-    """Return two slices of `count` samples: the first half, minus `_gap(correlation_length)`, and the last half."""
+    """Return two slices of `count` samples: the first half without its end, to be fitted, and the last half, held out.
+
+    The omitted end is a gap of `SELECTION.gap` correlation lengths, so that the errors of both slices are independent.
+    correlation_length: number of samples per independent error.
+    """
     middle = count // 2
     return slice(0, max(0, middle - _gap(correlation_length))), slice(middle, count)
 
@@ -108,9 +113,9 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # With two recordings, only two fits predict the ten blocks, so the errors of the blocks are not independent. As for
-    # a single recording, a candidate must then pass the stricter test with `standard_errors_of_one`, and its torque is
-    # bounded by `max_torques`.
+    # Cross-validation holds out complete recordings. With two recordings, only two different fits predict all ten
+    # blocks of the t test, so the errors of the blocks are not independent. As for a single recording, a candidate must
+    # then pass the stricter test with `standard_errors_of_one`, and its torque must be below `max_torques`.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)
@@ -153,8 +158,9 @@ def _best(
         noise: (n,) standard deviations of the torque noise [Nm, N].
         correlation_length: number of samples per independent error.
         recordings: (T,), index of the recording of each sample.
-        limits: bounds of the standard deviation of the term's torque (see `max_torques`), if there are only one or two
-            recordings; None: no bounds.
+        limits: {parameter of a residual term: largest allowed standard deviation of its torque, (n,) [Nm, N]} (see
+            `max_torques`) for one or two recordings, in which a model error may repeat with the motion; None: no
+            bounds.
     """
     significance = SELECTION.standard_errors if limits is None else SELECTION.standard_errors_of_one
     # In the second test, a candidate is fitted to the first half, and its error is computed on the last half: fitted

@@ -121,11 +121,13 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose per joint between rate-only friction and friction with bristle states; return the new estimate.
 
     ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
-    joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The marginal
-    likelihoods of the fits with and without bristles decide (see `_rejected`). If the likelihoods of all joints
-    together favour bristles, rate-only friction of a joint needs a second criterion: its torque residual without
-    bristles is also significantly smaller (t test on ten blocks of the log). The reason is that the likelihood ratio of
-    a single joint is unreliable, since the errors of a motion are correlated.
+    joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The evidence
+    of a joint is 2 log(L with bristles / L without bristles), with the marginal likelihood L of its torque.
+
+    - If the sum of the evidence over all joints favours bristles, a joint has rate-only friction if its own evidence is
+      strongly against bristles, and if its torque residual without bristles is also significantly smaller (t test on
+      ten blocks of the log). The evidence of a single joint is unreliable, since the errors of a motion are correlated.
+    - Otherwise, a joint has bristles only if its own evidence is strongly for them (see `_rejected`).
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
@@ -163,11 +165,15 @@ def _smaller_in_most_blocks(residual: torch.Tensor, reference: torch.Tensor) -> 
 def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose the joints with Stribeck effect, saturation and load dependence of friction; return the new estimate.
 
-    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. An effect has
-    to improve Akaike's criterion with one parameter. Saturation is tested first, at all joints together: the sum of the
-    joints' evidence must favour it. The evidence of a joint counts at most as `TUNING.strong_evidence`, since at one
-    joint saturation may explain another error of the model, which it would extrapolate to other speeds. Then all
-    effects are tested (see `_rejected`).
+    The coefficients of these effects are constrained to be positive, so noise biases all of them upwards. The evidence
+    of a joint for its effects is therefore 2 log(likelihood ratio) minus 2, Akaike's penalty for one parameter.
+
+    - Saturation is tested first, and removed at all joints if the sum of their evidence is negative. The evidence of
+      each joint is limited to +-`TUNING.strong_evidence`, so that no single joint decides: at a joint with very strong
+      evidence, saturation may explain another error of the model, and would then be wrong at other speeds.
+    - Then all effects of a joint are tested together. If the sum of the evidence over the joints is positive, they are
+      removed only at joints with strong evidence against them; otherwise at all joints without strong evidence for them
+      (`_rejected`).
     """
     # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     penalty, limit = 2.0, TUNING.strong_evidence

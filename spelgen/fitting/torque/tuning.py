@@ -27,8 +27,8 @@ class TorqueTuning:
     # [s] Prior mean of the correlation time of torque errors, from recordings of arms. Samples within a correlation
     # time count as one independent error.
     correlation_time: float = 0.2
-    # [s] Correlation time of torque errors in comparisons of friction models. It is shorter than `correlation_time`,
-    # because friction models differ only near reversals of velocity.
+    # [s] Correlation time of torque errors in comparisons of friction models. Two friction models differ only for a
+    # short time after each reversal of velocity, so their difference is correlated for less than `correlation_time`.
     reversal_correlation_time: float = 0.1
     # [1] Weight of the prior mean `correlation_time` in the estimated correlation time, as a number of independent
     # errors.
@@ -49,7 +49,7 @@ class TorqueTuning:
     # [1] Largest number of iterations of noise annealing, which lowers the noise to the least-squares noise.
     annealing_iterations: int = 12
     # [1] Noise in the iterations of noise annealing, as a fraction of the rms torque residual. For a low_cost_robot
-    # with placeholder inertials, annealing reduces the error of M(q) from 0.44 to 0.005.
+    # with placeholder inertials, annealing reduces the relative error of the mass matrix M(q) from 0.44 to 0.005.
     annealing_fraction: float = 0.03
     # [1] The noise has converged if its ratio to the noise of the previous iteration exceeds this value.
     noise_converged: float = 0.98
@@ -127,9 +127,9 @@ class ResidualTuning:
     # [1] A residual term is accepted only if the t value of its mean error reduction over the blocks exceeds this
     # number: p = 0.01 for Student's t with nine degrees of freedom.
     standard_errors: float = 2.82
-    # [1] Bound of the t value of the mean error reduction for one or two recordings, with p = 0.001. It is larger than
-    # `standard_errors`, since held-out and fitted motion of few recordings may be similar, with the same errors of the
-    # model.
+    # [1] The bound that replaces `standard_errors` if there are only one or two recordings: p = 0.001. It is stricter,
+    # since the held-out motion may then be similar to the fitted motion, so that both have the same errors of the
+    # model. A term that explains such errors need not be right for other motion.
     standard_errors_of_one: float = 4.30
     # [1] Largest standard deviation of a position-dependent torque that is selected on one or two recordings, as a
     # fraction of the standard deviation of the joint's torque.

@@ -1,0 +1,60 @@
+"""Names of joints in the rows of a log: a list per row, as in messages of ROS, which may differ from row to row."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeAlias
+
+import pyarrow as pa
+import pyarrow.compute
+
+from spelgen.errors import LogError
+
+RowsByNames: TypeAlias = dict[tuple[str, ...], pa.ChunkedArray]
+"""{list of names: mask (T,) of the rows with this list}. Indices of a mapping refer to the first list."""
+# A text that is the name of a joint, and no number.
+NAME = re.compile(r"[^\W\d][\w/.:-]*")
+
+
+def first_list(column: pa.ChunkedArray) -> list[str]:
+    """Return the first list of a column of lists, which may be texts such as "[0.1, 0.2]"; [] for other columns."""
+    return _list_of(next(iter(column.drop_null().slice(0, 1).to_pylist()), None))
+
+
+def _list_of(cell: object) -> list[str]:
+    """Return the list in a cell of a table; [] for a cell that is neither a list nor its text."""
+    if isinstance(cell, str) and (match := re.fullmatch(r"[^\[({]*[\[({]+(.*?)[\])}]+", cell.strip())):
+        return [text.strip("'\"") for text in re.split(r"[,;\s]+", match[1].strip())]
+    return cell if isinstance(cell, list) else []
+
+
+def are_names(values: pa.DataType) -> bool:
+    """Return True for the type of a column with a list of texts in each row."""
+    return bool(pa.types.is_list(values) and pa.types.is_string(values.value_type))
+
+
+def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> RowsByNames:
+    """Return {list of joint names: mask of the rows with this list}; {} if all rows of a table have the same list.
+
+    The first list is the first one in the table that contains all joints of the arm, or else the list of the first row.
+    A LogError is raised if the rows are of several arms: no list contains all joints of the arm, and some list with at
+    least as many names shares no name with the list of the first row. names: {joint: its name in the log}.
+    """
+    for column in table.columns:
+        if are_names(column.type):
+            column = pa.compute.binary_join_element_wise("[", pa.compute.binary_join(column, ","), "]", "")
+        first = first_list(column)
+        if not (first and pa.types.is_string(column.type) and all(map(NAME.fullmatch, first))):
+            continue
+        lists = {text: tuple(_list_of(text)) for text in column.unique().drop_null().to_pylist()}
+        of_arm = [x for x in lists.values() if set(names.values()) <= set(x)]
+        other_arms = [x for x in lists.values() if len(x) >= len(names) and set(x).isdisjoint(first)]
+        if other_arms and not of_arm:
+            raise LogError(
+                f"joint states of {', '.join(first)} and of {', '.join(other_arms[0])}", file=file,
+                expected=", ".join(names.values()), do="write each joint's name as 'name' under 'logs', 'joints'",
+            )  # fmt: skip
+        if len(lists) > 1:
+            ordered = sorted(lists, key=lambda text: lists[text] not in of_arm[:1])
+            return {lists[text]: pa.compute.equal(column, text) for text in ordered}
+    return {}
