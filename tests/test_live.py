@@ -27,7 +27,7 @@ from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.intake import Intake
 from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
-from spelgen.live.noise import NoiseLevels
+from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import find_payload
 from spelgen.live.replay import load_changes, replay
 from spelgen.live.tuning import TUNING
@@ -205,6 +205,34 @@ def test_a_changed_load_is_found_and_a_contact_is_none(arm, levels, run):
     assert abs(states[-1].payload.mass - 2.0) < 0.2
 
 
+def test_a_heavy_load_with_errors_of_its_own_is_reported(arm, levels, run):
+    """A payload is reported although errors proportional to its torque exceed the noise of logs without a payload."""
+    model, log, qdd = arm
+    load = loaded(model, log, qdd, 10 * PAYLOAD) - log.tau
+    noise = BlockNoise.model_validate(
+        levels.load.model_dump() | {"white": 0.1 * levels.load.white, "disturbance": 0 * EFFORT}
+    )
+    small = levels.model_copy(update={"load": noise})
+    errors = 1 + 0.02 * np.sin(np.outer(log.t, np.linspace(10.0, 14.0, model.n)))
+    _, states = estimates(run, small, log, log.tau + load * errors)
+    assert states[-1].payload.status == "payload"
+    low, high = states[-1].payload.mass_interval
+    assert low < 20.0 < high < 21.0
+
+
+def test_a_push_is_no_load_for_an_arm_without_disturbance(arm, levels, run):
+    """A push of two seconds at the tip is no load, also for an arm whose logs have white noise only."""
+    model, log, _ = arm
+    quiet = {"disturbance": np.zeros(model.n)}
+    noises = {"load": levels.load.model_copy(update=quiet), "drift": levels.drift.model_copy(update=quiet)}
+    white = levels.model_copy(update=noises)
+    jacobian = load_terms(model.chain, *numbers(log.q, log.qd, levels.point))[2].numpy()
+    for force in 5.0 * np.random.default_rng(2).standard_normal((8, 3))[4:6]:
+        torque = np.einsum("tij,i->tj", jacobian, force) * ((log.t >= 6) & (log.t < 8))[:, None]
+        _, states = estimates(run, white, log, log.tau - torque)
+        assert not any(state.load_changed or state.payload.status == "payload" for state in states)
+
+
 @pytest.mark.parametrize(
     ("reports", "changes"),
     [
@@ -343,13 +371,15 @@ def test_samples_that_cannot_be_used_are_refused_and_counted(arm, levels, run):
     assert step(111, t=0.1 + 1 / RATE) == "used"
 
 
-@pytest.mark.parametrize(("effort", "expected"), [(np.inf, "used"), (1.0, "saturated"), (0.6, "used")])
+@pytest.mark.parametrize(
+    ("effort", "expected"), [(np.inf, "used"), (1.0, "saturated"), (0.6, "used"), (200.0, "used")]
+)
 def test_torques_are_saturated_only_at_a_known_limit(arm, effort, expected):
     """Samples with torques beyond the effort limit of the URDF are refused as saturated if the limit is plausible.
 
-    A limit that logged torques exceed is wrong, and so unknown, as without a limit. Then four times the largest logged
-    torque is used; only more than ten times this torque is refused. effort: limit of the URDF, divided by the largest
-    logged torque. expected: result for four times the largest logged torque.
+    A limit that logged torques exceed is wrong, and a very large one is a placeholder: both are unknown, as without a
+    limit. Then four times the largest logged torque is used; only more than ten times this torque is refused. effort:
+    limit of the URDF, divided by the largest logged torque. expected: result for four times the largest logged torque.
     """
     model, log, _ = arm
     largest = np.abs(log.tau).max(axis=0)
@@ -411,14 +441,14 @@ def test_the_payload_is_the_map_estimate(offset):
     This also holds if the likelihood is largest far outside of the cone of consistent inertias.
     """
     random = np.random.default_rng(2)
-    root = random.standard_normal((10, 10)) * TUNING.load_prior * 2e-3
-    covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(TUNING.load_prior**-2.0))
+    root = random.standard_normal((10, 10)) * np.array(TUNING.load_prior) * 2e-3
+    covariance = np.linalg.inv(np.linalg.inv(root @ root.T) + np.diag(1 / np.square(TUNING.load_prior)))
     mean = PAYLOAD.copy()
     mean[[4, 7, 9]] -= offset
     payload = find_payload(mean, covariance, 1.0, 2.0)
     assert payload.status == "payload"
     precision = np.linalg.inv(covariance)
-    linear, precision = precision @ mean, precision - np.diag(TUNING.load_prior**-2.0)
+    linear, precision = precision @ mean, precision - np.diag(1 / np.square(TUNING.load_prior))
 
     def cost(factor):
         """Return the negative log posterior of the payload with the pseudo-inertia L L^T.
@@ -449,7 +479,7 @@ def test_the_payload_is_the_map_estimate(offset):
 
 
 def test_an_indefinite_covariance_is_no_payload_and_no_error():
-    covariance = np.diag(TUNING.load_prior**2.0)
+    covariance = np.diag(np.square(TUNING.load_prior))
     covariance[0, 0] = -1e-9
     assert find_payload(PAYLOAD, covariance, 1.5, 2.0).status == "not yet"
 
@@ -615,9 +645,22 @@ def test_training_from_a_run_prints_the_load(arm, run, tmp_path):
     payload = json.loads(result.stdout)["payload"]
     assert payload["status"] == "payload"
     assert payload["mass_interval"][0] < 2.0 < payload["mass_interval"][1]
+    assert "load changes" not in result.stderr
     # `train --from` copies the noise levels (estimator.json) of the source run into the new run. A live estimator
     # of the new model, the arm with its load, needs them.
     assert (tmp_path / "run" / "estimator.json").exists()
+
+
+def test_training_from_a_run_warns_of_a_load_that_changes(arm, run, tmp_path):
+    """One load is fitted to all logs, so a log in which the load changes is named in a warning."""
+    model, log, qdd = arm
+    tau = np.where(log.t[:, None] < 6, log.tau, loaded(model, log, qdd, PAYLOAD))
+    logs = [log, dataclasses.replace(log, tau=tau, name="picked")]
+    write_logs(tmp_path / "logs.parquet", logs, model.joint_names)
+    arguments = ["train", "--from", run, "--data", tmp_path / "logs.parquet", "-o", tmp_path / "run"]
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    assert result.exit_code == 0, result.output
+    assert "the load changes in picked, and one load is fitted" in " ".join(result.stderr.split())
 
 
 def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_path):
@@ -637,8 +680,9 @@ def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_pat
     ]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "payload of 2.0" in result.output
-    assert "contact at 9.0" in result.output
+    text = result.output
+    assert "payload of 2.0" in text
+    assert "contact at 9.0" in text
     assert "friction at the end" in result.output
     assert "contact thresholds in motion; at rest: joint1" in result.output
     assert "(training logs support >= 2): the training logs are too short" in " ".join(result.output.split())
@@ -652,6 +696,23 @@ def test_the_command_prints_payload_contacts_and_drift(arm, levels, run, tmp_pat
     assert content["payload"]["mass_interval"][0] < 2.0 < content["payload"]["mass_interval"][1]
     assert any(abs(contact["begin"] - 9.0) < 0.1 for contact in content["contacts"])
     assert set(content["friction_drift_percent"]) == set(model.joint_names)
+    # The load before its report is marked in the text, on the page and in JSON. It is not a contact.
+    for contact in content["contacts"]:
+        assert contact["is_load"] == (contact["begin"] < content["payload_since"])
+    count = sum(contact["is_load"] for contact in content["contacts"])
+    assert count == text.count("load before its report at") == page.count(": load before its report") > 0
+    assert "A payload was reported first at" in page
+
+
+def test_torques_at_their_limit_are_named(arm, levels, run):
+    """Samples with a torque at its limit are not used; the text states the joint, its largest torque and the limit."""
+    _, log, _ = arm
+    tau = log.tau.copy()
+    tau[1:201, 2] = 140.0
+    (result,) = replay(load_run(run), [dataclasses.replace(log, tau=tau)])
+    text = " ".join(result.text().split())
+    assert "200 torque at its limit" in text
+    assert "largest torques: joint3 140 (limit 100) Nm; if limits of the URDF are wrong" in text
 
 
 def test_a_contact_in_the_first_second_is_no_payload(arm, levels, run):

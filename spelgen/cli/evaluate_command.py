@@ -131,23 +131,21 @@ def estimate(
     log_mapping = options.log_mapping(joints, mapping or fit.record.mapping, accept)
     results = replay(fit, read_logs(paths, joints, mapping=log_mapping), alarms)
     page = write_estimate(fit, levels, results, path)
-    record: dict[str, object] = {"run": str(run), "page": str(page)}
-    record["supported_alarms_per_minute"] = rate = levels.supported_alarms
-    record["logs"] = [result.to_dict() for result in results]
-    alarm_rate = alarms or TUNING.alarms_per_minute
+    alarm_rate, rate = alarms or TUNING.alarms_per_minute, levels.supported_alarms
     thresholds = dict(zip(joints, levels.contact_thresholds(alarm_rate).tolist(), strict=True))
-    record["contact_thresholds"] = thresholds
-    smallest = ", ".join(
-        f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
-    )
+    record = {
+        "run": str(run), "page": str(page), "supported_alarms_per_minute": rate,
+        "logs": [result.to_dict() for result in results], "contact_thresholds": thresholds,
+    }  # fmt: skip
+    smallest = ", ".join(f"{joint} {low:.3g}; {high:.3g}" for joint, (low, high) in thresholds.items())
     supported = (
         f"contact thresholds in motion; at rest: {smallest} {torque_units(fit.model.joint_types)}, for a rate "
         f"of false alarms of {alarm_rate:g} per minute (training logs support >= {rate:.2g})"
     )
     if alarm_rate < rate:
         supported += ": the training logs are too short for this rate, train with longer logs"
-    supported = fill(supported, WIDTH, subsequent_indent="    ")
-    answer(format, record, *(result.text() for result in results), supported, f"wrote {page}")
+    texts = [*(result.text() for result in results), fill(supported, WIDTH, subsequent_indent="    ")]
+    answer(format, record, *texts, f"wrote {page}")
 
 
 def report(

@@ -147,8 +147,14 @@ def _payload(fit: Fit, source: Path | None) -> Payload | None:
     if levels is None:
         return None
     keep_levels(fit, levels)
-    is_load = isinstance(fit.config, TorqueFit) and fit.config.adapt == "load"
-    return carried_payload(original, fit.logs) if is_load else None
+    if not (isinstance(fit.config, TorqueFit) and fit.config.adapt == "load"):
+        return None
+    payload, changed = carried_payload(original, fit.logs)
+    if changed:
+        note(
+            f"warning: the load changes in {', '.join(changed)}, and one load is fitted: use logs with one load each"
+        )
+    return payload
 
 
 def _report(fit: Fit, folder: Path, format: str, payload: Payload | None) -> None:

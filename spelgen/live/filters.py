@@ -58,8 +58,7 @@ class Block(NamedTuple):
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
         means = [a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)]
-        y, load, friction, uncertainty = means
-        return Block(duration, y, load, friction, uncertainty, self.moving & later.moving)
+        return Block._make([duration, *means, self.moving & later.moving])
 
 
 class Blocks:
@@ -121,14 +120,14 @@ class LoadFilter:
         self.disturbance = np.square(noise.disturbance)
         self.x = np.zeros(10 + 3 * self.n)
         offset, friction = np.square(TUNING.offset * effort), np.full(self.n, TUNING.friction**2)
-        self.P = np.diag(np.concatenate([TUNING.load_prior**2, friction, offset, self.disturbance]))
+        self.P = np.diag(np.concatenate([np.square(TUNING.load_prior), friction, offset, self.disturbance]))
         self.log_likelihood = self.surprise = 0.0
 
     def forget_load(self) -> None:
         """Reset the payload's parameters theta to their prior distribution, for a new payload."""
         self.x[:10] = 0.0
         self.P[:10] = self.P[:, :10] = 0.0
-        self.P[:10, :10] = np.diag(TUNING.load_prior**2)
+        self.P[:10, :10] = np.diag(np.square(TUNING.load_prior))
 
     def predict(self, duration: float) -> None:
         """Replace the state x and its covariance P by their prediction after a time `duration` [s]."""
@@ -151,6 +150,7 @@ class LoadFilter:
         row = np.array([*block.load[joint], block.friction[joint], 1.0, 1.0])
         covariance = self.P[:, columns] @ row
         noise = self.noise.white[joint] ** 2 + TUNING.uncertainty * block.uncertainty[joint] ** 2
+        noise += TUNING.load_error**2 * block.y[joint] ** 2
         expected = float(row @ covariance[columns]) + noise
         residual = float(block.y[joint] - self.x[columns] @ row)
         # The influence of an outlier is bounded by a larger variance, which corresponds to Huber's weights.
@@ -272,8 +272,7 @@ class PayloadEstimate:
         self.filters = [LoadFilter(levels.load, levels.effort)]
         self.rows: Iterator[None] = iter(())
         self.moved = self.hypotheses_moved = 0.0
-        self.changed, self.misfit = False, 1.0
-        self.samples = self.per_sample = 0
+        self.samples, self.per_sample, self.changed, self.misfit = 0, 0, False, 1.0
 
     def start(self, block: Block) -> None:
         """Finish the filter updates of the previous block, and prepare the updates of `block` for calls of `step`."""
@@ -282,8 +281,7 @@ class PayloadEstimate:
         if block.moving.any():
             self.moved += block.duration
             self.hypotheses_moved += block.duration
-        self.per_sample = -(-len(self.filters) * len(block.y) // max(self.samples - 1, 1))
-        self.samples = 0
+        self.samples, self.per_sample = 0, -(-len(self.filters) * len(block.y) // max(self.samples - 1, 1))
         self.rows = self._rows(block)
 
     def step(self) -> None:
@@ -334,5 +332,6 @@ class PayloadEstimate:
             main.log_likelihood = self.hypotheses_moved = 0.0
             candidate, contact = copy.deepcopy(main), copy.deepcopy(main)
             candidate.forget_load()
-            contact.disturbance = main.disturbance * TUNING.contact_disturbance**2
+            variance = np.maximum(main.disturbance, np.square(main.noise.white))
+            contact.disturbance = variance * TUNING.contact_disturbance**2
             self.filters = [main, candidate, contact]

@@ -77,10 +77,8 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
         # body, at the origin of the last body.
         if tip.carrier == len(arm.chain.bodies) - 1:
             point = tip.pose[:3, 3]
-    tested = []
-    for k, fold in enumerate(folds):
-        others = [log for other in folds[:k] + folds[k + 1 :] for log in other]
-        tested.append((fitted_to(fit, others), fold))
+    others = [list(itertools.chain(*folds[:k], *folds[k + 1 :])) for k in range(len(folds))]
+    tested = [(fitted_to(fit, training), fold) for training, fold in zip(others, folds, strict=True)]
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
     # Serialization rounds the noise levels. The rounded levels are returned, so that they are equal to the levels that
     # are later read from the run folder.
@@ -154,10 +152,11 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
     largest = np.abs(joined_column(logs, "tau")).max(axis=0)
     # At first `levels` contains only the limits by which samples are accepted; the noise is then estimated from the
     # accepted samples. `limit` is the torque limit of the URDF, but at least 1.2 times the largest logged torque. If
-    # the URDF has no limit, or logged torques exceed it by more than 20 %, `limit` is a guess: 2.5 times the largest
-    # logged torque. A payload may need more torque than the guess, so a torque counts as saturated only if it is at
-    # least `TUNING.jump` times the guess.
-    is_known = (effort < np.inf) & (1.2 * effort >= largest)
+    # logged torques exceed the limit of the URDF by more than 20 %, or if it is absent or a placeholder, `limit` is a
+    # guess: 2.5 times the largest logged torque. A placeholder is at least 100 times the largest logged torque; real
+    # limits are 1.3 to 50 times the largest torque of recordings. A payload may need more torque than the guess, so a
+    # torque counts as saturated only if it is at least `TUNING.jump` times the guess.
+    is_known = (1.2 * effort >= largest) & (effort < 100 * largest)
     limit = np.where(is_known, np.maximum(effort, 1.2 * largest), 2.5 * largest)
     encoder = np.min([encoder_step(log.q) for log in logs], axis=0)
     levels = NoiseLevels.model_construct(
@@ -165,21 +164,17 @@ def find_levels(folds: Folds, effort: np.ndarray, point: np.ndarray, delay: floa
         minutes=sum(log.duration for log in logs) / 60, saturation=np.where(is_known, 1.0, TUNING.jump),
     )  # fmt: skip
     tested = [held_out(model, log, levels) for model, fold in folds for log in fold]
-    segments, pairs = [], []
-    for samples in tested:
-        blocks = [x.block for x in samples if x.block is not None]
-        segments.append(blocks)
-        # A block of the payload filter is joined from two blocks of the drift filter. This halves the number of updates
-        # of the payload filter, which take longer since it has 10 + 3 n states.
-        pairs.append([a.joined(b) for a, b in zip(blocks[::2], blocks[1::2], strict=False)])
+    segments = [[x.block for x in samples if x.block is not None] for samples in tested]
+    # A block of the payload filter is joined from two blocks of the drift filter. This halves the number of updates of
+    # the payload filter, which take longer since it has 10 + 3 n states.
+    pairs = [[a.joined(b) for a, b in zip(x[::2], x[1::2], strict=False)] for x in segments]
     levels = levels.model_copy(update={"drift": block_noise(segments), "load": block_noise(pairs)})
-    factor, freedom = load_variance(list(itertools.chain(*pairs)), levels)
-    payload = {"load_variance": factor, "load_freedom": freedom}
+    payload = load_variance(list(itertools.chain(*pairs)), levels)
     return _with_observer(levels.model_copy(update=payload), tested)
 
 
-def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, int]:
-    """Return a factor for the covariance of estimated payloads, and its degrees of freedom.
+def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, float]:
+    """Return the fields `load_variance`, a factor for the covariance of estimated payloads, and `load_freedom`.
 
     The covariance P of the payload filter neglects errors of the model, and is therefore multiplied by the factor. The
     factor is found by trials on logs without payload:
@@ -197,8 +192,7 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
     """
     factors = []
     for window in TUNING.trial_blocks:
-        squares = np.zeros(2)
-        trials = len(blocks) // window
+        squares, trials = np.zeros(2), len(blocks) // window
         for start in range(0, trials * window, window):
             load = LoadFilter(levels.load, levels.effort)
             for block in blocks[start : start + window]:
@@ -206,10 +200,9 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> tuple[float, 
                 for joint in range(load.n):
                     load.update(block, joint)
             squares += [load.x[:k] @ np.linalg.solve(load.P[:k, :k], load.x[:k]) / k for k in (1, 4)]
-        freedom = trials + TUNING.prior_trials
-        prior = TUNING.prior_trials * TUNING.prior_variance
+        freedom, prior = trials + TUNING.prior_trials, TUNING.prior_trials * TUNING.prior_variance
         factors.append((float(squares.max() + prior) / freedom, freedom))
-    return max(factors)
+    return dict(zip(("load_variance", "load_freedom"), max(factors), strict=True))
 
 
 def block_noise(segments: Sequence[Sequence[Block]]) -> BlockNoise:

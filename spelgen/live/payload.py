@@ -76,7 +76,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     try:
         precision = _inverse(covariance)
         linear = precision @ mean / factor
-        precision = (precision - np.diag(TUNING.load_prior**-2.0)) / factor
+        precision = (precision - np.diag(1 / np.square(TUNING.load_prior))) / factor
         for scale in TUNING.scales:
             found.append(_at_scale(precision, linear, scale, found[-1][0] if found else None))
     except np.linalg.LinAlgError:

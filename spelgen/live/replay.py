@@ -17,6 +17,7 @@ from spelgen.live.tuning import TUNING
 from spelgen.logs.checks import check
 from spelgen.logs.trajectory import Trajectory, require_torques
 
+LIMITS = "if limits of the URDF are wrong, correct them and train again"
 FOREIGN = """  external torques exceed their thresholds in most of the log: check that it is a log of this arm, and the
 units, senses and zeros of its positions and torques"""
 
@@ -38,6 +39,7 @@ class ContactEvent:
         joints: names of the joints whose external torque exceeds the threshold.
         torques: largest external torque of each of these joints [Nm, N].
         force: largest estimated force at the tip [N].
+        is_load: True if a load causes the torques: its report is during the contact, or directly after it.
     """
 
     begin: float
@@ -45,6 +47,7 @@ class ContactEvent:
     joints: tuple[str, ...]
     torques: tuple[float, ...]
     force: float
+    is_load: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +56,6 @@ class LogEstimate:
 
     Attributes:
         log: The log.
-        joints: Names of the joints.
         unit: Unit of the joint torques.
         states: Estimates after each sample.
         payload: Estimated payload at the end of the log.
@@ -62,10 +64,10 @@ class LogEstimate:
         contacts: Contacts along the log.
         drift: {joint: relative difference of friction at the end of the log from friction of the model [%]}.
         refused: {reason: number of samples that were refused or only partly used}.
+        limits: For joints whose torque reaches its limit, a text with the largest torque and the limit [Nm, N].
     """
 
     log: Trajectory
-    joints: tuple[str, ...]
     unit: str
     states: list[EstimatorState]
     payload: Payload
@@ -74,6 +76,7 @@ class LogEstimate:
     contacts: tuple[ContactEvent, ...]
     drift: dict[str, float]
     refused: dict[str, int]
+    limits: list[str]
 
     def to_dict(self) -> dict[str, object]:
         """Return the estimates as content of a JSON file: times [s], payload, contacts, friction drift [%]."""
@@ -81,23 +84,21 @@ class LogEstimate:
             "log": self.log.name, "seconds": self.log.duration, "payload": payload_content(self.payload),
             "payload_since": self.since, "load_changes": list(self.changes),
             "contacts": [vars(contact) for contact in self.contacts], "friction_drift_percent": self.drift,
-            "refused": self.refused,
+            "refused": self.refused, "torques_at_limit": self.limits,
         }  # fmt: skip
 
     def text(self) -> str:
         """Return the estimates as text for users, with a line per contact."""
         lines = [f"{self.log.name}: {payload_sentence(self.payload)}"]
-        reports = [] if self.since is None else [self.since]
-        lines += [f"  a payload was reported first at {at:.1f} s" for at in reports]
+        if self.since is not None and self.since not in self.changes:
+            lines.append(f"  a payload was reported first at {self.since:.1f} s")
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
         for event in self.contacts:
-            # The torque of a payload that is not reported yet counts as an external torque and looks like a contact.
-            is_load = any(event.begin < at < event.end + TUNING.merged for at in (*reports, *self.changes))
-            name = "load before its report" if is_load else "contact"
+            name = "load before its report" if event.is_load else "contact"
             pairs = zip(event.joints, event.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
-            span = f"{event.begin:.2f} to {event.end:.2f} s"
-            lines.append(f"  {name} at {span}: {torques} {self.unit}; {event.force:.3g} N at the tip")
+            name = f"{name} at {event.begin:.2f} to {event.end:.2f} s"
+            lines.append(f"  {name}: {torques} {self.unit}; {event.force:.3g} N at the tip")
         if not self.contacts:
             lines.append("  no contact")
         if np.mean([state.contact.touched.any() for state in self.states]) > 0.5:
@@ -107,6 +108,8 @@ class LogEstimate:
         if self.refused:
             refused = "; ".join(f"{count} {REASONS.get(name, name)}" for name, count in self.refused.items())
             lines.append(f"  samples that were not used, or only in part: {refused}")
+        if self.limits:
+            lines.append(f"  largest torques: {', '.join(self.limits)} {self.unit}; {LIMITS}")
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
@@ -117,8 +120,7 @@ def payload_content(payload: Payload) -> dict[str, object]:
         content["mass_limit"] = payload.limit
     if payload.status == "payload":
         fields = [f"{name}{end}" for name in ("mass", "center", "inertia") for end in ("", "_interval")]
-        content |= {name: np.asarray(vars(payload)[name]).tolist() for name in fields}
-        content["parameters"] = payload.parameters.tolist()
+        content |= {name: np.asarray(vars(payload)[name]).tolist() for name in (*fields, "parameters")}
     return content
 
 
@@ -133,7 +135,7 @@ def payload_sentence(payload: Payload) -> str:
             f"{value:.3f} ({first:.3f} to {last:.3f})"
             for value, (first, last) in zip(payload.center, payload.center_interval, strict=True)
         )
-        return f"payload of {payload.mass:.2f} kg ({low:.2f} to {high:.2f}), centre of mass {center} m"
+        return f"payload of {payload.mass:.3f} kg ({low:.3f} to {high:.3f}), centre of mass {center} m"
     limit = f"at most {payload.limit:.2g} kg" if np.isfinite(payload.limit) else "record motion of the joints"
     is_none = payload.status == "no payload"
     return f"{'no payload' if is_none else 'not determined yet whether there is a payload'} ({limit})"
@@ -167,26 +169,30 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
         times = log.t - log.t[0]
         reported = times[[state.payload.status == "payload" for state in states]].tolist()
         drift = np.round(100 * (states[-1].friction_scale - 1), 2).tolist()
+        changes = tuple(times[load_changes(states)].tolist())
+        largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
+        pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
         results.append(LogEstimate(
-            log=log, joints=joints, unit=torque_units(fit.model.joint_types), states=states,
-            payload=states[-1].payload, since=next(iter(reported), None),
-            changes=tuple(times[load_changes(states)].tolist()),
-            contacts=tuple(contact_events(states, joints)), drift=dict(zip(joints, drift, strict=True)),
-            refused=estimator.refused,
+            log=log, unit=torque_units(fit.model.joint_types), states=states, payload=states[-1].payload,
+            since=reported[0] if reported else None, changes=changes,
+            contacts=tuple(contact_events(states, joints, [*reported[:1], *changes])),
+            drift=dict(zip(joints, drift, strict=True)), refused=estimator.refused,
+            limits=[f"{joint} {top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most],
         ))  # fmt: skip
     return results
 
 
-def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> Payload:
-    """Return the payload of an arm, estimated from several logs with the same payload."""
-    estimator, begin = Estimator(fit), 0.0
+def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> tuple[Payload, list[str]]:
+    """Return the payload of an arm, estimated from several logs, and the names of logs in which the load changes."""
+    estimator, begin, changed = Estimator(fit), 0.0, []
     for log in logs:
         t = log.t - log.t[0] + begin
         # The logs are processed as one recording with pauses. Each pause exceeds `TUNING.gap`, so that the estimator
         # resets the friction state.
         begin = float(t[-1]) + 2 * TUNING.gap
-        estimator.replay(replace(log, t=t))
-    return estimator.report()
+        if load_changes(estimator.replay(replace(log, t=t))):
+            changed.append(log.name)
+    return estimator.report(), changed
 
 
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:
@@ -209,10 +215,15 @@ def load_changes(states: Sequence[EstimatorState]) -> list[int]:
     ]
 
 
-def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> list[ContactEvent]:
+def contact_events(
+    states: Sequence[EstimatorState], joints: Sequence[str], reports: Sequence[float]
+) -> list[ContactEvent]:
     """Return the contacts in a log; contacts separated by less than `TUNING.merged` seconds are one contact.
 
-    states: estimates after each sample of the log. joints: names of the joints.
+    The torque of a payload that is not reported yet counts as an external torque, so it is a contact with `is_load`.
+
+    states: estimates after each sample of the log. joints: names of the joints. reports: times at which a payload is
+    reported first or changes, from the start of the log [s].
     """
     touching = [state for state in states if state.contact.touched.any()]
     ends = np.flatnonzero(np.diff([state.t for state in touching]) > TUNING.merged) + 1
@@ -228,5 +239,6 @@ def contact_events(states: Sequence[EstimatorState], joints: Sequence[str]) -> l
         force = float(max(np.linalg.norm(state.contact.force) for state in group))
         begin, end = group[0].t - states[0].t, group[-1].t - states[0].t
         names, largest = tuple(joints[k] for k in named), tuple(torques[peaks, named].tolist())
-        events.append(ContactEvent(begin, end, names, largest, force))
+        is_load = any(begin < at < end + TUNING.merged for at in reports)
+        events.append(ContactEvent(begin, end, names, largest, force, is_load))
     return events

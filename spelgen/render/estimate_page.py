@@ -71,7 +71,7 @@ def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
         JointRow("external torque", "external torque", "torque", torque),
         JointRow("friction relative to the model", "friction [%]", "", friction, 100),
     ]
-    return stacks(_times(result), rows, named_joints(result.joints, fit.model.joint_types))
+    return stacks(_times(result), rows, named_joints(tuple(result.drift), fit.model.joint_types))
 
 
 def _times(result: LogEstimate) -> np.ndarray:
