@@ -99,8 +99,9 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
     """Positions in degrees that wrap around at 360 give one error, which names the unit and advises a settings line.
 
-    With this line, positions and velocities have no errors. The joints with wrapped positions have no limits; the others have limits.
-    The torques of `motion` belong to no arm, so the error may state other faults of them.
+    With this line, positions and velocities have no errors. The joints with wrapped positions have no
+    limits; the others have limits. The torques of `motion` belong to no arm, so the error may
+    state other faults of them.
     """
     text = (robots / "six_dof.urdf").read_text()
     joints = load_arm(robots / "six_dof.urdf").chain.joint_names
