@@ -165,7 +165,7 @@ class BodyChain(nn.Module):
         steady = (turning * (qd @ self.ratios.mT).unsqueeze(-2)) @ self.carriers
         w, (a, u) = twists[..., :3, :, None], steady.unsqueeze(-1).chunk(2, dim=-3)
         # A point p of a body with twist (w, u0) and velocity v has the acceleration w x v + a x p + u, where
-        # (a, u) is the time derivative of the twist, here at constant joint rates.
+        # (a, u) is the time derivative of the twist, here at constant joint rates; a is angular.
         turned = torch.linalg.cross(w, velocity, dim=-3) + torch.linalg.cross(a, cache.place, dim=-3)
         return torch.addcmul(turned, u, cache.mass).flatten(-3) + cache.weight
 

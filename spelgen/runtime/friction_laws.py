@@ -82,8 +82,8 @@ class FrictionConstants(NamedTuple):
 
     def stored_energy(self, z: Tensor) -> Tensor:
         """Return the elastic energy of all bristles, (...) [J]; z: displacements, (..., n, K) [rad, m]."""
-        # Each bristle is a spring of stiffness coulomb * fraction / breakaway: only the Coulomb term of
-        # dry friction stores energy. The Stribeck and load terms vary with velocity and load. Their power
+        # The bristles count as springs of stiffness coulomb * fraction / breakaway: only the Coulomb term
+        # of dry friction stores energy. The Stribeck and load terms vary with velocity and load. Their power
         # counts as dissipation, which may be slightly negative when a bristle relaxes.
         stored = self.bristle_fractions * z.square() / self.bristle_reach
         return 0.5 * (self.coulomb * stored.sum(dim=-1)).sum(dim=-1)
@@ -93,7 +93,7 @@ class FrictionLaws(nn.Module):
     """Friction of all joints with trained constants.
 
     Without bristles, it dissipates energy for any values of the parameters. Bristles store energy and return
-    it. Their stiffness is proportional to dry friction, which depends on velocity and load: they can return
+    it. Their torque is proportional to dry friction, which depends on velocity and load: they can return
     slightly more than they have stored if velocity or load have changed meanwhile.
 
     The friction torque of a joint with velocity qd is
@@ -113,10 +113,10 @@ class FrictionLaws(nn.Module):
     the bristles of the joint. It is s(qd, coulomb_smoothing_velocity) for a joint without bristles, or if
     z is unknown.
 
-    The trained parameters are logarithms of the constants, and logits of the bristle fractions. For large r
-    the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of Machines with Friction,
-    1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982), but without a corner at
-    rest. Powers replace exponentials, so that a control loop takes a third of the time.
+    The trained parameters are logarithms of constants, see ``parameter_groups``, and logits of the bristle
+    fractions. For large r the Stribeck term is close to the Gaussian of Armstrong-Helouvry (Control of
+    Machines with Friction, 1991); for small r, to the exponential of Bo and Pavelescu (Wear 82:277, 1982),
+    but without a corner at rest. Powers replace exponentials: a control loop takes a third of the time.
     """
 
     # (name, group, unit of the constant, initial value of the constant) of each trained parameter. Fits

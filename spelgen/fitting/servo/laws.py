@@ -43,7 +43,7 @@ def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> Servo
     """Return x with small dead zones set to zero and excluded from the fit.
 
     A dead zone is small if half its width [rad, m], the parameter, is below `TUNING.min_dead_zone`. This bound is about
-    the resolution of encoders: smaller dead zones cannot be measured.
+    the resolution of encoders: smaller dead zones cannot be measured. The other parameters of x are unchanged.
     """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone

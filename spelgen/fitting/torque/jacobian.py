@@ -243,8 +243,9 @@ class TorqueJacobian:
 
         The torque is linear in the inertial parameters of the bodies, and in armatures and friction coefficients c, but
         x contains log-Cholesky parameters and log c. The curve is a straight line in the quantities in which the torque
-        is linear. For the bodies see `step_in_inertial_parameters`. A step s > 0 of log c changes c to c (1 + s). A
-        step s < 0 changes c to c exp(s), as x + step does, since c (1 + s) could be negative.
+        is linear, except for coefficients that fall: a step s > 0 of log c changes c to c (1 + s), a step s < 0 changes
+        c to c exp(s), as x + step does, since c (1 + s) could be negative. For the bodies see
+        `step_in_inertial_parameters`.
         """
         change, bodies = self.rigid.unflatten(step), self.rigid.bodies
         parameters = self.rigid.unflatten(x + step)

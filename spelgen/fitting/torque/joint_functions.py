@@ -100,7 +100,7 @@ class JointFunction:
 
         If the term is an added torque, the result is `features` @ weights: the torque without the part that rigid
         bodies and friction would absorb. If the term is a factor f of the friction, the result is (f - 1) times the
-        friction torque.
+        friction torque of the model, whose present factor, 1 for a term that is not selected yet, f multiplies.
         """
         features = self.features[rows]
         if self.friction is None:
@@ -224,7 +224,6 @@ def joint_functions(
 
     projection: removes from a torque the part that the rigid-body and friction model would absorb. selected:
     (parameter, joint) of the terms to yield; None: all.
-    None: all.
     """
     terms, motors = model.residuals, motors_of(model)
     with torch.no_grad():

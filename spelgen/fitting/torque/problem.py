@@ -51,8 +51,8 @@ class NoiseEstimator:
 
     s^2 is the mean squared residual times the correlation length. The sum over all samples of residual^2 / s^2 is then
     the number of independent errors instead of the number of samples. correlation_length: (n,), number of correlated
-    samples that count as one independent error. The root mean square residual is limited: below by a fraction of
-    torque_std (n,) [Nm, N], the standard deviation of the torque, and above by max_error (n,) [Nm, N].
+    samples that count as one independent error. The root mean square residual is limited first from above, by max_error
+    (n,) [Nm, N], and then from below, by a fraction of torque_std (n,) [Nm, N], the standard deviation of the torque.
     """
 
     count: int
@@ -306,11 +306,12 @@ class TorqueEstimate:
         return replace(self, covariance=self.problem.covariance(normal.curvature))
 
     def on_segments(self, samples: TorqueSamples) -> TorqueEstimate:
-        """Return this estimate, converted to segments of consecutive samples, with a recomputed covariance.
+        """Return this estimate, converted to segments of consecutive samples.
 
         The estimate may have been fitted to a subset of the samples with gaps, from which the correlation time of the
         torque errors cannot be estimated. The segments have a duration of `TUNING.segment` and are cut from `samples`.
-        The parameters x are unchanged; the noise is converted to the sample interval of the segments.
+        The parameters x are unchanged; the noise is converted to the sample interval of the segments. Before
+        the samples are replaced, the covariance is recomputed for the current noise.
         """
         jacobian = TorqueJacobian(
             self.problem.jacobian.model, samples.segments(TUNING.segment, TUNING.initial_samples)
@@ -377,8 +378,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     the model, with tenths of a second to seconds. The integrated correlation time of the sum is estimated on segments
     of samples, from the residual. Since fitted parameters reduce the correlation of the residual, the residual is
     corrected first (see `RigidProjection.errors`). The result is a weighted mean of this value and of the prior mean
-    `TUNING.correlation_time`. The weights are numbers of independent errors: in the samples, and a constant for the
-    prior mean.
+    `TUNING.correlation_time`. The weight of the value is the number of independent errors in the segments, at the prior
+    correlation time; the weight of the prior mean is a constant.
 
     The correlation time is estimated only once. Updates in the outer iterations would be unstable: a joint with a long
     correlation time has a small weight, so its residual grows, which makes the correlation time even longer.
@@ -389,8 +390,8 @@ def with_correlation_time(estimate: TorqueEstimate, samples: TorqueSamples) -> T
     errors = projection.errors(residual.torque_residual, size)
     observed = torch.from_numpy(correlation_time(list(errors.numpy()))) * interval
     # A weighted mean is formed. The weight of the prior mean is 1. The weight of the estimated correlation time is the
-    # number of independent errors in the samples divided by `correlation_weight`, the number to which the prior mean is
-    # equivalent.
+    # number of independent errors in the segments divided by `correlation_weight`, the number to which the prior mean
+    # is equivalent.
     weight = len(residual.q) * interval / prior_mean / TUNING.correlation_weight
     mean = (weight * observed + prior_mean) / (weight + 1)
     noise = problem.noise * (mean / problem.correlation_time).sqrt()
