@@ -206,12 +206,11 @@ def logged_column(table: pa.Table, name: str, by_names: RowsByNames | None = Non
     lists, index = table.column(element[0]), element[1]
     if not by_names:
         return _elements(lists, index)
-    joint = next(iter(by_names))[index : index + 1]
-    values = pa.nulls(len(table))
+    first, values = next(iter(by_names)), pa.nulls(len(table))
+    joint = first[index] if index < len(first) else ""
     for names, rows in by_names.items():
-        if set(joint) <= set(names):
-            index_in_row = names.index(*joint) if joint else index
-            values = pa.compute.if_else(rows, _elements(lists, index_in_row), values)
+        if joint in names:
+            values = pa.compute.if_else(rows, _elements(lists, names.index(joint)), values)
     return values
 
 
