@@ -9,7 +9,7 @@ from test_log_geometry import arm, excitation, mended, recorded, told  # noqa: F
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
-from spelgen.logs.read import write_logs
+from spelgen.logs.read import read_logs, write_logs
 from spelgen.settings.log_mapping import LogMapping
 
 
@@ -207,7 +207,10 @@ def test_the_unit_of_positions_is_named_together_with_the_order_of_the_torques(a
     factors = np.full(4, 180 / np.pi) if motion == "degrees" else np.array([101.0, 50.0, 121.0, 80.0])
     wrong = replace(log, q=log.q * factors, qd=log.qd * factors, tau=log.tau[:, order])
     error = told(arm, wrong)
-    assert "--accept torque-order --accept joint-unit" in error or "--accept joint-unit --accept torque-order" in error
+    assert (
+        "--accept torque-order --accept joint-unit" in error
+        or "--accept joint-unit --accept torque-order" in error
+    )
     write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
     again, (read,) = mended(arm, error, tmp_path / "log.csv")
     assert (np.abs(read.q - log.q).max(axis=0) < 0.03 * np.ptp(log.q, axis=0)).all()
@@ -226,10 +229,27 @@ def test_degrees_are_advised_also_if_a_joint_has_another_fault(arm, reversed_joi
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
-def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # noqa: F811
+@pytest.mark.parametrize("gains", [(1.3, 0.02, 0.4, 0.006), (0.3, 1.9, 0.5, 2e-5), (0.04, 1.1, 0.2, 1e-6)])
+def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm, gains):  # noqa: F811
     """Torques in percent of each joint's rated torque get one gain per joint; their ratios are right to about 30 %."""
-    log, gains = recorded(arm, 16, noise=0.01), np.array([1.3, 0.02, 0.4, 0.006])
+    log = recorded(arm, 16, noise=0.01)
     error = told(arm, replace(log, tau=log.tau / gains))
     assert "--accept torque-unit" in error
     found = np.array([float(x) for x in re.findall(r"gain: ([\d.e-]+)", error)])
     assert np.ptp(np.log(found / gains)) < 0.3
+
+
+def test_a_short_delay_of_all_torques_is_no_delay_of_one_joint(shared):
+    """Positions that are 20 ms late explain the torques of one joint best, but no more than a delay of all torques."""
+    panda = load_arm(shared / "arms" / "panda_erd.urdf")
+    (log,) = read_logs([shared / "logs" / "panda"], panda)
+    q, qd = (np.stack([np.interp(log.t - 0.02, log.t, x) for x in y.T], axis=1) for y in (log.q, log.qd))
+    assert check_logs([replace(log, q=q, qd=qd)], panda).errors == ()
+
+
+def test_the_unit_of_a_last_joint_that_nothing_determines_leaves_the_others_alone(shared):
+    """If masses of the URDF are 30 % wrong, and the last joint has another unit, no gain is advised for other joints."""
+    panda = load_arm(shared / "arms" / "panda_erd.urdf")
+    (log,) = read_logs([shared / "logs" / "panda"], panda)
+    (*errors,) = check_logs([replace(log, tau=log.tau * np.append(np.ones(6), 10.0))], panda).errors
+    assert not any("panda_joint1" in str(error) for error in errors)

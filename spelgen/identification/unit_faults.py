@@ -82,7 +82,7 @@ class TorqueUnit(WrongScale):
         the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
         significantly below the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that
-        the torques do not determine is 1. The factors of all joints are tried only if several have another unit.
+        hardly lowers the cost is 1. The factors of all joints are tried only if several have another unit.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if gravity torques in the log gave a candidate.
@@ -94,7 +94,8 @@ class TorqueUnit(WrongScale):
         gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
         is_free = self._is_open & (gains > 0)
-        is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        ratios = np.where(is_free, gains, common) / common
+        is_other = is_other_unit(ratios)
         # Without gravity in the torques, the masses of the URDF do not show a common factor of all joints.
         if not (is_other.any() or has_gravity):
             return
@@ -103,17 +104,21 @@ class TorqueUnit(WrongScale):
             rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
             return problem.fit(present.changed(self, scale=rounded))
 
-        is_common, units = bool(is_other_unit(common)), np.eye(len(gains))
-        several = is_free & (is_common or is_other.sum() > 1)
-        for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
-            factors = np.where(changed, factors, 1.0)
+        is_common = bool(is_other_unit(common))
+        # if only one joint differs from the common factor, the masses of the URDF are the reason for this factor
+        several = is_free & (is_common or (is_other_unit(np.square(ratios)).sum() > 1))
+        for start, changed in ((ratios, is_other & (not is_common)), (gains, several)):
+            factors = np.where(changed, start, 1.0)
             fit = fitted(factors)
-            # A factor is determined if the cost rises when it is multiplied or divided by `other_unit`. Errors of
-            # masses may change it by less than this factor. Other factors become 1.
-            for joint in np.flatnonzero(changed):
-                steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
-                changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
-            fit = fitted(np.where(changed, factors, 1.0))
+            # If the factors differ a lot, the fit with free gains may end far from the factors of lowest cost.
+            for unit in np.eye(len(gains))[changed]:
+                for step in (GEOMETRY.other_unit**unit, GEOMETRY.other_unit**-unit):
+                    while (other := fitted(factors * step)).cost < fit.cost - self.rarity:
+                        factors, fit = factors * step, other
+                without = np.where(unit, 1.0, factors)
+                if (other := fitted(without)).cost < fit.cost + self.rarity:
+                    factors, fit = without, other
+            changed = factors != 1.0
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
             if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
