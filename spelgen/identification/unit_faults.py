@@ -81,8 +81,8 @@ class TorqueUnit(WrongScale):
         The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and
         the masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. Separate factors are therefore yielded only if (1) their cost, plus a penalty for each factor, is
-        significantly below the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that
-        hardly lowers the cost is 1. The factors of all joints are tried only if several have another unit.
+        significantly below the cost of `lowest`, (2) each factor lowers the cost, and (3) the relative residual of each
+        joint is small. The factors of all joints are tried only if several have another unit.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if gravity torques in the log gave a candidate.
@@ -105,22 +105,20 @@ class TorqueUnit(WrongScale):
             return problem.fit(present.changed(self, scale=rounded))
 
         is_common = bool(is_other_unit(common))
-        # if only one joint differs from the common factor, the masses of the URDF are the reason for this factor
-        several = is_free & (is_common or (is_other_unit(np.square(ratios)).sum() > 1))
+        # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
+        is_several = is_common or is_other_unit(np.square(ratios)).sum() > 1
+        several = is_free & (is_free.all() and is_several)
         for start, changed in ((ratios, is_other & (not is_common)), (gains, several)):
-            factors = np.where(changed, start, 1.0)
+            factors, units = np.where(changed, start, 1.0), np.eye(len(gains))[changed]
             fit = fitted(factors)
             # If the factors differ a lot, the fit with free gains may end far from the factors of lowest cost.
-            for unit in np.eye(len(gains))[changed]:
+            for unit in units:
                 for step in (GEOMETRY.other_unit**unit, GEOMETRY.other_unit**-unit):
                     while (other := fitted(factors * step)).cost < fit.cost - self.rarity:
                         factors, fit = factors * step, other
-                without = np.where(unit, 1.0, factors)
-                if (other := fitted(without)).cost < fit.cost + self.rarity:
-                    factors, fit = without, other
-            changed = factors != 1.0
+            is_sure = all(fitted(np.where(x, 1.0, factors)).cost > fit.cost + self.rarity for x in units)
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
-            if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
+            if is_sure and is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
                 yield fit
 
