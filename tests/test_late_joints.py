@@ -212,7 +212,7 @@ def test_the_unit_of_positions_is_named_together_with_the_order_of_the_torques(a
         or "--accept joint-unit --accept torque-order" in error
     )
     write_logs(tmp_path / "log.csv", [wrong], arm.chain.joint_names)
-    again, (read,) = mended(arm, error, tmp_path / "log.csv")
+    _, (read,) = mended(arm, error, tmp_path / "log.csv")
     assert (np.abs(read.q - log.q).max(axis=0) < 0.03 * np.ptp(log.q, axis=0)).all()
     np.testing.assert_allclose(read.tau, log.tau, rtol=1e-6, atol=1e-9)
 
@@ -257,7 +257,7 @@ def test_a_short_delay_of_all_torques_is_no_delay_of_one_joint(shared):
 
 
 def test_the_unit_of_a_last_joint_that_nothing_determines_leaves_the_others_alone(shared):
-    """If masses of the URDF are 30 % wrong, and the last joint has another unit, no gain is advised for other joints."""
+    """If the URDF's masses are 30 % wrong and the last joint has another unit, no other joint gets a gain."""
     panda = load_arm(shared / "arms" / "panda_erd.urdf")
     (log,) = read_logs([shared / "logs" / "panda"], panda)
     (*errors,) = check_logs([replace(log, tau=log.tau * np.append(np.ones(6), 10.0))], panda).errors
