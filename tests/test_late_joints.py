@@ -9,7 +9,7 @@ from test_log_geometry import arm, excitation, mended, recorded, told  # noqa: F
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.log_checks.check_logs import check_logs
-from spelgen.logs.read import write_logs
+from spelgen.logs.read import read_logs, write_logs
 from spelgen.settings.log_mapping import LogMapping
 
 
@@ -248,3 +248,29 @@ def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # n
     assert "--accept torque-unit" in error
     found = np.array([float(x) for x in re.findall(r"gain: ([\d.e-]+)", error)])
     assert np.ptp(np.log(found / gains)) < 0.3
+
+
+@pytest.mark.parametrize("arm", ["six_dof", "ur10e"], indirect=True)
+def test_gains_per_joint_are_found_although_the_last_one_is_far_smaller(arm):  # noqa: F811
+    """The gain of the last joint is a 500th of the others', and yet the ratios of all gains are right to 30 %."""
+    log, gains = recorded(arm, 16, noise=0.01), np.array([0.27, 1.9, 0.49, 0.2, 0.09, 4e-4])
+    error = told(arm, replace(log, tau=log.tau / gains))
+    assert "--accept torque-unit" in error
+    found = np.array([float(x) for x in re.findall(r"gain: ([\d.e-]+)", error)])
+    assert np.ptp(np.log(found / gains)) < 0.3
+
+
+def test_a_short_delay_of_all_torques_is_no_delay_of_one_joint(shared):
+    """Positions that are 20 ms late explain the torques of one joint best, but no more than a delay of all torques."""
+    panda = load_arm(shared / "arms" / "panda_erd.urdf")
+    (log,) = read_logs([shared / "logs" / "panda"], panda)
+    q, qd = (np.stack([np.interp(log.t - 0.02, log.t, x) for x in y.T], axis=1) for y in (log.q, log.qd))
+    assert check_logs([replace(log, q=q, qd=qd)], panda).errors == ()
+
+
+def test_the_unit_of_a_last_joint_that_nothing_determines_leaves_the_others_alone(shared):
+    """If the URDF's masses are 30 % wrong and the last joint has another unit, no other joint gets a gain."""
+    panda = load_arm(shared / "arms" / "panda_erd.urdf")
+    (log,) = read_logs([shared / "logs" / "panda"], panda)
+    (*errors,) = check_logs([replace(log, tau=log.tau * np.append(np.ones(6), 10.0))], panda).errors
+    assert not any("panda_joint1" in str(error) for error in errors)

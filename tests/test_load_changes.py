@@ -103,7 +103,7 @@ def test_training_is_told_of_different_loads(arm):  # noqa: F811
 
 @pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
 @pytest.mark.parametrize("joint", [None, 0, 1])
-@pytest.mark.parametrize("factor", [0.7, 1.5])
+@pytest.mark.parametrize("factor", [0.5, 0.7, 1.5])
 def test_torques_whose_scale_changes_within_a_recording_are_an_error(arm, joint, factor):  # noqa: F811
     """The error names the joint and the time of the change, also in one of several recordings."""
     log = recorded(arm, 6)
@@ -152,3 +152,11 @@ def test_recordings_of_a_ur10e_with_loads_are_found(shared):
         (float(a), float(b)) for a, b in re.findall(r"load_2600 \((\S+) \+- (\S+) kg\)", text)
     ]
     assert abs(mass - 2.6) < 2 * width < 0.6
+
+
+def test_a_torque_in_another_unit_is_no_changed_zero_of_another_joint(shared):
+    """The torque of a UR10e's elbow in kNm is not explained by another zero of the wrist's torque."""
+    ur10e = load_arm(shared / "logs" / "ur10e" / "ur10e.urdf")
+    (log,) = read_logs([shared / "logs" / "ur10e" / "20_02_05_20sec_12harm.parquet"], ur10e)
+    scaled = replace(log, tau=log.tau * np.where(np.arange(6) == 2, 1e-3, 1.0))
+    assert not any("torque-changed" in str(error) for error in check_logs([scaled], ur10e).errors)

@@ -84,13 +84,12 @@ class TorqueUnit(WrongScale):
         """Yield the least-squares fits in which joints have different factors on their torques.
 
         The first fit has factors only on the joints whose gain differs much from the median gain. The second fit has
-        factors on all joints whose unit is open; it is tried only if several joints, or all, have another unit.
+        factors on all joints; it is tried only if several joints, or all, have another unit.
 
         The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and the
         masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. A fit is therefore yielded only if (1) its cost, plus a penalty for each factor, is significantly below
-        the cost of `lowest`, and (2) the relative residual of each joint is small. A factor that the torques do not
-        determine is 1.
+        the cost of `lowest`, (2) each factor lowers the cost, and (3) the relative residual of each joint is small.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if the gravity in the logged torques gave at least one candidate. If it is False, and
@@ -103,7 +102,8 @@ class TorqueUnit(WrongScale):
         gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
         is_free = self._is_open & (gains > 0)
-        is_other = is_free & is_other_unit(np.where(is_free, gains, common) / common)
+        ratios = np.where(is_free, gains, common) / common
+        is_other = is_other_unit(ratios)
         # If no gain differs much from the median gain, only one common factor on all torques can be wrong. It is known
         # only if the torques contain gravity, which is compared to the URDF's gravity torques.
         if not (is_other.any() or has_gravity):
@@ -113,20 +113,21 @@ class TorqueUnit(WrongScale):
             rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
             return problem.fit(present.changed(self, scale=rounded))
 
-        is_common, units = bool(is_other_unit(common)), np.eye(len(gains))
-        several = is_free & (is_common or is_other.sum() > 1)
-        for factors, changed in (gains / common, is_other & ~np.bool_(is_common)), (gains, several):
-            factors = np.where(changed, factors, 1.0)
+        is_common = bool(is_other_unit(common))
+        # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
+        is_several = is_common or is_other_unit(np.square(ratios)).sum() > 1
+        several = is_free & (is_free.all() and is_several)
+        for start, changed in ((ratios, is_other & (not is_common)), (gains, several)):
+            factors, units = np.where(changed, start, 1.0), np.eye(len(gains))[changed]
             fit = fitted(factors)
-            # The factor of a joint is determined if the cost rises both when the factor is multiplied by `other_unit`
-            # and when it is divided by `other_unit`. Smaller changes of the factor are no test, since errors of the
-            # masses cause them, too. Factors that are not determined become 1.
-            for joint in np.flatnonzero(changed):
-                steps = GEOMETRY.other_unit ** np.stack([units[joint], -units[joint]])
-                changed[joint] = min(fitted(factors * x).cost for x in steps) > fit.cost + 0.5
-            fit = fitted(np.where(changed, factors, 1.0))
+            # If the factors differ a lot, the fit with free gains may end far from the factors of lowest cost.
+            for unit in units:
+                for step in (GEOMETRY.other_unit**unit, GEOMETRY.other_unit**-unit):
+                    while (other := fitted(factors * step)).cost < fit.cost - self.rarity:
+                        factors, fit = factors * step, other
+            is_sure = all(fitted(np.where(x, 1.0, factors)).cost > fit.cost + self.rarity for x in units)
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
-            if is_lower and fit.errors.max() <= GEOMETRY.unexplained:
+            if is_sure and is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
                 yield fit
 

@@ -331,6 +331,9 @@ class TorqueLogs:
         if unexplained is not None:
             yield unexplained
             return
+        # if no hypothesis lowers the torque error, the torques do not show the unit of positions
+        if self._guessed and better and better[0].errors.mean() > GEOMETRY.lower * unchanged.errors.mean():
+            return
         faults = better[0].hypothesis.faults if better else ()
         if not better or {fault.code for fault in faults} <= accepted:
             yield from () if better else _link_notes(problem, unchanged)
