@@ -99,9 +99,7 @@ def test_wraps_of_angles_without_limits_are_removed_before_anything_else(robots,
 def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path):
     """Positions in degrees that wrap around at 360 give one error, which names the unit and advises a settings line.
 
-    With this line, positions and velocities have no errors. The joints with wrapped positions have no
-    limits; the others have limits. The torques of `motion` belong to no arm, so the error may
-    state other faults of them.
+    With this line, the log has no errors. The joints with wrapped positions have no limits; the others have limits.
     """
     text = (robots / "six_dof.urdf").read_text()
     joints = load_arm(robots / "six_dof.urdf").chain.joint_names
@@ -117,7 +115,7 @@ def test_wraps_in_degrees_are_no_jumps_once_the_unit_is_stated(robots, tmp_path)
             columns[f"q_{joint}"] %= 360
     file = written(columns, tmp_path / "log.csv")
     (error,) = check_logs(read_logs([file], arm), arm).errors
-    assert "units: {q: deg, qd: deg/s}" in str(error) and "check the encoder" not in str(error)
+    assert "degrees" in str(error) and "check the encoder" not in str(error)
     mapping = advised(str(error))
     assert not errors(read_logs([file], arm, mapping=mapping), arm)
 
