@@ -202,8 +202,8 @@ def _change(
     factor, offset = 1.0, float(best.quantities[0, 0])
     if best is refits[0]:
         # `torque` is a compromise of both parts: the refitted parameters give the torque before the change.
-        scaled, before = columns[0][..., 0], rows @ best.parameters
-        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * before).sum()), 0.0
+        scaled, original = columns[0][..., 0], rows @ best.parameters
+        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * original).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
     # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
     remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
