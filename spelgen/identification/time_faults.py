@@ -52,16 +52,16 @@ class Delay(Fault):
             # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
             # torques, whose derivative with respect to time is mostly noise.
             starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
-            delay, best = problem.descend(
+            delay, delayed_fit = problem.descend(
                 delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
                 allowed=lambda x: np.clip(x, -longest, longest),
             )  # fmt: skip
             if abs(delay[0]) >= GEOMETRY.min_delay:
                 fit = problem.fit(delayed(delay.round(3)))
                 yield from [fit] if _explains_more(problem, reference, fit) else []
-            elif signals[1].all() and best.cost < base.cost:
+            elif signals[1].all() and delayed_fit.cost < base.cost:
                 # The delay of one joint must explain more than a short delay of all torques, which is not reported.
-                reference = best
+                reference = delayed_fit
 
     def text(self, correction: Correction) -> str:
         """Return the text about delayed signals: which signals of the joints, and the longest delay."""

@@ -117,14 +117,14 @@ class TorqueUnit(WrongScale):
         # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
         is_several = is_common or is_other_unit(np.square(ratios)).sum() > 1
         several = is_free & (is_free.all() and is_several)
-        for start, changed in ((ratios, is_other & (not is_common)), (gains, several)):
-            factors, units = np.where(changed, start, 1.0), np.eye(len(gains))[changed]
+        for initial, changed in ((ratios, is_other & (not is_common)), (gains, several)):
+            factors, units = np.where(changed, initial, 1.0), np.eye(len(gains))[changed]
             fit = fitted(factors)
             # If the factors differ a lot, the fit with free gains may end far from the factors of lowest cost.
             for unit in units:
                 for step in (GEOMETRY.other_unit**unit, GEOMETRY.other_unit**-unit):
-                    while (other := fitted(factors * step)).cost < fit.cost - self.rarity:
-                        factors, fit = factors * step, other
+                    while (rescaled := fitted(factors * step)).cost < fit.cost - self.rarity:
+                        factors, fit = factors * step, rescaled
             is_sure = all(fitted(np.where(x, 1.0, factors)).cost > fit.cost + self.rarity for x in units)
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
             if is_sure and is_lower and fit.errors.max() <= GEOMETRY.unexplained:
