@@ -230,6 +230,16 @@ def test_the_unit_of_positions_is_named_together_with_the_order_of_the_torques(a
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_the_unit_of_positions_is_stated_before_errors_that_it_causes(arm):  # noqa: F811
+    """Positions in degrees that are read in rad may seem to jump: the error about the unit is then the first."""
+    logs = [recorded(arm, seed, noise=0.01) for seed in (18, 19)]
+    logs = [replace(x, q=np.degrees(x.q), qd=np.degrees(x.qd), name=f"{k}") for k, x in enumerate(logs)]
+    logs[1].q[500:508, 1] += 12.0
+    unit, jump = check_logs(logs, arm).errors
+    assert "units: {q: deg, qd: deg/s}" in str(unit) and "got q that jumps" in str(jump)
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize("reversed_joint", [None, 1])
 def test_degrees_are_advised_also_if_a_joint_has_another_fault(arm, reversed_joint):  # noqa: F811
     log = recorded(arm, 18, noise=0.01)

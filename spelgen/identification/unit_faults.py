@@ -224,16 +224,17 @@ class PositionUnit(WrongScale):
 
         A candidate has given factors on the positions, such as pi / 180. The joints of a group, such as all revolute
         joints, get the factors of lowest cost. A group is omitted if the hypothesis of `base` already changes the unit
-        of one of its joints. All groups are omitted if `base` or a candidate explains the torques.
+        of one of its joints. Single joints are omitted if `base` or a candidate explains the torques.
         """
         units = list(super().fits(problem, base))
         yield from units
-        # A free factor explains small errors of the model, too: it is tried only if the torques are not explained, and
-        # the factors of several joints must halve the residual.
+        # A free factor explains small errors of the model, too. It is tried for a single joint only if the torques are
+        # not explained. The factors of several joints are tried in any case, since degrees at all joints explain most
+        # of the torques of a log of motor positions; but these factors must halve the residual.
         lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
-        for joints in self._groups if lowest.max() > GEOMETRY.explained else ():
-            if not is_changed[joints].any():
+        for joints in self._groups:
+            if not is_changed[joints].any() and (lowest.max() > GEOMETRY.explained or len(joints) > 1):
                 fit = self._free(problem, base, joints)
                 yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 

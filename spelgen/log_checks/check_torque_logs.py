@@ -131,8 +131,10 @@ class TorqueLogs:
             if not unscaled:
                 geometry = self._geometry_findings(samples, evidence, accepted, loads)
             if guesses:
-                geometry = [x for x in geometry if isinstance(x, LogError)] or guesses
-                summary.errors[:] = [x for x in summary.errors if x not in guesses]
+                # The error about the unit is the first, since the wrong unit may cause others, such as jumps.
+                remaining = [x for x in summary.errors if x not in guesses]
+                geometry = [*([x for x in geometry if isinstance(x, LogError)] or guesses), *remaining]
+                summary.errors.clear()
             summary.extend(geometry)
             is_right = not any(isinstance(x, SpelgenError) or x.code in UNEXPLAINING for x in geometry)
             if is_right and moving is not None:
