@@ -196,6 +196,14 @@ def test_positions_of_all_motors_are_no_degrees(arm, third, is_motor_torque, tmp
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+def test_gear_ratios_near_the_factor_of_degrees_are_found(arm):  # noqa: F811
+    """Degrees are not advised for motor positions with gear ratios near 57.3, although they explain most torques."""
+    log, gears = recorded(arm, 17, noise=0.01), np.array([52.0, 63.0, 60.0, 54.0])
+    error = told(arm, replace(log, q=log.q * gears, qd=log.qd * gears))
+    assert "positions in deg" not in error and "--accept joint-unit" in error
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_gear_ratios_that_the_torques_do_not_show_are_not_advised(arm):  # noqa: F811
     """If positions are logged at the motors and torques are of another motion, the gear ratios cannot be found.
 
