@@ -1,14 +1,15 @@
-"""Torque errors of the presets and of other methods, and errors of predicted states of the presets, per arm.
+"""Print tables of the errors of the presets `closed-form` and `hybrid`, and of other methods, per arm.
 
     python benchmarks/arms.py [FOLDER]
 
-FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings. The first table has the nMSE of
-torques on recordings: mean squared error divided by the torque's variance, mean over joints, pauses included. The
-presets are fitted as by `spelgen train`. Least squares, ridge regression and the networks of `rivals.py` are fitted to
-the same filtered samples; `+ network` is a network for the torque residual of least squares. The second table has the
-errors of states that are predicted 0.1, 0.5 and 1 s ahead, relative to the motion as in `spelgen evaluate`: by
-constant velocity, and by the model without and with a constant disturbance torque from a momentum observer. The third
-table has the nMSE of torques of a simulated UR10e with a spring, gear ripple and friction that varies with position.
+FOLDER is made by `python benchmarks/recordings.py FOLDER`, by default runs/recordings.
+
+- Torques on recordings: nMSE, the mean squared error divided by the torque's variance, mean over joints, pauses
+  included. The presets are fitted as by `spelgen train`. Least squares, ridge regression and the networks of
+  `rivals.py` are fitted to the same filtered samples. `+ network` is a network for the residual of least squares.
+- States predicted 0.1, 0.5 and 1 s ahead: RMS error divided by the RMS change of the state in this time. Predictors are
+  constant velocity, and the model without and with a constant disturbance torque from a momentum observer.
+- Torques of a simulated UR10e with a spring, gear ripple and friction that varies with position: nMSE.
 """
 
 from __future__ import annotations

@@ -63,10 +63,11 @@ def error_lines(rows: Sequence[Row], methods: Sequence[str]) -> Iterator[str]:
 
 
 def ratio_lines(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield lines on the error of `hybrid` divided by the smaller error of the two least-squares methods.
+    """Yield lines on the ratio (error of `hybrid`) / (smaller error of the two least-squares methods).
 
-    The errors are of M and of the torque. The lines have medians of this ratio and shares below limits: over all cases,
-    then for each value of each of `CAUSES`, the properties of cases such as the kind of friction.
+    There is a ratio for the error of M, and one for the nMSE of the torque. The lines have the median of each ratio and
+    the share of cases with a ratio below a limit such as 1.2: for all cases, then per property of the cases, such as
+    the kind of friction (`CAUSES`).
     """
     for key, goal in (("mass", 1.2), ("nmse", 1.02)):
         ratio = np.array([by_better_least_squares(row, key) for row in rows])

@@ -376,7 +376,10 @@ def test_gains_of_currents_are_found(uncoupled, tmp_path):
 
 
 def test_intervals_contain_unknown_gains_if_the_masses_of_the_urdf_are_wrong(uncoupled, tmp_path):
-    """Intervals of the gains contain the true gains; the URDF's masses, which fix their scale, are about 30 % wrong."""
+    """Intervals of unknown motor gains contain the true gains, although the URDF's masses are about 30 % wrong.
+
+    The masses determine the common scale of the gains.
+    """
     gains = np.array([30.0, 60.0, 15.0, 20.0, 10.0, 5.0])
     log = simulate(as_built(uncoupled, 1, tmp_path / "true.urdf")).train[0]
     model = trained_gains(tmp_path, uncoupled.chain.joint_names)

@@ -118,7 +118,7 @@ def test_what_is_no_module_is_refused(tmp_path):
 
 
 def test_a_module_of_an_earlier_version_is_refused_with_a_remedy(module, tmp_path):
-    """Modules of earlier formats, or without a specification, are refused with the advice to build and train again."""
+    """A module without specification, or with another format number, is refused: it must be built and trained again."""
     old = tmp_path / "old.py"
     old.write_text(f'open({str(tmp_path / "mark")!r}, "w")\nFACTS = """{{"format": 8}}"""\n')
     assert refusal(old) == f"{old}: got no specification of spelgen in it, {REMEDY}, or check the path"

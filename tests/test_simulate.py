@@ -133,9 +133,9 @@ class TestFriction:
         assert np.abs(np.diff(torque[:, 0], 2)).max() < 1e-6
 
     def test_where_two_motors_move_two_joints_friction_is_that_of_the_motors(self):
-        """Friction of coupled motors acts at motor speeds.
+        """The simulated friction of coupled motors is a function of motor velocities, not of joint velocities.
 
-        In a differential, the motors turn by the sum and the difference of both joint velocities.
+        The motors of this differential turn at the sum and at the difference of the two joint velocities.
         """
         joints = [coordinate(damping=0.3, friction=0.2), coordinate("b", damping=0.1, friction=0.4)]
         bodies = [

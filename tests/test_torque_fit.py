@@ -831,9 +831,10 @@ def test_a_spring_that_bodies_could_absorb_is_found(emitted, robots):
 
 
 def test_bodies_absorb_no_more_than_a_torque(emitted):
-    """The projection of a torque onto the rigid bodies never exceeds this torque.
+    """No eigenvalue of the projection of a joint's torque onto the rigid-body parameters is larger than 1.
 
-    The projection uses the covariance for the current noise; with another covariance it could exceed the torque.
+    The projection uses the posterior covariance for the current noise. The covariance for a larger noise would be too
+    large, and the rigid bodies would absorb more than the torque.
     """
     model = emitted["two_link"][0].Model()
     samples = TorqueSamples.of([recorded(model, 6.0, 0.05)])
@@ -907,9 +908,9 @@ def test_a_model_states_its_residual_terms(robots):
 
 
 def test_functions_of_a_joint_and_bodies_are_fitted_together(emitted, robots):
-    """Residual terms and rigid bodies are fitted together: varying friction, ripple, and a spring like gravity.
+    """Rigid bodies are accurate although friction depends on position, torques ripple, and a spring resembles gravity.
 
-    Fitted one after the other, each term would explain torque of the other terms.
+    Bodies and residual terms are fitted together. Fitted one after the other, each would absorb torque of the others.
     """
     true = drawn(emitted["six_dof"][0], seed=3, deviation=0.3)
     scale = recorded(true, 20.0, 0.0).tau.std(axis=0)

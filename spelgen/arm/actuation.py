@@ -1,7 +1,8 @@
-"""Input matrix G of M qdd + ... = G tau, from the transmissions of the URDF and the settings.
+"""Input matrix G of the equation of motion, from the transmissions of the URDF and the settings.
 
-tau are the logged torques: joint torques, or motor torques if the settings specify ``torque: motor``. In the second
-case G contains the gear ratios and the couplings of motors that drive several joints, as in many wrists.
+G converts logged torques tau to joint torques: M qdd + ... = G tau. G is the identity if joint torques are logged. If
+the settings specify ``torque: motor``, motor torques are logged, and G contains the gear ratios and the couplings of
+motors that drive several joints, as in many wrists.
 """
 
 from __future__ import annotations

@@ -241,22 +241,21 @@ class Placement:
         return Frame(frame.body, composed, self._in_body(frame.body, composed), position)
 
     def _without_rounding_errors(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Return a joint's position (3,) [m] in the parent body, without tiny components due to rounding errors.
+        """Return the position (3,) [m] of a joint in its parent body, with tiny components in both frames set to 0.
 
-        Example: an offset of (0.1, 0.1, 0) along an axis at 45 degrees is not exactly parallel to the rational
-        approximation of the axis. Tiny components are set to 0 along the axes of the joint's frame, then along the axes
-        of the body's frame. If the second step changes the components in the joint's frame again, the zeros in the two
-        frames contradict each other, and ``position`` is returned unchanged.
+        The two frames are the joint's and the parent body's. The caller has set tiny components of ``position`` in the
+        body's frame to 0. Tiny components in the joint's frame are also due to rounding. Example: an offset of
+        (0.1, 0.1, 0) along an axis at 45 degrees is not exactly parallel to the rational approximation of the axis.
+        If the components cannot be 0 in both frames at once, ``position`` is returned unchanged.
 
         Args:
             rotation: exact rotation (3, 3) of the joint's frame in the frame of the parent body.
-            position: exact position (3,) [m] in the frame of the parent body; its tiny components in this frame are 0
-                already.
+            position: exact position (3,) [m] in the frame of the parent body.
         """
         in_own_frame = self._rounding.position(rotation.T @ position)
-        # Tiny components are set to 0 in the joint's frame (above) and in the body's frame (`moved`): a rounding error
-        # in either frame would make a zero entry of M nonzero. `moved` is used only if its components in the joint's
-        # frame are unchanged: otherwise the zeros in the two frames contradict each other.
+        # `in_own_frame` is the position in the joint's frame, with tiny components set to 0. `moved` is this position
+        # in the body's frame, again with tiny components set to 0: a rounding error in either frame would make a zero
+        # entry of M nonzero. `moved` is returned only if the second step preserves the zeros in the joint's frame.
         moved = self._rounding.position(rotation @ in_own_frame)
         return moved if np.array_equal(rotation.T @ moved, in_own_frame) else position
 

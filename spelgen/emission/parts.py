@@ -45,7 +45,7 @@ FUNCTIONS, CONSTANTS, MASS_ENTRIES = Code("FUNCTIONS"), Code("CONSTANTS"), Code(
 
 @dataclass(frozen=True)
 class NetworkTuning:
-    """Constants of untrained networks: numbers of hidden units, and the scale of inputs."""
+    """Constants with which networks are built, before training: numbers of hidden units, and the scale of inputs."""
 
     # [1] Factor of the inputs of friction networks that encode positions, such as cos q and sin q. The other inputs are
     # velocities, divided by typical speeds. The factor is below one, so that an untrained network depends less on

@@ -77,7 +77,7 @@ def _joined(definitions: Iterable[Definition]) -> str:
 
 @cache
 def load_runtime() -> Runtime:
-    """Return the definitions and imports of all files of ``spelgen.runtime``."""
+    """Return the source of ``spelgen.runtime``: its import statements, and its definitions in order of dependence."""
     texts = {
         path.name.removesuffix(".py"): path.read_text(encoding="utf-8")
         for path in (files("spelgen") / "runtime").iterdir()

@@ -45,9 +45,9 @@ def export_torch(trained: Trained) -> Exported:
 
 
 def prepared(trained: Trained) -> PreparedModel:
-    """Return a copy of the model, the source of torch and ONNX programs.
+    """Return the model in the form that `torch.export` converts to torch and ONNX programs.
 
-    It has precomputed parameters, the kinematics of the tip, and the number type of the programs.
+    It is a copy with precomputed parameters, the kinematics of the tip, and the number type of the programs.
     """
     dtype = torch.float32 if trained.float32 else torch.float64
     return PreparedModel(trained.model, tip_kinematics(trained.arm), dtype=dtype)

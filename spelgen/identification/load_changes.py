@@ -195,12 +195,12 @@ def _change(
     time: float,
     joint: int | None,
 ) -> tuple[float, TorqueChange]:
-    """Return the evidence for a change of the logged torques from `time` on, and the change: another factor or offset.
+    """Return the evidence for a change of the logged torques at `time`, and the change: a new factor or a new offset.
 
-    Two other hypotheses are another load, or other friction with drifting offsets, from `time` on. The evidence is the
-    negative log likelihood of the better of these two minus the negative log likelihood of the change; 0 if the change
-    does not explain the torques. fit: fit of `problem` without a change. torque: torques of the model of `fit`, (S, n)
-    [Nm, N]. recording, time, joint: see `TorqueChange`.
+    The evidence is the difference of two negative log likelihoods: the value of the best alternative minus the value of
+    the change. The alternatives are another load from `time` on, and other friction from `time` on with drifting
+    offsets. The evidence is 0 if the change does not explain the torques. fit: fit of `problem` without a change.
+    torque: torques (S, n) [Nm, N] predicted by `fit`. recording, time, joint: see `TorqueChange`.
     """
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]

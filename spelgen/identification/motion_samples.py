@@ -26,8 +26,8 @@ from spelgen.logs.dynamics_samples import (
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
 
-# [samples at 100 Hz] Times around a sample at which signals are stored for it: every 20 ms. The signals are low-pass
-# filtered, so that they can be interpolated between these times.
+# [samples at 100 Hz] To test delays, each sample stores its signals also at these times before and after it, every
+# 20 ms. Values between these times can be interpolated, because the signals are low-pass filtered.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
 # [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
 ENDS = 3
@@ -106,9 +106,9 @@ class MotionSamples(NamedTuple):
 
     @property
     def longest_delay(self) -> float:
-        """Largest time [s] before or after a sample for which `values` contains signals: the last of `OFFSETS`.
+        """Longest delay [s] that can be tested with `values`, the signals at times before and after each sample.
 
-        It is 0 if `values` contains only the signals at the time of the sample itself (E = 1).
+        It is 0.16 s, the largest time in `OFFSETS`, or 0 if `values` contains only the signals at the sample's time.
         """
         return float(OFFSETS[-1]) / FREQUENCY if self.values.shape[3] > 1 else 0.0
 
@@ -203,7 +203,7 @@ class DriveLog:
         moving = np.flatnonzero(is_moving(inner.qd))
         while (
             len(moving[:: self._every]) > 2 * HINTS.samples
-        ):  # samples are removed first: the signals around all samples of a log of hours would need gigabytes
+        ):  # before signals at E times are stored per sample: for all samples of a long log they need gigabytes
             self._thin()
         signals = np.stack([samples.q, samples.qd, samples.qdd, samples.tau @ self._inputs.T], axis=2)
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")

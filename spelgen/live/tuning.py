@@ -121,7 +121,8 @@ class LiveTuning:
     # last body at the distance `distance` from the origin.
     radius: float = 0.2
     distance: float = 0.05
-    # [kg] Masses of the prior means of a payload. Each has the same prior probability.
+    # [kg] The prior of a payload is a mixture of distributions with equal probabilities. Each number is the mass of the
+    # ball that is the mean of one distribution.
     scales: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
     # [1] Limits of the log odds of "no payload" against a payload. A payload is reported if the log odds are at most
     # `payload_odds`, "no payload" if they are greater than `no_payload_odds`. Between the limits, the status is "not

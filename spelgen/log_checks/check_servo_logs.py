@@ -420,7 +420,8 @@ def _command_faults(
         following: tracking of the commands in a recording.
         log: the recording.
         joints: names of all joints.
-        is_only: True if there are no other recordings.
+        is_only: True if there are no other recordings. With other recordings, a single joint that moves like the
+            command of another joint is no finding: it may be chance in one recording.
     """
     faults = dict[int, CommandFault]()
     correlations, mapping = following.correlation.diagonal(), log.mapping

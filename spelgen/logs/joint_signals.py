@@ -138,7 +138,7 @@ class JointSignals(NamedTuple):
         return values[:, self.number] if values.size else np.zeros(0)
 
     def raw(self, quantity: str) -> np.ndarray:
-        """Return the joint's signal in the unit of the log, (T,)."""
+        """Return the joint's signal "q", "qd", "tau" or "u" as logged, (T,): without the mapping's unit and offset."""
         mapping = self.trajectory.mapping
         values = self.signal(quantity) - mapping.offset(quantity, self.joint)
         return np.asarray(values / mapping.scale(quantity, self.joint))

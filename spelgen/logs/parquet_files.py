@@ -217,11 +217,11 @@ def _require_times(file: Path, fps: float) -> None:
 def _with_scale(
     folder: Path, files: Sequence[Path], joints: Sequence[str], mapping: LogMapping
 ) -> tuple[LogMapping, tuple[str, ...]]:
-    """Return the mapping with the unit of the positions in a LeRobot data set, and remarks on the unit.
+    """Return `mapping`, completed by the unit of the positions in a LeRobot data set, and remarks on the unit.
 
     By default LeRobot normalises the calibrated range of each motor to -100..100; degrees or radians are options. The
-    data set does not state the unit, which is therefore derived from the largest value. Raises LogError for values that
-    may be normalised, if neither a unit nor a calibration is given.
+    data set does not state the unit. A largest value above 2 pi and at most about 100 may be normalised: the motors'
+    calibration then converts the positions, unless `mapping` states a unit. Raises LogError if neither is known.
     """
     # `largest` is the largest magnitude of the positions of the arm's joints. Other elements of the state are not used:
     # they may belong to a gripper, or be velocities.

@@ -20,10 +20,10 @@ from spelgen.runtime.rows import Constant, Function, Joint, vector
 
 
 class LinearMass(nn.Module):
-    """Base class of mass matrices M whose entries are linear in learned functions of q and in constants.
+    """Base class of mass matrices M(q) whose entries are linear in functions f_j(q) and in constants c_k.
 
-    This class has the trained constants and the armature (rotor inertia, added to the diagonal of M). Derived
-    classes add the functions of q, if there are any.
+    This class has the trained constants c_k and the armature (rotor inertia, added to the diagonal of M).
+    Derived classes add the learned functions f_j(q), or have none.
     """
 
     parameter_groups = (
@@ -211,11 +211,11 @@ class DerivedMass(LinearMass):
         return self.network.vjp(network, (half.unsqueeze(-1) * qd.unsqueeze(-2)).flatten(-2))
 
     def jvp(self, rate: Tensor, intermediates: tuple[Intermediates, Tensor]) -> Tensor:
-        """Return the time derivative of the mass matrix M' = C + t (M - C), (..., n, n).
+        """Return the rate of change of the positive definite mass matrix C + t (M - C), (..., n, n).
 
-        M is the network's matrix. C, the constant nominal matrix, and t, a piecewise constant factor,
-        make M' positive definite (see the class). rate: time derivative of the encoding of q (see
-        ``JointEncoding``), (..., 2 n) [1/s]. intermediates: second result of ``forward`` at q.
+        It is t times the rate of change of the network's matrix M: the nominal matrix C is constant, and
+        the factor t (1, 1/2, 1/4, ...) changes only in steps. rate: time derivative of the encoding of q
+        (see ``JointEncoding``), (..., 2 n) [1/s]. intermediates: second result of ``forward`` at q.
         """
         network, fraction = intermediates
         rows = fraction.unsqueeze(-1) * self.network.jvp(network, rate)
@@ -351,9 +351,10 @@ class DenseMass(nn.Module):
         _, factor, moved, scale = intermediates
         speed = moved @ qd.unsqueeze(-1)
         momentum = speed / scale.unsqueeze(-1)
-        # M = (U^-1 A)^T diag(1 / e) U^-1 A, with a constant A. The kinetic energy T = 1/2 qd^T M qd is
-        # therefore the sum of w^2 / (2 e), with w = U^-1 A qd (`speed`). With p = w / e (`momentum`),
-        # dT/dU = -U^-T p w^T and dT/de = -p^2 / 2.
+        # M = (U^-1 A)^T diag(1 / e) U^-1 A, see the class: A is constant, and the network gives e > 0 and
+        # the lower triangular U (`factor`). The kinetic energy T = 1/2 qd^T M qd is therefore the sum of
+        # w^2 / (2 e), with w = U^-1 A qd (`speed`). With p = w / e (`momentum`), dT/dU = -U^-T p w^T and
+        # dT/de = -p^2 / 2.
         by_factor = -self._unit_solved(factor.mT, momentum, upper=True) @ speed.mT
         by_entry = by_factor.flatten(-2).index_select(-1, self.below)
         # For e = softplus(s) of a network output s, de/ds = 1 - exp(-e) = -expm1(-e).

@@ -15,13 +15,13 @@ SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """Parameter cache of ``FrictionLaws``: constants of all joints, (n,), and of K bristles each, (n, K).
+    """Parameter cache of ``FrictionLaws``: constants >= 0 of n joints, (n,), or of K bristles each, (n, K).
 
-    All constants are in SI units and >= 0. All torques except ``min_load`` are 0 at joints without
-    friction.
+    At joints without friction, the constants in Nm (N) are 0, except ``min_load``, which is no friction
+    torque: it smooths the gravity torque.
     """
 
-    viscous: Tensor  # viscous friction coefficient [Nm s/rad, N s/m]
+    viscous: Tensor  # coefficient of the viscous friction, a torque per velocity [Nm s/rad, N s/m]
     saturation: Tensor  # limit of the saturating viscous friction [Nm, N]
     saturation_velocity: Tensor  # velocity scale of the saturating viscous friction [rad/s, m/s]
     coulomb: Tensor  # Coulomb friction [Nm, N]
@@ -200,8 +200,8 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        # Without bristles there are no fractions to train: the parameter is replaced by an empty buffer,
-        # (n, 0).
+        # Without bristles there are no fractions to train. The parameter is replaced by the buffer `reach`
+        # of break-away displacements, which has the required shape: (n, 0) for no bristles.
         self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:

@@ -99,16 +99,17 @@ class Expansion:
         )
 
     def polynomial(self, element: Deferred | int, parameter: int) -> fmpq_mpoly:
-        """Return the coefficient of an inertial parameter in an entry of M or the potential energy V, as a polynomial.
+        """Return the coefficient of one inertial parameter in an entry of M, or in the potential energy V.
 
-        The variables of the polynomial are cosines, sines and lengths that depend on the joint positions.
+        M and V are linear in the inertial parameters. The coefficient is a polynomial in s1, c1, q1, s2, ...: sines,
+        cosines and positions of the joints (see the class).
 
         Args:
-            element: the entry as a tree of recorded operations, from ``energies``, or the integer 0 for a zero entry.
-            parameter: index of the inertial parameter, 10 body + i.
+            element: the entry of M, or V, as recorded operations from ``energies``; the integer 0 for a zero entry.
+            parameter: index of the inertial parameter: 10 k + i for parameter i of body k, both from 0.
 
         Raises:
-            TooLarge: more multiplications are needed than this object permits.
+            TooLarge: the polynomials need more multiplications than ``budget``.
         """
         # The keys of `values` are the id() of recorded operations: a subexpression that occurs twice is computed once.
         values: dict[int, Value] = {}

@@ -40,10 +40,10 @@ def select_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParamet
 
 
 def without_small_dead_zones(problem: ServoProblem, x: ServoParameters) -> ServoParameters:
-    """Return x with small dead zones set to zero and excluded from the fit.
+    """Return x with small dead zones set to zero and excluded from the fit; its other parameters are unchanged.
 
-    A dead zone is small if half its width [rad, m], the parameter, is below `TUNING.min_dead_zone`. This bound is about
-    the resolution of encoders: smaller dead zones cannot be measured. The other parameters of x are unchanged.
+    A dead zone is small if its half width [rad, m] is at most `TUNING.min_dead_zone`. This bound is about the
+    resolution of encoders: smaller dead zones cannot be measured.
     """
     row, joints, active = problem.parameters.row(DEAD_ZONE), x.joints.clone(), x.active.clone()
     active[row] &= joints[row] > TUNING.min_dead_zone
@@ -72,7 +72,8 @@ def _joint_minima(problem: ServoProblem, x: ServoParameters) -> tuple[ServoParam
         candidate_errors = problem.residual(candidate)
         candidate_costs = problem.joint_costs(candidate, candidate_errors)
         better = active & (candidate_costs < costs)
-        # The fit of a joint ends after a step that lowers the joint's cost by less than `min_decrease`.
+        # A joint is no longer fitted (`active` becomes False) after a step that lowers its cost by less than
+        # `min_decrease`. A step that raises the cost is rejected, and the next one is tried with more damping.
         active &= ~better | (costs - candidate_costs >= TUNING.min_decrease)
         x = replace(x, joints=torch.where(better, candidate.joints, x.joints))
         errors = torch.where(better, candidate_errors, errors)
