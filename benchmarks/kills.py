@@ -2,9 +2,9 @@
 
     python benchmarks/kills.py [--kills 50] [--servos]
 
-The training uses AdamW on few windows and ends at the number of epochs, not by convergence. With --servos it is a fit
-of position servos, which ends by convergence. Each kill is a SIGKILL, which cannot be caught, after a random time since
-the process began to write. `make bench` takes 5 kills.
+The training uses AdamW on few windows, and ends at a fixed number of epochs. With --servos, it is a fit of position
+servos, which ends by convergence. Each kill is a SIGKILL, which a process cannot catch. It is sent at a random time
+after the process has first written to the run folder. `make bench` takes 5 kills.
 """
 
 from __future__ import annotations

@@ -40,8 +40,9 @@ def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
 def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
     """Return the table of nMSE per method, with a row for each cell (fold, duration, group of test recordings).
 
-    Folds with a training recording of one motion and a test recording of another, the motion pairs, share one row per
-    arm and duration. It has the median over the pairs, per method. The last column has `ratio_to_best` or its median.
+    A motion pair is a fold that is trained on one motion and tested on another. All motion pairs of an arm and a
+    duration share one row with the median over the pairs. The last column is the error of `hybrid` divided by the
+    smallest error of the reference methods (`ratio_to_best`).
     """
     table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
     for (fold, seconds, group), errors in cells.items():

@@ -19,7 +19,7 @@ RIPPLE_PERIODS = (
     100,
     160,
 )  # periods of torque ripple per revolution of a joint: eccentric bearings, gear teeth, motors
-# [rad, m] lowest and highest displacement at which the hysteresis of a cable saturates; each joint has a random value
+# [rad, m] The hysteresis torque of a cable at a joint saturates after a displacement. Bounds of its random values.
 CABLE_BREAKAWAY = (0.05, 0.5)
 CURRENT_CORRELATION = 0.01  # [s] correlation time of the noise of the motor current
 BACKLASH_TORQUE = (

@@ -114,7 +114,10 @@ def ur10e(read: Read, folder: Path) -> None:
 
 
 def panda(read: Read, folder: Path) -> None:
-    """Write the Panda's log, with the torques of joint torque sensors."""
+    """Write the Panda's log from text files of its repository. Torques were measured by joint torque sensors.
+
+    read: function that returns the bytes of a file of the repository.
+    """
     log = "matlab/data/Exciting_Traj/Trajectory_1/rbt_log/exciting_traj_{}.txt"
     t, *rest = (numbers(read(log.format(x)), None) for x in ("time", "positions", "velocity", "torques"))
     q, qd, tau = (values.reshape(-1, 7) for values in rest)

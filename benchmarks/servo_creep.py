@@ -47,10 +47,11 @@ def holds(t: np.ndarray, command: np.ndarray) -> Iterator[slice]:
 
 
 def creep(log: spelgen.Trajectory, q: np.ndarray, step: float) -> list[tuple[int, float, float]]:
-    """Return (joint, measured creep, predicted creep) [rad] for each hold of each joint in a log (see `holds`).
+    """Return (joint, measured creep, predicted creep) [rad] for each hold in which a joint of a log is at rest.
 
-    Creep is the largest displacement from the position at the beginning of the hold. Holds with a measured creep of
-    more than one encoder step are omitted, since the joint has not stopped.
+    A hold is an interval with a constant command (see `holds`). Creep is the largest displacement from the position at
+    the beginning of the hold. A joint is at rest if its measured creep is at most one encoder step: more predicted
+    creep is then an error of the model.
 
     q: (T, n) predicted positions [rad]. step: resolution of the encoder [rad].
     """

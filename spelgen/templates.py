@@ -34,9 +34,9 @@ def _environment(autoescape: bool) -> Environment:
 
 
 def render(template: str, **context: object) -> str:
-    """Return the text of ``template``, in which the names of ``context`` are replaced by their values.
+    """Return the text of the Jinja template ``template``, with the values of ``context`` in place of their names.
 
-    An undefined name raises an error. HTML templates escape the values.
+    A name that is not in ``context`` raises an error. In HTML templates, special characters of the values are escaped.
     """
     return _environment(".html" in template).get_template(template).render(**context)
 

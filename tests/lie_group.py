@@ -40,7 +40,7 @@ def from_group(joint_types: Sequence[str], elements: Sequence[torch.Tensor]) -> 
 
 
 class GroupModel(Protocol):
-    """Attributes and methods of an emitted module that `group_rates` uses, with the shapes of the module."""
+    """Protocol of the models that `group_rates` accepts: attributes and methods of `Model` in emitted modules."""
 
     joint_types: tuple[str, ...]
 

@@ -60,10 +60,10 @@ def urdf(folder, *transmissions, sidecar=""):
 
 
 def inputs(path):
-    """Return {(row, column): (kind, value)} of the entries of the input matrix G that are not always zero, from 1.
+    """Return {(row, column): (kind, value)} of the entries of the input matrix G that are not always zero.
 
-    path: a URDF. value: joint torque per input. kind: "fixed"; "coupled" for motors that drive several joints; "gain"
-    for a trained entry, whose value is the initial value.
+    Rows and columns are counted from 1. value: joint torque per input. kind: "fixed"; "coupled" for motors that drive
+    several joints; "gain" for a trained entry, with its initial value. path: a URDF.
     """
     found = inspect(path).to_dict()["input_matrix"]["entries"]
     assert len(found) == 9

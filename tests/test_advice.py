@@ -122,7 +122,10 @@ def test_offset_of_angles_of_another_turn(arm, turn):
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 def test_angles_beyond_both_limits_are_of_no_other_turn(arm):
-    """If the angles of a joint span more than its range, no offset shifts all of them into it, and none is advised."""
+    """If the angles of a joint span more than the range of its limits, the message advises no offset of the zero.
+
+    No offset would shift all angles into the range.
+    """
 
     def wide(arm, rng):
         t, q = pick_and_place(arm, rng)

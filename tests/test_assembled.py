@@ -1,4 +1,7 @@
-"""Models assembled in memory, from thin modules (which import spelgen.runtime) and standalone ones are equal."""
+"""A model that is assembled in memory equals the model of a thin module and the model of a standalone module.
+
+A thin module imports spelgen.runtime, a standalone module contains its code.
+"""
 
 from dataclasses import replace
 from functools import cache

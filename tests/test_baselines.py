@@ -196,7 +196,10 @@ def digests(folder):
 
 
 def test_least_squares_is_kept_with_a_run_and_evaluated(robots, tmp_path):
-    """On logs of the URDF's own bodies, trained model and stored least squares both have negligible torque errors."""
+    """The least-squares model is stored with a run, and has a negligible torque error on a test log.
+
+    The logs are simulated with the inertias of the URDF.
+    """
     arm = load_arm(robots / "rpr.urdf")
     bodies = RegressorDynamics(arm.chain, urdf_parameters(arm.chain), np.full(3, 0.1), lambda qd, _: 0.5 * qd)
     names = [coordinate.name for coordinate in arm.chain.coordinates]

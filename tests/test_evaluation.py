@@ -186,7 +186,8 @@ def evaluated(run, logs, **options):
 def test_the_true_model_has_no_error_and_its_baseline_has(run):
     result = evaluated(run, run.parent / "logs")
     assert [(x.name, x.steps, x.windows) for x in result.horizons] == [
-        # windows begin two samples before a prediction, for predictors that use earlier samples
+        # The four logs have 25 samples each. A window has two samples before the prediction, for predictors that use
+        # earlier samples, and k + 1 samples for a prediction over k steps: 23 - k windows per log.
         ("1 step", 1, 4 * 22),
         ("10 steps", 10, 4 * 13),
         ("1 s", 20, 4 * 3),

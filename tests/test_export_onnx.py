@@ -108,7 +108,7 @@ def test_onnx_in_single_precision(tmp_path):
 
 
 def test_the_files_are_plain_onnx_of_equal_bytes(coupled, exported):
-    """Exported files have only standard operators and no path of this machine; two exports have equal bytes."""
+    """ONNX files have standard operators only, and no metadata of this machine; a second export has the same bytes."""
     files = {name: content for name, content in exported.files.items() if name.endswith(".onnx")}
     assert files["gravity.onnx"] == onnx_model(coupled[0].prepared(), "gravity")
     for content in files.values():

@@ -108,7 +108,7 @@ def test_bristles_are_passive():
 
 
 def test_energy_of_an_unforced_arm_never_rises(tmp_path):
-    """Without input, H with the stored energy of the bristles never increases along the motion of a closed-form rpr."""
+    """The energy H of the arm rpr, stored energy of the bristles included, never increases while no torque acts."""
     model = import_source(built("rpr", preset="closed-form")[0], tmp_path / "rpr.py").Model(seed=1)
     with torch.no_grad():
         model.friction.raw_stribeck -= 100.0

@@ -296,9 +296,9 @@ def test_a_log_that_begins_in_motion_begins_without_a_contact(arm, levels, run):
 
 
 def test_delayed_torques_are_compared_with_the_motion_of_their_time():
-    """Torques that are logged 15 ms late are compared with the motion 15 ms earlier.
+    """If torques are logged 15 ms late, the fit finds the delay, and external torques are estimated with it.
 
-    The fit finds the delay; without it, the motion would cause wrong external torques.
+    Without the delay, the estimated external torques would be at least twice as large, although there is no contact.
     """
     urdf, late = ROBOTS / "two_link.urdf", 3
     model = moved_model("two_link", "closed-form", 0.03).double()

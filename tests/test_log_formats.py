@@ -829,7 +829,10 @@ OF_ROW = {
 @pytest.mark.parametrize("rows", OF_ROW)
 @pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet"])
 def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, suffix):
-    """Rows with other joint names, or in another order, never change the values of the arm's joints."""
+    """Each value is assigned by the joint name in its row, if rows have other names or their joints in another order.
+
+    The values of grippers, hands and other arms in the same log are ignored.
+    """
     t = 0.01 * np.arange(40)
     q = np.stack([np.sin(5 * t), 2 + np.cos(7 * t)], axis=1)
     log = []

@@ -157,7 +157,7 @@ def test_the_line_that_is_named_mends_the_log(arm, fault, tmp_path):
 
 
 def test_two_reversed_joints_are_not_taken_for_a_third(shared):
-    """The error names both reversed joints, although the best single correction reverses the torque of one joint."""
+    """If two joints are reversed, the error names both, although correcting only the torque of one joint also helps."""
     arm = load_arm(shared / "arms" / "doosan_m1013.urdf")
     wrong = flipped(flipped(recorded(arm, 0), 1, True, False), 4, True, True)
     error = told(arm, wrong)

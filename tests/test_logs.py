@@ -357,9 +357,10 @@ def test_a_velocity_of_the_motors_of_a_coupled_wrist_is_named(matrix, formula):
 
 
 def test_times_that_contradict_all_velocities_get_the_rate_of_the_velocities(tmp_path):
-    """If all velocities contradict the times, the advised `sample_rate` restores the right times.
+    """If the velocities of all joints contradict the time stamps, the error advises the right `sample_rate`.
 
-    The log was recorded at 100 Hz, and its time stamps have another rate.
+    The time stamps of the log are 2.5 times as far apart as its samples. A log that is read with the advised rate
+    passes the checks.
     """
     sound = swing()
     write_logs(tmp_path / "x.csv", [replace(sound, t=2.5 * sound.t)], JOINTS)

@@ -101,7 +101,6 @@ def arm_like(robots, seed):
 
 
 def base_values(model):
-    """Return the values of the base parameters of a model's bodies and armatures."""
     with torch.no_grad():
         constants = torch.cat([model.inertial_parameters.flatten(), model.armature])
     return (base_combinations(model.chain, motors_of(model))[1] @ constants).tolist()

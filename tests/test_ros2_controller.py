@@ -152,7 +152,8 @@ def test_a_preceding_controller_is_tracked(arm):
     assert np.abs(qd[0]).max() > 0.3
     assert np.abs(qd[-1]).max() < 1e-3
     # The preceding controller may write only positions: velocities and accelerations are NaN here. The reference on the
-    # topic, 1 rad away, is ignored in chained mode. It counts after this mode, and is too far away.
+    # topic is 1 rad away from the arm. It is ignored in chained mode; after chained mode ends, it is used, and causes
+    # damping because of its distance.
     controller.reference(simulated.q + 1.0)
     controller.write(simulated.q, [np.nan] * 4)
     controller.update(simulated.q, simulated.qd)

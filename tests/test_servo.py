@@ -69,7 +69,7 @@ def fitted(arm, logs, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(fitted, logs):
-    """Return the evaluation of the fit on the log that was not in the training."""
+    """Return the evaluation of the fitted model on the last log, which was not used for the fit."""
     return spelgen.evaluate(fitted, logs[5:])
 
 

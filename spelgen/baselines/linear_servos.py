@@ -63,7 +63,9 @@ class LinearServos:
 def linear_response(
     q: np.ndarray, qd: np.ndarray, u: np.ndarray, dt: float, frequency: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return the positions of second-order servos, the exact solution for commands that are constant in each interval.
+    """Return the positions of independent servos with q'' = frequency^2 (u - q) - 2 damping frequency q'.
+
+    The solution is exact for commands u that are constant in each interval.
 
     Args:
         q: (..., n) initial positions [rad, m].

@@ -44,7 +44,8 @@ def roll_out_stiff(
         disturbance: constant disturbance in each window, (W, n), see `_stepper`; None: no disturbance.
     """
     q, qd = windows.q[:, 0], windows.qd[:, 0]
-    # `windows.z` may be the friction state of another model. Dynamics whose friction has no state do not use it.
+    # All predictors share the windows. Their initial friction state `windows.z` is only for dynamics with a friction
+    # state; other dynamics get an empty state.
     z = windows.z if windows.z is not None and is_stateful(dynamics) else sliding_memory(dynamics, qd)
     largest = windows.qd.abs().amax(dim=(0, 1))
     largest = torch.maximum(largest, 1e-3 * largest.max()).clamp(min=1e-2)
@@ -60,7 +61,8 @@ def roll_out_stiff(
         inside = ((qd.abs() <= TUNING.bounds * largest) & q.isfinite()).all(dim=-1, keepdim=True)
         if not inside.any():
             break
-        # A diverged state becomes NaN, which propagates to all later samples.
+        # The state of a window that has diverged (velocity out of bounds, or not finite) becomes NaN. All later states
+        # of the window are then NaN, too.
         q, qd = torch.where(inside, q, torch.nan), torch.where(inside, qd, torch.nan)
         positions[:, k], velocities[:, k] = q, qd
     return positions, velocities

@@ -251,7 +251,7 @@ def _remark(diagnostic: Diagnostic) -> str:
 
 
 def range_text(coordinate: Coordinate) -> str:
-    """Return the position limits of a joint as text with unit, or "continuous" or "no limits"."""
+    """Return the position limits of a joint as text, such as "-1.5 .. 1.5 rad", "continuous" or "no limits"."""
     if coordinate.continuous:
         return "continuous"
     if coordinate.lower is None or coordinate.upper is None:

@@ -151,9 +151,10 @@ def differences_of_reading(robot: Robot, arm: Chain, seed: int) -> dict[str, tup
 
 
 def _pinocchio_dynamics(robot: Robot, arm: Chain) -> PinocchioDynamics:
-    """Return the dynamics of the URDF as Pinocchio reads it.
+    """Return the dynamics of the arm, computed by Pinocchio from the URDF file of `robot`.
 
-    Raises ValueError if the file has changed, or if a mass is negative: Pinocchio would use another mass.
+    Raises ValueError if the file has changed since `robot` was read, or if a link has a negative mass, which Pinocchio
+    would replace by another value.
     """
     if any(link.inertial is not None and link.inertial.mass < 0 for link in robot.links):
         raise ValueError("negative mass of a link")

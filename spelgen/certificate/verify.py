@@ -260,15 +260,15 @@ def _smallest_form(structure: Structure, samples: numeric_samples.NumericSamples
 def _ranks(structure: Structure, samples: numeric_samples.NumericSamples) -> Iterator[_DerivedFact]:
     """Yield facts about the number of terms in the minimal form of M, each with the matrix rank that it must equal.
 
-    M is a sum of terms: outputs are the functions f_j(q), constants the terms c_k, each times a constant matrix. All
-    terms are linearly independent. The matrices have one column per entry of M and rows from `samples`: M at random
-    positions q, or the change M(q') - M(q), with q' equal to q except for one joint, which is at another random
-    position.
+    The minimal form is M(q) = sum of f_j(q) A_j + sum of c_i B_i, with constant, linearly independent matrices A_j and
+    B_i. The functions f_j are called outputs, the numbers c_i constants. The ranks are of two matrices with a column
+    per entry of M: the rows of the first are M at random positions q. The rows of the second are changes M(q') - M(q),
+    for which one joint moves to another random position.
 
-    1. The number of outputs must be the rank of all changes of M, one row per position and moved joint.
-    2. The number of outputs and constants must be the rank of M itself, one row per position.
-    3. For each k, the number of outputs that depend on any of the first k joints must be the rank of the changes of M
-       for which one of these joints moves.
+    1. The number of outputs must be the rank of the changes.
+    2. The number of outputs and constants together must be the rank of the values of M.
+    3. For each number k of joints, the number of outputs that depend on any of the first k joints must be the rank of
+       the changes for which one of these k joints moves.
     """
     changes, outputs = samples.changes, len(structure.outputs)
     width = changes.shape[-1]

@@ -22,8 +22,8 @@ from spelgen.labels import counted, printable
 
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
-INTERRUPTED = 130  # Shells use the exit code 128 + signal number; SIGINT is 2.
-BROKEN_PIPE = 141  # Shells use the exit code 128 + signal number; SIGPIPE is 13.
+INTERRUPTED = 130  # exit code after Ctrl-C, as in shells: 128 + 2, the number of the signal SIGINT
+BROKEN_PIPE = 141  # exit code if the reader of a pipe has ended, as in shells: 128 + 13, the number of SIGPIPE
 
 # {optional package: group of dependencies ("extra") of spelgen that installs it}, for the error if it is absent
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}
@@ -146,7 +146,7 @@ def say(text: str) -> None:
 
 
 def note(text: object) -> None:
-    """Print progress, a diagnostic or an error to stderr."""
+    """Print a message to stderr: progress, a diagnostic or an error."""
     print(printable(with_addresses(str(text)), "\n"), file=sys.stderr, flush=True)
 
 

@@ -41,9 +41,9 @@ class Study:
     estimates: dict[str, float]
 
     def announcement(self, parallel: int) -> str:
-        """Return a text with the number of runs, and the estimated duration of the unfinished runs.
+        """Return a text with the number of runs, such as "12 runs (2 arms, 3 presets, ...)", and the estimated time.
 
-        parallel: number of runs at the same time.
+        The time is an estimate for all unfinished runs, `parallel` of which run at the same time.
         """
         dimensions = zip(*((job.arm, job.design, job.seed, job.split) for job in self.jobs), strict=True)
         nouns = ("arm", "preset", "seed", "split")

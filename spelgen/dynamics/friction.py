@@ -191,5 +191,5 @@ class FrictionModel:
             effects.append(sign * np.exp(-((speed / 0.1) ** 2)))
         if self.polynomial:
             effects += [speed * np.abs(speed), speed**3]
-        # The columns have the order of the property `effects`.
+        # The rows of the result, (..., effects, n), have the order of the property `effects`.
         return np.stack(effects, axis=-2)

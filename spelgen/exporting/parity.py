@@ -231,9 +231,9 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return the velocity limits of the joints in the URDF, (n,) [rad/s, m/s], to scale random velocities.
+    """Return a speed per joint, (n,) [rad/s, m/s], by which random test velocities are multiplied.
 
-    Joints without a limit have the speed limit of exciting motions.
+    It is the velocity limit in the URDF. Joints without a limit have the speed limit of exciting motions.
     """
     return np.array([joint.velocity or SPEEDS[joint.joint_type] for joint in coordinates])
 

@@ -168,10 +168,10 @@ def _scale(mean_square: Tensor) -> Tensor:
 def rollout_errors(
     model: ArmModel, windows: Windows, scales: LossScales, substeps: int, solver: Solver = "rk4"
 ) -> Tensor:
-    """Return the errors of the rollout in units of ``scales``, (W, K-1, 2n): n positions, then n velocities.
+    """Return predicted minus measured states, divided by ``scales``, (W, K-1, 2n): n positions, then n velocities.
 
-    There are W windows of K samples; the first sample of a window is the initial state and has no error. substeps,
-    solver: see `roll_out`.
+    There are W windows of K samples. The prediction of a window begins at its first sample, which has no error.
+    substeps, solver: see `roll_out`.
     """
     q, qd = roll_out(model, windows, substeps, solver)
     position = position_difference(q, windows.q[:, 1:], model.joint_types) / scales.q

@@ -65,8 +65,8 @@ class ZeroOffset(Fault):
         # determine which of the two is right: both are candidates.
         if not candidates or abs(offset - right)[0] > GEOMETRY.serious_angle:
             candidates.append(problem.fit(shifted(offset.round(4))))
-        # An offset must lower the torque residual (misfit). If it lowers only the prior term, it only replaces a change
-        # of the masses, whose values in the URDF are uncertain.
+        # An offset must lower the torque residual (`misfit`), and not only the prior term of the cost. If it lowers
+        # only the prior term, other masses than in the URDF explain the torques equally well without the offset.
         for fit in candidates:
             change = (fit.hypothesis.offset - reading.offset)[joint]
             if abs(change) >= min_offset and fit.misfit <= base.misfit - GEOMETRY.needed / 2:

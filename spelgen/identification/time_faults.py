@@ -34,8 +34,8 @@ class Delay(Fault):
 
         The sets (`_delayed_signals`) are the torques of all joints, and the motion, the torque or both of one joint.
         Each fit has the best delay of its set. Delays below `GEOMETRY.min_delay` are omitted: friction causes such
-        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if samples have
-        signals only at their own times, between which delayed signals cannot be interpolated.
+        apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if the samples
+        do not contain the signals at earlier and later times, which delayed signals need.
         """
         reading, longest, reference = base.hypothesis, problem.samples.longest_delay, base
         if not longest or reading.delay.any():

@@ -368,13 +368,14 @@ class PositionUnit(WrongScale):
 
 
 def position_factors(arm: Chain, scale: np.ndarray) -> list[np.ndarray]:
-    """Return candidates for factors (2, n) that correct the unit of the positions of all joints of one type.
+    """Return candidates for factors (2, n) on the signals of the joints that correct a wrong unit of the positions.
 
-    The first row of a candidate has factors on the positions and velocities, the second row factors on the torques,
-    which are 1. There is one candidate per joint type and unit that differs from the unit in the mapping.
+    A candidate corrects all revolute joints, or all prismatic joints, as if their positions were logged in another unit
+    than the mapping of the log states. Row 0 has the factors on positions and velocities, 1 for joints of the other
+    type. Row 1 has the factors on torques: all are 1.
 
-    scale: (n,) factor from logged positions to SI units in the current mapping; negative for joints with the setting
-    `sign: -1`.
+    scale: (n,) factors that the mapping specifies, from logged positions to SI units; negative for joints with the
+    setting `sign: -1`.
     """
     types, candidates = np.array(arm.joint_types), []
     for joint_type, units in UNITS.items():

@@ -247,8 +247,8 @@ def _likelihood(
     # white noise.
     prior = np.stack([np.full_like(scale, TUNING.friction), 4 * scale, scale * ratio], axis=-1)
     for blocks in segments:
-        # With drifts=False, joints at rest update no state of the filters: only the noise of joints in motion is
-        # estimated.
+        # The option `drifts` of the filters is False by default: samples of joints at rest then change no state. Here
+        # only the noise of joints in motion is estimated.
         filters = JointFilters(prior, scale, constant)
         for block in blocks:
             residual, expected = filters.update(block, block.y)

@@ -101,9 +101,10 @@ def _joined(notes: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
 def require_sound_logs(
     logs: Sequence[Trajectory], arm: Arm, mapping: LogMapping | None = None
 ) -> list[Diagnostic]:
-    """Check logs; return the findings that concern the arm. Raises LogError if the logs cannot be used for training.
+    """Check logs before a fit; return the findings that depend on the arm, such as a link with a wrong mass.
 
-    A fit calls this function before it uses the logs.
+    All other findings are omitted, since the fit reports them itself. Raises LogError if the logs cannot be used for
+    training. mapping: see `check_logs`.
     """
     # the command `spelgen logs` makes the same checks, so that training and the command reject the same logs
     report = check_logs(logs, arm, mapping)

@@ -315,10 +315,12 @@ class ServoLogs:
             summary.extend([geometry_finding(problem, self._logs[0].mapping, unchanged, better)])
 
     def _geometry_problems(self) -> list[GeometryProblem]:
-        """Return the least-squares problems of the torques kp (u - q), with an unknown gain kp of each servo.
+        """Return least-squares problems that test hypotheses about the log, such as a reversed joint.
 
-        There is one problem per delay of the command in `COMMAND_DELAYS`; a delay at which u = q in all samples is
-        omitted. [] is returned for too few samples. The friction terms include the damping of the servos.
+        Each problem fits the equation of motion to the torques kp (u - q) of position servos. Unknowns are the inertial
+        parameters, the friction, which includes the damping of the servos, and the gain kp of each servo. There is one
+        problem per delay of the command u in `COMMAND_DELAYS`, except delays for which u = q in all samples, and none
+        for too few samples.
         """
         chain, alone = self._arm.chain, np.eye(len(self._names))
         collected = DriveLog(chain.joint_types, Drives(alone, alone), Preprocessing())

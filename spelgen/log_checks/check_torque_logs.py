@@ -110,9 +110,9 @@ class TorqueLogs:
         evidence = self._evidence(reports, motion)
         completed = [joint.report for joint in evidence]
         moving = self._moving.samples()
-        # The model is fitted only to logs without errors: after an error, a hypothesis about the log may be wrong. An
-        # exception are the errors of earlier checks that guess the unit of positions from their range: if the torques
-        # determine the unit, they are replaced by an error that states this unit.
+        # The model is fitted only if earlier checks found no errors: an error, such as jumps, may make a wrong
+        # correction of the log fit best. Errors about the unit of positions, which is only guessed from their range,
+        # are no obstacle: if the fit to the torques determines the unit, an error with this unit replaces the guess.
         self._guessed = summary.guessed
         guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
         is_sound = bool(guesses) or not summary.errors
@@ -475,9 +475,9 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             axis = np.tensordot(of_urdf, columns, 2) / size
             ratio = float(axis @ found)
             deviation = float(np.sqrt(axis @ fit.covariance[block, block] @ axis))
-            # The ratio must be above 2.5 or below 1/2.5: masses of CAD models are wrong by less. It must also differ
-            # from 1 by more than four of its standard deviations: among many bodies, the ratio of one may by chance
-            # differ from 1 by two standard deviations.
+            # A body is reported if `ratio` is above 2.5 or below 1/2.5, since masses of CAD models are wrong by less.
+            # The ratio must also differ from 1 by more than four standard deviations of the fit: among many bodies, a
+            # difference of two standard deviations may occur by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (

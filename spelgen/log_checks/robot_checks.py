@@ -36,9 +36,9 @@ class RobotCheckTuning:
     # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
     # deviation of the torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
-    # [rad, m] Hypotheses about a log are not tested if its positions range over less than this value: friction before
-    # sliding may then determine the torques. On simulated arms, wrong hypotheses fit best if positions range over 0.02,
-    # but not if they range over 0.1.
+    # [rad, m] Hypotheses about a log, such as a reversed joint, are not tested if its positions range over less than
+    # this value: presliding friction may then dominate the torques. On simulated arms, wrong hypotheses fit best if
+    # positions range over 0.02, but not if positions range over 0.1.
     smallest_motion: float = 0.05
     # [1] The unit of a joint's torque is checked only if gravity loads the joint enough: the standard deviation of its
     # gravity torque by the URDF must be at least this fraction of the largest standard deviation of all joints. At

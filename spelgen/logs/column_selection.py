@@ -127,8 +127,8 @@ def columns_by_joint(
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}
-    # If columns have the same name, pandas appends numbers except to the first: q, q.1, q.2. The first then has the
-    # number -1.
+    # pandas makes equal column names different: q, q, q becomes q, q.1, q.2. The first name has no number, which
+    # `ColumnName` represents by -1, and is added here.
     if len(numbered) == len(joints) - 1:
         numbered = {x.number: x for x in columns}
     if named or len(numbered) < len(joints):

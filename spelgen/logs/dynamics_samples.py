@@ -17,8 +17,8 @@ FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default c
 # [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
 SHORTEST = 1.0
 NEEDED = f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least"
-# [s] Shorter gaps do not cut a recording. They are shorter than a quarter period of the low-pass's default cutoff, so
-# that the filter removes all motion that could have occurred within them.
+# [s] A gap in the time stamps divides a recording only if it is longer. A quarter period of the low-pass filter's
+# default cutoff is chosen, since the filter removes the fast motion that a shorter gap could hide.
 HOLE = 0.25 / TUNING.automatic_cutoff
 AUTOMATIC = Preprocessing()
 

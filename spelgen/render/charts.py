@@ -255,7 +255,7 @@ def _floats(values: Values) -> np.ndarray:
 
 
 def _spaced(pixels: np.ndarray) -> str:
-    """Return pixel coordinates (T, 2) or (2,) as text: rounded to tenths and separated by blanks."""
+    """Return pixel coordinates, (T, 2) or (2,), as text for SVG, "x y x y ...", rounded to 0.1 pixel."""
     return " ".join(f"{round(pixel, 1):g}" for pixel in pixels.ravel().tolist())
 
 

@@ -15,10 +15,10 @@ SMOOTHING_VELOCITY = 0.006
 
 
 class FrictionConstants(NamedTuple):
-    """Parameter cache of ``FrictionLaws``: constants >= 0 of n joints, (n,), or of K bristles each, (n, K).
+    """Parameter cache of ``FrictionLaws``: constants >= 0 per joint, (n,), or per bristle, (n, K).
 
-    At joints without friction, the constants in Nm (N) are 0, except ``min_load``, which is no friction
-    torque: it smooths the gravity torque.
+    At joints without friction, the coefficients and torques of friction are 0. ``min_load`` is never 0:
+    it is no friction torque, but smooths |gravity torque|.
     """
 
     viscous: Tensor  # coefficient of the viscous friction, a torque per velocity [Nm s/rad, N s/m]
@@ -200,8 +200,8 @@ class SlidingFriction(FrictionLaws):
         self.memoryless.fill_(1.0)
         self.raw_coulomb_smoothing_velocity = nn.Parameter(torch.zeros_like(self.speed))
         del self.raw_bristle_fractions
-        # Without bristles there are no fractions to train. The parameter is replaced by the buffer `reach`
-        # of break-away displacements, which has the required shape: (n, 0) for no bristles.
+        # Without bristles there are no fractions to train: the parameter is replaced by a buffer (n, 0).
+        # The array of break-away displacements, `reach`, is reused, since it has this shape.
         self.register_buffer("raw_bristle_fractions", self.reach)
 
     def prepare(self) -> FrictionConstants:

@@ -190,7 +190,10 @@ class ResidualTerms(nn.Module):
         )
 
     def at(self, q: Tensor, parameters: ResidualParameters) -> ResidualConfiguration:
-        """Return the configuration cache at q, (..., n) [rad, m]; parameters: cache from ``prepare``."""
+        """Return the configuration cache: the residual terms' values at positions q, (..., n) [rad, m].
+
+        parameters: parameter cache from ``prepare``.
+        """
         encoded = self.encoding.forward(q)
         splines = torch.einsum("...ik,ikm->...im", self.splines(q), parameters.splines)
         # The torque term and the log friction factor are sums of the same splines: one product gives both.

@@ -234,8 +234,8 @@ def load_settings(urdf_path: Path | str, joints: Collection[str] | None = None) 
             if group not in OF_A_STEP:
                 collect([*errors, *chain(*unusable.values())])
             unusable[group] = (*unusable.get(group, ()), each)
-            # The content is checked again without the faulty group, whose errors may have hidden errors of other
-            # groups.
+            # The loop checks the content again without the faulty group. Other groups may also have errors, which the
+            # errors of this group may have hidden.
             content.pop(group, None)
     update: dict[str, object] = {group: Unusable(group_errors) for group, group_errors in unusable.items()}
     # The setting `input` of the arm also applies to its logs, so that a settings file contains it only once.

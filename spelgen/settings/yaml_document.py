@@ -134,8 +134,8 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
 def read_document(path: Path) -> YamlDocument:
     """Read and parse a YAML file; its keys and values are not yet validated.
 
-    Raises SettingsError if the file cannot be read, is larger than 256 KiB, is not valid YAML in UTF-8, has more than
-    one document, or contains a construct that `_Loader` does not permit.
+    Raises SettingsError if the file cannot be read, is larger than 256 KiB, or is not one valid YAML document in UTF-8.
+    Tags, aliases, repeated keys, deep nesting, and numbers such as 1:50 are also errors.
     """
     # The size of a YAML file is bounded, because larger files could exhaust the memory. Settings of 300 joints with all
     # keys have 60 kB.
@@ -323,6 +323,6 @@ Inputs = Annotated[tuple[Number, ...], Field(min_length=1)]
 
 
 class Group(BaseModel):
-    """Base class of a group of keys in a settings file: the keys are fields of the class; other keys are errors."""
+    """Base class of a group of keys in a settings file. A derived class has a field per key; other keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -72,8 +72,8 @@ def _settings(arm: Arm, seed: int) -> dict[str, object]:
     )
     names = list(arm.chain.joint_names)
     settings = {"about": ABOUT.format(seed), "moving_joints": names} | carried
-    # Arms with position servos or passive joints cannot be simulated along prescribed paths, and keep the protocol of
-    # their settings. All other arms are simulated along prescribed paths.
+    # All arms are simulated along prescribed paths, except arms with position servos or passive joints: their motion
+    # depends on the servos or on free joints and cannot be prescribed, so the simulation in their settings is kept.
     if nominal.input == "position" or any(joint.passive for joint in arm.chain.coordinates):
         settings["simulation"] = carried.get("simulation", {}) | {"seed": seed}
         return settings

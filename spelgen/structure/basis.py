@@ -224,8 +224,8 @@ def _single(spans: Spans, index: int) -> tuple[np.ndarray, np.ndarray]:
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Return the least-squares solution X (k, p) of A X = B, with A = matrix (S, k) and B = right (S, p)."""
     width = matrix.shape[1]
-    # [A, B] is replaced by the triangular factor of its QR decomposition: the normal equations and the solution are the
-    # same, but there are far fewer rows.
+    # [A, B] = Q R is replaced by the triangular factor R. The solution is the same, since R^T R = [A, B]^T [A, B]. R
+    # has at most k + p rows in place of S.
     factor = np.asarray(np.linalg.qr(np.concatenate([matrix, right], axis=1), mode="r"))
     return np.asarray(np.linalg.lstsq(factor[:, :width], factor[:, width:], rcond=None)[0])
 

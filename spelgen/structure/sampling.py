@@ -100,15 +100,15 @@ def float_samples(arm: Chain, assume: Assume, samples: int, seed: int = 2) -> np
 
 
 def float_energies(arm: Chain, q: np.ndarray, inertias: Sequence[Ten]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower triangle of M and the potential energy V at positions q, in double precision.
+    """Return the lower triangle of the mass matrix M, and the potential energy V, at positions q in double precision.
 
     Args:
         arm: the arm, with n coordinates.
         q: positions, (..., n) [rad, m], real, or complex for complex-step derivatives.
-        inertias: ten inertial parameters of each body, numbers or arrays, (...,) each.
+        inertias: ten inertial parameters per body; each is a number, or an array (...,) with a value per position.
 
     Returns:
-        Lower triangles of M, row after row, (..., n(n+1)/2), and V, (...,) [J].
+        Lower triangles of M, row after row, (..., n(n+1)/2) [kg m^2, kg m, kg], and V, (...,) [J].
     """
     positions = []
     for index, base in enumerate(base_denominators(arm)):

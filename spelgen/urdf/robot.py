@@ -128,8 +128,9 @@ class Transmission(NamedTuple):
 class Robot:
     """The content of a URDF: a tree of links and joints, in the order of the file.
 
-    ``source`` is the name of the file in errors. ``digest`` is the SHA-256 of the bytes of the file in hexadecimal.
-    ``root`` is the name of the root link. For a xacro file, lines and digest refer to the expanded document.
+    ``source`` is the file that errors name. ``root`` is the name of the root link. ``digest`` is the SHA-256 of the
+    file in hexadecimal; for a xacro file, of the expanded document. Line numbers of links and joints refer to the
+    same document.
     """
 
     name: str

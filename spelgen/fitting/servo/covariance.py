@@ -15,11 +15,11 @@ from spelgen.identification.intervals import QUANTILE
 def posterior_content(problem: ServoProblem, solution: ServoSolution) -> Content:
     """Return the posterior of a servo fit for the checkpoint: `covariance` (K, K), and `delay_std` of the delay [s].
 
-    The K parameters are the parameters of a `ParameterVector`. The fit estimates k parameters (`ServoParameters`):
-    joint parameters, coordinates of the bodies, and the delay. Their covariance (k, k) is converted by the derivatives
-    of the K parameters with respect to the k parameters. It is scaled such that 1.96 standard deviations are half the
-    width of the 95 % interval of Student's t distribution. Three variances are increased, since the fit underestimates
-    them:
+    K is the number of parameters of the model (`ParameterVector`). The fit estimates fewer parameters
+    (`ServoParameters`), with coordinates of the bodies in place of the inertial parameters. The covariance of the fit
+    is converted to the model's parameters by the Jacobian. It is scaled such that 1.96 standard deviations are half the
+    width of the 95 % interval of the fit, which is wider than a normal one (`ServoSolution.quantile`). Three variances
+    are increased, since the fit underestimates them:
 
     - kd, armature and friction: the variance due to errors of the friction model is added
       (`ServoTuning.model_deviation`).

@@ -139,9 +139,9 @@ def identifiable(blocks: NormalEquations, precision: Tensor, indices: Tensor) ->
 
 
 def ratios(model: ArmModel, qd: Tensor, gravity: Tensor) -> dict[str, Tensor]:
-    """Return {key of `RATIOS`: (n,)}, the ratios of servo and friction parameters to kp for all joints.
+    """Return {name: (n,)} of the quantities in `RATIOS`, such as kd / kp [s] and (dry friction) / kp [rad, m].
 
-    Dry friction depends on velocity and gravity torque, and is averaged over samples (`sliding_friction`).
+    Dry friction depends on velocity and gravity torque. Its mean over the samples is used (`sliding_friction`).
 
     Args:
         model: model with position servos.

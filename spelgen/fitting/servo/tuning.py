@@ -99,7 +99,7 @@ class ServoTuning:
     # [rad, m] Dead zones of a smaller half width are set to zero. The step of a 12-bit encoder is 1.5e-3 rad.
     min_dead_zone: float = 1e-3
 
-    # Constants of the intervals and the identifiability of the fitted parameters (`servo.report`).
+    # Constants of the confidence intervals and the identifiability of the fitted parameters (`servo.report`).
 
     # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
     # halves of one motion are not independent.

@@ -112,11 +112,11 @@ class JointFunction:
         return friction * log_factor.nan_to_num().expm1()
 
     def target(self, torque_residual: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """Return values (T,) [Nm, N] of this residual term's torque that explain the torque residual best.
+        """Return the torque of this residual term at each sample that explains the torque residual best, (T,) [Nm, N].
 
-        At each sample, the value minimizes the sum over all joints of (residual - effect of the term)^2 / noise^2. The
-        term is fitted to these values. torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque
-        noise [Nm, N].
+        A torque x of the term adds x d to the joint torques, with the constant vector d = `direction` (n,). At each
+        sample, x minimizes the sum over joints of (residual - x d)^2 / noise^2. The term is fitted to these values.
+        torque_residual: (T, n) [Nm, N]. noise: (n,) standard deviations of the torque noise [Nm, N].
         """
         # The friction of a coupled drive acts on several joints, each with its own residual and noise. The returned
         # value is the weighted least-squares solution over these joints.

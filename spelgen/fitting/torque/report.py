@@ -77,7 +77,10 @@ def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
 
 
 def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
-    """Return a note with the estimated prior width of the bodies, or a warning if the width is implausibly large."""
+    """Return a note with the typical factor by which masses in the URDF are wrong; a warning if it is implausibly large.
+
+    The logarithm of the factor is the prior standard deviation of the bodies' parameters, estimated in the fit.
+    """
     # `prior.bodies` is the standard deviation of each log-Cholesky parameter. One of the ten parameters of a body is
     # the logarithm of the mass, so exp(standard deviation) is a factor of the mass.
     factor = float(np.exp(solution.prior.bodies))

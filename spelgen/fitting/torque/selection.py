@@ -113,9 +113,9 @@ def select_functions(
     for candidate in joint_functions(model, samples, projection):
         if (candidate.parameter, candidate.joint) not in selected:
             candidates[candidate.joint].append(candidate)
-    # Cross-validation holds out complete recordings. With two recordings, only two different fits predict all ten
-    # blocks of the t test, so the errors of the blocks are not independent. As for a single recording, a candidate must
-    # then pass the stricter test with `standard_errors_of_one`, and its torque must be below `max_torques`.
+    # Cross-validation holds out complete recordings. With two recordings there are only two fits, one per recording,
+    # and the ten blocks of the t test have correlated errors. The tests of candidates are therefore as strict as for a
+    # single recording: `standard_errors_of_one` is the limit of the t test, and `max_torques` limits the torque.
     limits = None if int(recordings.max()) > 1 else max_torques(model, samples.q, torque_std)
     best = (
         _best(of_joint, samples.torque_residual, noise, float(length), recordings, limits)

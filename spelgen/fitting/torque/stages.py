@@ -120,14 +120,15 @@ def _without_line(values: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
 def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     """Choose per joint between rate-only friction and friction with bristle states; return the new estimate.
 
-    ``estimate`` has rate-only friction. The force of bristles reverses over a displacement, later than the velocity. At
-    joints whose friction reverses with the velocity, the delayed force would be confounded with inertia. The evidence
-    of a joint is 2 log(L with bristles / L without bristles), with the marginal likelihood L of its torque.
+    ``estimate`` has rate-only friction, which reverses with the velocity. The force of bristles reverses later, after a
+    displacement. If bristles are fitted to a joint with rate-only friction, wrong inertias compensate this delay. The
+    evidence of a joint is 2 log(L with bristles / L without bristles), with the marginal likelihood L of its torque.
 
-    - If the sum of the evidence over all joints favours bristles, a joint has rate-only friction if its own evidence is
-      strongly against bristles, and if its torque residual without bristles is also significantly smaller (t test on
-      ten blocks of the log). The evidence of a single joint is unreliable, since the errors of a motion are correlated.
-    - Otherwise, a joint has bristles only if its own evidence is strongly for them (see `_rejected`).
+    - If the sum of the evidence of all joints is positive, joints have bristles by default. A joint has rate-only
+      friction if its evidence is below -`TUNING.strong_evidence`, and its torque residual is significantly smaller
+      without bristles (t test on ten blocks of the log). The second test is needed because correlated errors make the
+      evidence of a single joint unreliable.
+    - Otherwise, a joint has bristles only if its evidence is above `TUNING.strong_evidence`.
     """
     friction = estimate.problem.jacobian.model.friction
     residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
