@@ -30,7 +30,7 @@ from spelgen.simulation.simulate import simulate
 
 URDF = Path(__file__).parents[1] / "robots" / "rpr.urdf"
 ADAMW = ["--set", "optimizer=adamw", "--set", "batch=8", "--set", "momentum_steps=0"]
-# [s] longest time from the first write of a process to its kill; LONGEST: a training with AdamW, SHORTER: with --servos
+# [s] A kill is at most this time after the first write of a process. LONGEST: training with AdamW. SHORTER: --servos.
 LONGEST, SHORTER = 6.0, 2.0
 
 

@@ -67,16 +67,16 @@ def _median(values: Sequence[float]) -> str:
 
 
 def ratio_to_best(errors: Mapping[str, float]) -> float | None:
-    """Return the error of `hybrid` divided by the smallest error of `REFERENCES`.
+    """Return the nMSE of `hybrid` divided by the smallest nMSE of the methods in `REFERENCES`.
 
-    errors: nMSE by method. Return None if `hybrid` has no error, or none of `REFERENCES` has one.
+    errors: {method: nMSE}. Return None if `errors` lacks `hybrid`, or all of `REFERENCES`.
     """
     best = min((errors[name] for name in REFERENCES if name in errors), default=None)
     return None if best is None or DEFAULT not in errors else errors[DEFAULT] / best
 
 
 def summary(cells: Mapping[Cell, Mapping[str, float]]) -> list[str]:
-    """Return a summary of the ratio of the error of `hybrid` to the smallest error of `REFERENCES`, over all cells.
+    """Return lines that summarize the ratios of `ratio_to_best` over all cells.
 
     A cell is a fold, a duration and a group of test recordings. Cells with ratios above `GOALS[1]` are listed.
     """

@@ -114,7 +114,7 @@ def ur10e(read: Read, folder: Path) -> None:
 
 
 def panda(read: Read, folder: Path) -> None:
-    """Write the Panda's log from text files of its repository. Torques were measured by joint torque sensors.
+    """Write the Panda's log from text files of its repository. The torques are values of joint torque sensors.
 
     read: function that returns the bytes of a file of the repository.
     """

@@ -386,8 +386,8 @@ def test_intervals_contain_unknown_gains_if_the_masses_of_the_urdf_are_wrong(unc
     fitted = fit(model, [replace(log, tau=log.tau / gains)], TorqueFit(), arm=load_arm(tmp_path / "arm.urdf"))
     found = fitted.posterior.drives["gain"]
     assert all(x.low <= gain <= x.high for x, gain in zip(found, gains, strict=True))
-    # The common scale of the gains is fixed by the masses of the URDF. Its relative error is below 30 %, the error of a
-    # single mass, since the errors of six masses are averaged.
+    # The masses of the URDF determine the common scale of the gains. The relative error of the scale is below 30 %, the
+    # error of a single mass, since the errors of six masses are averaged.
     assert abs(np.log([x.value / gain for x, gain in zip(found, gains, strict=True)]).mean()) < 0.3
 
 

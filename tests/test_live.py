@@ -316,7 +316,7 @@ def test_delayed_torques_are_compared_with_the_motion_of_their_time():
 
     def external_torques(delay):
         states = Estimator(fit, levels=levels.model_copy(update={"delay": delay})).replay(log[3500:])
-        # the first three seconds are omitted, in which the friction state is unknown
+        # Three seconds are omitted, since the friction state is unknown at the start.
         torques = [x.contact.external_torque / levels.observer for x in states[600:]]
         return np.sqrt(np.mean(np.square(torques), axis=0))
 

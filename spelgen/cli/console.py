@@ -23,7 +23,7 @@ from spelgen.labels import counted, printable
 METAVARS: dict[object, str] = {int: "N", float: "X", str: "TEXT", Path: "FILE"}
 FAILED = 1
 INTERRUPTED = 130  # exit code after Ctrl-C, as in shells: 128 + 2, the number of the signal SIGINT
-BROKEN_PIPE = 141  # exit code if the reader of a pipe has ended, as in shells: 128 + 13, the number of SIGPIPE
+BROKEN_PIPE = 141  # exit code if the reader of a pipe has ended: 128 + 13, the number of SIGPIPE
 
 # {optional package: group of dependencies ("extra") of spelgen that installs it}, for the error if it is absent
 EXTRAS = {"pinocchio": "simulate", "ray": "parallel"}

@@ -231,7 +231,7 @@ def random_inputs(coordinates: Sequence[Coordinate], states: int, memory: int = 
 
 
 def nominal_speeds(coordinates: Sequence[Coordinate]) -> np.ndarray:
-    """Return a speed per joint, (n,) [rad/s, m/s], by which random test velocities are multiplied.
+    """Return a speed per joint, (n,) [rad/s, m/s], as the scale of velocities at which models are compared.
 
     It is the velocity limit in the URDF. Joints without a limit have the speed limit of exciting motions.
     """

@@ -87,7 +87,7 @@ def identify_by(
 def _negative_friction(result: Identification) -> Iterator[Diagnostic]:
     """Yield a warning if viscous friction is negative, also at the upper bound of its 95 % interval.
 
-    Negative friction indicates that the drives compensate friction.
+    Negative friction indicates that friction decreases with speed, or that the drives compensate friction.
     """
     names = {f"viscous{k}": name for k, name in enumerate(result.arm.joint_names, start=1)}
     negative = [f"{names[x.name]} {x.text}" for x in result.intervals if x.name in names and x.high < 0]

@@ -64,7 +64,7 @@ class GeometryProblem:
         self._counted: np.ndarray | None = None
         self._has_free_gains = self._has_hysteresis = False
         self._equations: dict[tuple[bytes, Vector3], tuple[np.ndarray, np.ndarray]] = {}
-        self._chains: dict[Vector3, BodyChain] = {}  # cache: {gravity vector: chain of bodies with this gravity}
+        self._chains: dict[Vector3, BodyChain] = {}  # cache: {gravity vector: the arm's chain of bodies}
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""

@@ -29,7 +29,7 @@ from spelgen.logs.trajectory import Trajectory
 # [samples at 100 Hz] To test delays, each sample stores its signals also at these times before and after it, every
 # 20 ms. Values between these times can be interpolated, because the signals are low-pass filtered.
 OFFSETS = np.arange(-HINTS.longest_offset, HINTS.longest_offset + 1, 2)
-# [samples] Samples at both ends of a recording that are omitted, because later or earlier signals are not known there.
+# [samples] Number of samples that are omitted at each end of a recording: signals before or after it are not known.
 ENDS = 3
 
 

@@ -20,7 +20,7 @@ from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
 
-_BLOCK = 2048  # [samples] The terms of the momentum balance are computed in blocks of this length, to save memory.
+_BLOCK = 2048  # [samples] The terms of the balance are computed in blocks of this length, to save memory.
 
 
 class Balance(NamedTuple):

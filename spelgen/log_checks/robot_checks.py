@@ -30,11 +30,11 @@ class RobotCheckTuning:
 
     # [rad, m] Tolerance of position limits, for positions that a logger has rounded.
     limit_rounding: float = 1e-3
-    # [1] The torque contains gravity if its correlation with the URDF's gravity torque is above this number, and does
-    # not if the magnitude of the correlation is below 1 minus this number. In between nothing is concluded.
+    # [1] Limit of the correlation c of logged torques with the URDF's gravity torques. The logged torques contain
+    # gravity if c > `seen`, and lack gravity if |c| < 1 - `seen`. Otherwise nothing is concluded.
     seen: float = 0.7
-    # [1] Gravity is visible in logged torques if its standard deviation is at least this fraction of the standard
-    # deviation of the torque. The fraction was chosen on logs of a UR10e.
+    # [1] Gravity is visible in logged torques if the standard deviation of the gravity torque is at least this fraction
+    # of the standard deviation of the logged torque. The fraction was chosen on logs of a UR10e.
     visible: float = 0.2
     # [rad, m] Hypotheses about a log, such as a reversed joint, are not tested if its positions range over less than
     # this value: presliding friction may then dominate the torques. On simulated arms, wrong hypotheses fit best if

@@ -122,8 +122,8 @@ def columns_by_joint(
     """Return {joint: column}: the column whose name contains the name of the joint.
 
     If no column name contains a joint name, columns are assigned by the last number in their names. `order` may state
-    the number of each joint, such as {"elbow": 2} for the column `q2` (see `_order_in_cells`). If it lacks a joint, the
-    columns, sorted by their numbers, belong to the `joints` in the given order.
+    the number of each joint, such as {"elbow": 2} for the column `q2` (see `_order_in_cells`). If `order` does not
+    state the numbers of all joints, the columns with ascending numbers belong to the `joints` in the given order.
     """
     named = {column.joint: column for column in columns if column.joint}
     numbered = {x.number: x for x in columns if x.number >= 0}

@@ -14,7 +14,7 @@ from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SLOWEST, TUNING, shows_accelerations
 
 FREQUENCY = 100.0  # [Hz] common rate of all samples, twelve times the default cutoff of the low-pass filter
-# [s] Shorter gap-free pieces are omitted: more than a fifth of them would be filter transients.
+# [s] Shorter pieces of a recording between gaps are omitted: filter transients would be more than a fifth of a piece.
 SHORTEST = 1.0
 NEEDED = f"motion sampled at {SLOWEST:g} Hz or faster, {SHORTEST:g} s without a gap at least"
 # [s] A gap in the time stamps divides a recording only if it is longer. A quarter period of the low-pass filter's

@@ -101,8 +101,8 @@ class ServoTuning:
 
     # Constants of the confidence intervals and the identifiability of the fitted parameters (`servo.report`).
 
-    # [1] Smallest number of logs for which each log is one block of the jackknife. Logs are not divided then, since
-    # halves of one motion are not independent.
+    # [1] With at least this number of logs, each log is one block of the jackknife, which estimates the covariance of
+    # the parameters: parts of one log would not be independent.
     min_logs: int = 3
     # [1] If there are fewer logs than `min_logs`, the logs are divided into at least this number of blocks in total.
     min_blocks: int = 6
@@ -110,8 +110,7 @@ class ServoTuning:
     # is below 30 or above 90.
     variance_inflation: float = 50.0
     # [1] Standard deviation of log(kd/kp), log(armature/kp) and log(friction/kp) due to errors of the friction model,
-    # measured by `benchmarks/servo_recovery.py`. This deviation is added to the standard deviation of the fit (root of
-    # the sum of squares).
+    # measured by `benchmarks/servo_recovery.py`. Its square is added to the variance of the fit.
     model_deviation: float = 0.015
     # [1] Largest ratio between the upper end of an interval and the value; with a wider interval, the value counts as
     # not determined.

@@ -77,7 +77,7 @@ def _warning(code: str, message: str, element: str = "logs") -> Diagnostic:
 
 
 def _urdf_prior(solution: TorqueSolution) -> Diagnostic:
-    """Return a note with the typical factor by which masses in the URDF are wrong; a warning if it is implausibly large.
+    """Return a note with the typical factor by which masses in the URDF are wrong, or a warning if it is too large.
 
     The logarithm of the factor is the prior standard deviation of the bodies' parameters, estimated in the fit.
     """
