@@ -40,9 +40,9 @@ def cells_of(rows: Iterable[Row]) -> dict[Cell, dict[str, float]]:
 def errors_table(cells: Mapping[Cell, Mapping[str, float]], methods: Sequence[str]) -> list[list[str]]:
     """Return the table of nMSE per method, with a row for each cell (fold, duration, group of test recordings).
 
+    The last column is the error of `hybrid` divided by the smallest error of the reference methods (`ratio_to_best`).
     A motion pair is a fold that is trained on one motion and tested on another. All motion pairs of an arm and a
-    duration share one row with the median over the pairs. The last column is the error of `hybrid` divided by the
-    smallest error of the reference methods (`ratio_to_best`).
+    duration share one row, with medians over the pairs.
     """
     table: dict[tuple[str, str, str], list[Mapping[str, float]]] = {}
     for (fold, seconds, group), errors in cells.items():
