@@ -97,7 +97,7 @@ def class_summary(spec: ModelSpec) -> str:
             f"{counted(len(spec.links), 'rigid body')} with trained inertial parameters, friction{residual}."
         )
     if spec.design.mass == "dense-3n":
-        return "Networks of the whole M^-1 over three axes per joint, V, D and G."
+        return "Networks give M^-1 (three axes per joint), potential energy V, damping D and input matrix G."
     return f"{_functions(spec)} make M; networks of V and D."
 
 

@@ -1,6 +1,7 @@
 r"""Port-Hamiltonian model of an arm with 3 joints, by `spelgen build`.
 
-Robot "rpr". Networks of the whole M^-1 over three axes per joint, V, D and G. V depends on joints 1-3.
+Robot "rpr". Networks give M^-1 (three axes per joint), potential energy V, damping D and input matrix G. V
+depends on joints 1-3.
 
     import torch
     from rpr_spel import Model  # if this file is rpr_spel.py
@@ -38,7 +39,7 @@ JOINTS = (
 
 
 class Model(DenseInputDynamics):
-    """Networks of the whole M^-1 over three axes per joint, V, D and G."""
+    """Networks give M^-1 (three axes per joint), potential energy V, damping D and input matrix G."""
 
     def __init__(self, seed: int = 0, dtype: torch.dtype = torch.float64) -> None:
         generator = torch.Generator().manual_seed(seed)
