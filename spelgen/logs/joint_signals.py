@@ -15,7 +15,16 @@ import yaml
 from numpy.lib.stride_tricks import sliding_window_view
 
 from spelgen.labels import counted
-from spelgen.logs.jumps import decoded, is_lost, is_outlier, jump_count, jumps, read_as_words, unwrapped
+from spelgen.logs.jumps import (
+    FEWEST,
+    decoded,
+    is_lost,
+    is_outlier,
+    jump_count,
+    jumps,
+    read_as_words,
+    unwrapped,
+)
 from spelgen.logs.recording import COMMANDED, listed_times, outlier_rows, stale_rows
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
@@ -124,8 +133,7 @@ class JointSignals(NamedTuple):
     @property
     def step(self) -> float:
         """Median time step between samples [s]; 0 for a single sample."""
-        steps = np.diff(self.trajectory.t)
-        return float(np.median(steps)) if steps.size else 0.0
+        return self.trajectory.step
 
     @property
     def joint(self) -> str:
@@ -335,6 +343,8 @@ def _reading(signals: JointSignals, name: str) -> WordReading | None:
     The size of the signal's jumps shows the period at which the words overflow, or the value of their sign bit.
     """
     mapping, values = signals.trajectory.mapping, signals.signal(name)
+    if len(values) < FEWEST:
+        return None
     turns: list[float | None] = [None]
     if signals.kind != "prismatic" and name in ("q", "u"):
         # `turns`: candidates for one revolution in the unit of the log; angles without a stated unit may be in degrees.

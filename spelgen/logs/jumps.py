@@ -16,6 +16,8 @@ from spelgen.settings.log_mapping import Decoding
 # Register words of drives have at most 18 bits, so their step is at least 2^-18 = 4e-6 of their range. Smaller steps of
 # a signal are rounding errors.
 FINEST_WORD = 4e-6
+# A signal with fewer values is not decoded: its median step might itself be a jump.
+FEWEST = 4
 
 
 def jump_count(values: np.ndarray, period: float) -> int:
@@ -201,6 +203,9 @@ def repeated_rows(columns: np.ndarray, positions: int) -> tuple[np.ndarray, int]
 
 def held_samples(values: np.ndarray) -> int:
     """Return the number of consecutive rows in which a logger repeats each value of a signal (T,); normally 1."""
+    # a short signal is omitted first, which saves time for logs of many short recordings
+    if len(values) <= TUNING.jump_window:
+        return 1
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < TUNING.jump_window:
         return 1
@@ -237,8 +242,7 @@ def read_as_words(values: np.ndarray, turn: float | None) -> Word | None:
 
     values: (T,) in the unit of the log. turn: one revolution in this unit; None for a joint that does not rotate.
     """
-    # A signal with fewer than four values is not decoded: its median step might itself be a jump.
-    if len(values) < 4:
+    if len(values) < FEWEST:
         return None
     steps = np.diff(values)
     limit = 0.4 * float(np.ptp(values))

@@ -130,10 +130,16 @@ class Trajectory:
         return float(1.0 / steps.mean()) if steps.size else 0.0
 
     @cached_property
+    def step(self) -> float:
+        """Median time step between samples [s]; 0 for a single sample."""
+        steps = np.diff(self.t)
+        return float(np.median(steps)) if steps.size else 0.0
+
+    @cached_property
     def regular_steps(self) -> np.ndarray:
         """Time steps between samples that are no gaps, (steps,) [s]; their mean is the sample interval."""
         steps = np.diff(self.t)
-        return steps[steps <= GAP * np.median(steps)] if steps.size else steps
+        return steps[steps <= GAP * self.step] if steps.size else steps
 
     @cached_property
     def fingerprint(self) -> list[int]:
