@@ -854,6 +854,20 @@ def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, s
         np.testing.assert_array_equal(values, expected)
 
 
+def test_lists_of_words_beside_columns_of_joints_are_no_names(tmp_path):
+    """A column with lists of words, such as tags, has no influence on columns with a joint each."""
+    tags = [["good", "fast"], ["slow", "far"], ["good", "fast"], ["near", "slow"]]
+    check(read_logs(parquet(tmp_path / "x.parquet", columns(tags=tags)), JOINTS)[0], "x")
+    check(
+        read_logs(
+            tmp_path / "x.parquet",
+            JOINTS,
+            yaml.safe_load(suggest_mapping(tmp_path / "x.parquet", JOINTS).text),
+        )[0],
+        "x",
+    )
+
+
 def test_rows_of_two_arms_with_unknown_names_are_an_error(tmp_path):
     """If rows are of two arms and no joint name identifies one of them, the names in the log are asked for."""
     state = {"position": [0.1, 0.2], "velocity": [0.3, 0.4], "effort": [0.5, 0.6]}

@@ -40,11 +40,15 @@ def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> Rows
     A LogError is raised if the rows are of several arms: no list contains all joints of the arm, and some list with at
     least as many names shares no name with the list of the first row. names: {joint: its name in the log}.
     """
+    lengths = [len(first_list(column)) for column in table.columns]
     for column in table.columns:
         if are_names(column.type):
             column = pa.compute.binary_join_element_wise("[", pa.compute.binary_join(column, ","), "]", "")
         first = first_list(column)
         if not (first and pa.types.is_string(column.type) and all(map(NAME.fullmatch, first))):
+            continue
+        # lists of names that belong to no list of values, such as tags, are no names of joints
+        if lengths.count(len(first)) < 2:
             continue
         lists = {text: tuple(_list_of(text)) for text in column.unique().drop_null().to_pylist()}
         of_arm = [x for x in lists.values() if set(names.values()) <= set(x)]
