@@ -137,7 +137,9 @@ def estimate(
         "run": str(run), "page": str(page), "supported_alarms_per_minute": rate,
         "logs": [result.to_dict() for result in results], "contact_thresholds": thresholds,
     }  # fmt: skip
-    smallest = ", ".join(f"{joint} {low:.3g}; {high:.3g}" for joint, (low, high) in thresholds.items())
+    smallest = ", ".join(
+        f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
+    )
     supported = (
         f"contact thresholds in motion; at rest: {smallest} {torque_units(fit.model.joint_types)}, for a rate "
         f"of false alarms of {alarm_rate:g} per minute (training logs support >= {rate:.2g})"

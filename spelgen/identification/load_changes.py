@@ -213,12 +213,13 @@ def _change(
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
-    factor, offset = 1.0, float(best.quantities[0, 0])
+    quantity = float(best.quantities[0, 0])
+    factor, offset = 1.0, quantity
     if best is refits[0]:
         # `torque` was fitted to the samples before and after the change together. The parameters that were refitted
         # with the change give the torque before it.
         scaled, unchanged = columns[0][..., 0], rows @ best.parameters
-        factor, offset = 1 + offset * float(np.square(scaled).sum() / (scaled * unchanged).sum()), 0.0
+        factor, offset = 1 + quantity * float(np.square(scaled).sum() / (scaled * unchanged).sum()), 0.0
     change = TorqueChange(recording, time, joint, factor, offset)
     # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
     remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)

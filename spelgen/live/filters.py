@@ -58,7 +58,8 @@ class Block(NamedTuple):
         # The terms of a block are means over time: the means over both blocks are weighted by their durations.
         weight = later.duration / duration
         means = [a + weight * (b - a) for a, b in zip(self[1:5], later[1:5], strict=True)]
-        return Block._make([duration, *means, self.moving & later.moving])
+        y, load, friction, uncertainty = means
+        return Block(duration, y, load, friction, uncertainty, self.moving & later.moving)
 
 
 class Blocks:
@@ -272,7 +273,8 @@ class PayloadEstimate:
         self.filters = [LoadFilter(levels.load, levels.effort)]
         self.rows: Iterator[None] = iter(())
         self.moved = self.hypotheses_moved = 0.0
-        self.samples, self.per_sample, self.changed, self.misfit = 0, 0, False, 1.0
+        self.changed, self.misfit = False, 1.0
+        self.samples = self.per_sample = 0
 
     def start(self, block: Block) -> None:
         """Finish the filter updates of the previous block, and prepare the updates of `block` for calls of `step`."""
@@ -281,7 +283,8 @@ class PayloadEstimate:
         if block.moving.any():
             self.moved += block.duration
             self.hypotheses_moved += block.duration
-        self.samples, self.per_sample = 0, -(-len(self.filters) * len(block.y) // max(self.samples - 1, 1))
+        self.per_sample = -(-len(self.filters) * len(block.y) // max(self.samples - 1, 1))
+        self.samples = 0
         self.rows = self._rows(block)
 
     def step(self) -> None:

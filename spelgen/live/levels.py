@@ -192,7 +192,8 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, flo
     """
     factors = []
     for window in TUNING.trial_blocks:
-        squares, trials = np.zeros(2), len(blocks) // window
+        squares = np.zeros(2)
+        trials = len(blocks) // window
         for start in range(0, trials * window, window):
             load = LoadFilter(levels.load, levels.effort)
             for block in blocks[start : start + window]:
@@ -200,7 +201,8 @@ def load_variance(blocks: Sequence[Block], levels: NoiseLevels) -> dict[str, flo
                 for joint in range(load.n):
                     load.update(block, joint)
             squares += [load.x[:k] @ np.linalg.solve(load.P[:k, :k], load.x[:k]) / k for k in (1, 4)]
-        freedom, prior = trials + TUNING.prior_trials, TUNING.prior_trials * TUNING.prior_variance
+        freedom = trials + TUNING.prior_trials
+        prior = TUNING.prior_trials * TUNING.prior_variance
         factors.append((float(squares.max() + prior) / freedom, freedom))
     return dict(zip(("load_variance", "load_freedom"), max(factors), strict=True))
 

@@ -97,8 +97,8 @@ class LogEstimate:
             name = "load before its report" if event.is_load else "contact"
             pairs = zip(event.joints, event.torques, strict=True)
             torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
-            name = f"{name} at {event.begin:.2f} to {event.end:.2f} s"
-            lines.append(f"  {name}: {torques} {self.unit}; {event.force:.3g} N at the tip")
+            span = f"{event.begin:.2f} to {event.end:.2f} s"
+            lines.append(f"  {name} at {span}: {torques} {self.unit}; {event.force:.3g} N at the tip")
         if not self.contacts:
             lines.append("  no contact")
         if np.mean([state.contact.touched.any() for state in self.states]) > 0.5:

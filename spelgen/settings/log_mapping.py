@@ -47,9 +47,6 @@ UNIT_NAMES: dict[str, dict[str, str]] = {
     }.items()
 }  # fmt: skip
 UNIT_NAMES["qd"] |= {f"{name}/s": f"{unit}/s" for name, unit in UNIT_NAMES["q"].items()}
-for _name, _unit in UNIT_NAMES["q"].items():
-    _factor, _, _plain = _unit.rpartition(" ")
-    UNIT_NAMES["qd"].setdefault(f"{_name}/min", f"{float(_factor or 1) / 60:.11g} {_plain}/s")
 ONLY = {  # {joint type: units that values of such a joint cannot have}
     "revolute": {"m", "mm", "m/s", "mm/s", "N"},
     "prismatic": {NORMALISED, "rad", "rad/s", "Nm", "mNm", "Ncm", "kgf.cm", *LENGTHS, *SPEEDS}
@@ -134,7 +131,11 @@ def mapped_unit(quantity: str, unit: str) -> str | None:
     if mapped is None or not factor:
         return mapped
     multiple, _, name = mapped.rpartition(" ")
-    return f"{float(factor) * float(multiple or 1):.9g} {name}"
+    return f"{float(factor) * float(multiple or 1):.11g} {name}"
+
+
+# Velocities per minute, such as mm/min: a sixtieth of the unit per second.
+UNIT_NAMES["qd"] |= {f"{x}/min": mapped_unit("qd", f"{1 / 60} {x}/s") or "" for x in UNIT_NAMES["q"]}
 
 
 def is_unit(unit: str) -> bool:
