@@ -14,6 +14,7 @@ from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SpelgenError
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.checks import check
+from spelgen.logs.jumps import is_outlier
 from spelgen.logs.read import read_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import LogMapping
@@ -356,6 +357,22 @@ def test_quick_but_sound_signals_have_no_jumps():
             ["a"],
             ["revolute"],
         )
+
+
+def test_velocities_of_single_encoder_steps_are_no_outliers():
+    # Slow motion of a coarse encoder, differentiated at 1 kHz: the velocity is 0 or one encoder step per sample. The
+    # filter before the differentiation leaves rounding errors, which are smaller than any step.
+    t = 0.001 * np.arange(1500)
+    random = np.random.default_rng(0)
+    step = 2 * np.pi / 8192
+    q = step * np.round(0.02 * t / step + 0.5 * np.sin(2 * t) * 0.1 / step)
+    qd = np.diff(q, append=q[-1]) / 0.001
+    qd[random.choice(len(t), 20, replace=False)] += 1.4e-14
+    log = Trajectory(t, q[:, None], qd[:, None], random.normal(size=(len(t), 1)))
+    assert not is_outlier(qd, smooth=False).any()
+    assert check([log], ["a"], ["revolute"]) == []
+    qd[700] = 1e6
+    assert np.flatnonzero(is_outlier(qd, smooth=False)).tolist() == [700]
 
 
 def columns_of(columns, quantity, joints):

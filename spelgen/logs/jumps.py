@@ -308,6 +308,13 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
 
 
 def _typical_step(sizes: np.ndarray) -> float:
-    """Return the typical step of a signal: the median of its nonzero step sizes (T,); infinity if all are zero."""
-    moving = sizes[sizes > 0]
-    return float(np.median(moving)) if moving.size else np.inf
+    """Return the typical step of a signal: the median of its nonzero step sizes (T,); infinity if all are zero.
+
+    Rounding errors of velocities that were computed as differences of encoder positions do not count as steps.
+    """
+    moving = np.sort(sizes[sizes > 0])
+    if not moving.size:
+        return np.inf
+    # The 90 % quantile is a normal step also if single outliers are larger by many orders of magnitude.
+    smallest = 1e-9 * moving[int(0.9 * (len(moving) - 1))]
+    return float(np.median(moving[np.searchsorted(moving, smallest) :]))
