@@ -360,12 +360,12 @@ def test_quick_but_sound_signals_have_no_jumps():
 
 
 def test_velocities_of_single_encoder_steps_are_no_outliers():
-    # Slow motion of a coarse encoder, differentiated at 1 kHz: the velocity is 0 or one encoder step per sample. The
-    # filter before the differentiation leaves rounding errors, which are smaller than any step.
+    # Slow motion of a coarse encoder, differentiated at 1 kHz: the velocity is 0 or one encoder step per sample, apart
+    # from rounding errors.
     t = 0.001 * np.arange(1500)
     random = np.random.default_rng(0)
     step = 2 * np.pi / 8192
-    q = step * np.round(0.02 * t / step + 0.5 * np.sin(2 * t) * 0.1 / step)
+    q = step * np.round((0.02 * t + 0.05 * np.sin(2 * t)) / step)
     qd = np.diff(q, append=q[-1]) / 0.001
     qd[random.choice(len(t), 20, replace=False)] += 1.4e-14
     log = Trajectory(t, q[:, None], qd[:, None], random.normal(size=(len(t), 1)))

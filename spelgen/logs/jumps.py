@@ -1,8 +1,9 @@
 """Detection of jumps of logged signals: lost samples, outliers, wrapped angles, register words, repeated rows.
 
 The functions apply to one signal (T,) or to a log of C columns (T, C), of any format and any robot. A step is the
-difference between neighbouring samples; the typical step is the median magnitude of the nonzero steps. Register words
-are the raw integers of a drive's register: they overflow at a period, or have a bit for the sign.
+difference between neighbouring samples; the typical step is the median magnitude of the steps, without zeros and
+rounding errors. Register words are the raw integers of a drive's register: they overflow at a period, or have a bit for
+the sign.
 """
 
 from itertools import pairwise
@@ -308,9 +309,10 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
 
 
 def _typical_step(sizes: np.ndarray) -> float:
-    """Return the typical step of a signal: the median of its nonzero step sizes (T,); infinity if all are zero.
+    """Return the typical step of a signal: the median of its step sizes (T,), without zeros and rounding errors.
 
-    Rounding errors of velocities that were computed as differences of encoder positions do not count as steps.
+    A step below 1e-9 times a large step is a rounding error. Example: a velocity that was computed from encoder
+    positions at rest is 1e-14 instead of 0. The result is infinity if all sizes are zero.
     """
     moving = np.sort(sizes[sizes > 0])
     if not moving.size:
