@@ -64,7 +64,7 @@ def test_the_assessment_follows_from_the_figures(relative, nmse, said):
 def test_figures_and_better_baselines_are_reported():
     told = verdict(evaluation(0.05, 0.004, squares=0.03)).because
     assert "explains 99.6 % of the variance" in told and "is off by 5 % of the motion after 1 s" in told
-    assert "But squares is better after 1 s." in told
+    assert "But squares is better than the model after 1 s." in told
 
 
 @pytest.mark.parametrize("nmse, worst", [(0.004, "a"), (0.2, "b")])

@@ -145,7 +145,7 @@ def test_numbers_are_those_of_the_run(run):
     assert "Good enough for feed-forward control, contact detection" in text
     assert "simulation 1 s ahead; worst at joint1" in text
     assert "The model explains 99 % of the variance of the torques and is off by 1.23 % of the motion" in text
-    assert "But URDF is better after 1 step." in text
+    assert "But URDF is better than the model after 1 step." in text
     assert "34 for training, 17 for validation" in text
     assert description(RunFolder(run).read_spec()) in text
     assert "import torch" not in text, "the description of the model, and not the example of its module"

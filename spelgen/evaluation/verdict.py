@@ -199,7 +199,7 @@ def _better_baselines(results: Results, good_torques: bool) -> list[str]:
     if times:
         ahead = f"A constant velocity predicts better {listed(times)} ahead"
         statements.append(f"{ahead}: there, use the model for torques only." if good_torques else f"{ahead}.")
-    reasons = [f"{name} is better {listed(occasions)}" for name, occasions in better.items()]
+    reasons = [f"{name} is better than the model {listed(occasions)}" for name, occasions in better.items()]
     return [*statements, f"But {listed(reasons)}."] if reasons else statements
 
 
