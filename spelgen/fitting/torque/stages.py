@@ -124,23 +124,16 @@ def choose_friction_state(estimate: TorqueEstimate) -> TorqueEstimate:
     displacement. If bristles are fitted to a joint with rate-only friction, wrong inertias compensate this delay. The
     evidence of a joint is 2 log(L with bristles / L without bristles), with the marginal likelihood L of its torque.
 
-    - If the sum of the evidence of all joints is positive, joints have bristles by default. A joint has rate-only
-      friction if its evidence is below -`TUNING.strong_evidence`, and its torque residual is significantly smaller
-      without bristles (t test on ten blocks of the log). The second test is needed because correlated errors make the
-      evidence of a single joint unreliable.
-    - Otherwise, a joint has bristles only if its evidence is above `TUNING.strong_evidence`.
+    The joints with bristles are chosen by `_rejected`.
     """
     friction = estimate.problem.jacobian.model.friction
-    residual = estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
+    residual = _torque_residual(estimate)
     friction.memoryless.fill_(0.0)
     # The noise is estimated again, since bristles explain more of the torque than rate-only friction does.
     problem, state = _least_squares_noise_fit(estimate.problem, estimate.state)
     hysteretic = alternate(problem, state)
     evidence = log_likelihood_ratio(hysteretic, estimate) - fraction_occam_factor(hysteretic)
-    rate_only = _rejected(evidence)
-    if evidence.sum() > 0:
-        bristle_residual = hysteretic.problem.jacobian.residual_samples(hysteretic.state.x).torque_residual
-        rate_only &= _smaller_in_most_blocks(residual, bristle_residual)
+    rate_only = _rejected(evidence, _torque_residual(hysteretic), residual)
     friction.memoryless.copy_(rate_only)
     if rate_only.all():
         return estimate
@@ -172,9 +165,7 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     - Saturation is tested first, and removed at all joints if the sum of their evidence is negative. The evidence of
       each joint is limited to +-`TUNING.strong_evidence`, so that no single joint decides: at a joint with very strong
       evidence, saturation may explain another error of the model, and would then be wrong at other speeds.
-    - Then all effects of a joint are tested together. If the sum of the evidence over the joints is positive, they are
-      removed only at joints with strong evidence against them; otherwise at all joints without strong evidence for them
-      (`_rejected`).
+    - Then all effects of a joint are tested together (`_rejected`).
     """
     # Penalty of Akaike's criterion for one parameter (IEEE Trans. Autom. Control 19:716, 1974).
     penalty, limit = 2.0, TUNING.strong_evidence
@@ -187,7 +178,8 @@ def choose_friction_effects(estimate: TorqueEstimate) -> TorqueEstimate:
     # `effects`: row k contains the indices in x of the coefficients of joint k, one per effect.
     effects = torch.stack([index[name] for name in rigid.names("effects", "load_dependence")], dim=-1)
     plain = _without(estimate, effects.flatten())
-    rejected = _rejected(log_likelihood_ratio(estimate, plain) - penalty)
+    evidence = log_likelihood_ratio(estimate, plain) - penalty
+    rejected = _rejected(evidence, _torque_residual(estimate), _torque_residual(plain))
     if rejected.all():
         return plain
     return _without(estimate, effects[rejected].flatten()) if rejected.any() else estimate
@@ -235,15 +227,29 @@ def fraction_occam_factor(estimate: TorqueEstimate) -> torch.Tensor:
     return prior.logdet() - estimate.covariance[block].logdet()
 
 
-def _rejected(evidence: torch.Tensor) -> torch.Tensor:
-    """Return a mask (n,), True for joints at which a model of friction is rejected.
+def _torque_residual(estimate: TorqueEstimate) -> torch.Tensor:
+    """Return the torque residual of an estimate at its samples, (T, n) [Nm, N]."""
+    return estimate.problem.jacobian.residual_samples(estimate.state.x).torque_residual
+
+
+def _rejected(evidence: torch.Tensor, residual: torch.Tensor, simple_residual: torch.Tensor) -> torch.Tensor:
+    """Return a mask (n,), True for joints at which a model of friction is rejected in favour of a simpler one.
 
     If the sum of the evidence over all joints favours the model, it is rejected only at joints with strong evidence
     against it. Otherwise it is rejected at all joints without strong evidence for it: the gears of an arm have similar
-    friction, so the sum decides at joints with weak evidence. evidence: (n,), twice the log of the likelihood ratio;
-    positive values favour the model.
+    friction, so the sum decides at joints with weak evidence. Correlated errors make the evidence of a single joint
+    unreliable. Strong evidence therefore counts only if the torque residual of the favoured model is significantly
+    smaller, too (t test on ten blocks of the log).
+
+    Args:
+        evidence: (n,), twice the log of the likelihood ratio; positive values favour the model.
+        residual: (T, n) torque residual of the model [Nm, N].
+        simple_residual: (T, n) torque residual of the simpler model [Nm, N].
     """
-    return evidence < -TUNING.strong_evidence * evidence.sum().sign()
+    if evidence.sum() > 0:
+        against = evidence < -TUNING.strong_evidence
+        return against & _smaller_in_most_blocks(simple_residual, residual)
+    return ~((evidence > TUNING.strong_evidence) & _smaller_in_most_blocks(residual, simple_residual))
 
 
 def fit_residual_terms(
