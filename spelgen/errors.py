@@ -66,8 +66,19 @@ class OptionError(SettingsError):
         self.args = (option, belongs)
 
 
+@dataclass(eq=False, repr=False)
 class LogError(SpelgenError):
-    """Measured data is missing, malformed or inconsistent with its description."""
+    """Measured data is missing, malformed or inconsistent with its description.
+
+    ``codes`` are the codes of the checks that found the fault; the option ``--accept CODE`` omits a check.
+    """
+
+    _: KW_ONLY
+    codes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        options = " ".join(f"--accept {code}" for code in self.codes)
+        return super().__str__() + (f"; {options} if it is right" if options else "")
 
 
 class ModuleError(SpelgenError):

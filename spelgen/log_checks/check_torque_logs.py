@@ -114,7 +114,9 @@ class TorqueLogs:
         # correction of the log fit best. Errors about the unit of positions, which is only guessed from their range,
         # are no obstacle: if the fit to the torques determines the unit, an error with this unit replaces the guess.
         self._guessed = summary.guessed
-        guesses = [x for x in summary.errors if self._guessed and "--accept degrees" in str(x)]
+        guesses = [
+            x for x in summary.errors if self._guessed and isinstance(x, LogError) and "degrees" in x.codes
+        ]
         is_sound = bool(guesses) or not summary.errors
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
@@ -364,7 +366,7 @@ class TorqueLogs:
         return LogError(
             f"torques that are, from about {change.time:.2g} s after the start on, {torque}", file=file,
             element=f"trajectory {name}{joints}, tau", expected="one scale and zero of the torques in a recording",
-            do=f"use the part before or after it; --accept {CHANGED} if it is right",
+            do="use the part before or after it", codes=(CHANGED,),
         )  # fmt: skip
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:

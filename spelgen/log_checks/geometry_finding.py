@@ -68,8 +68,8 @@ def geometry_finding(
     code = faults[0].minor_code(correction)
     if code and len(faults) == 1:
         return Diagnostic("warning", code, where, None, f"{got}; {do}")
-    do += f"; {' '.join(f'--accept {fault.code}' for fault in faults)} if it is right"
-    return LogError(got, element=where, expected=RIGHT, do=do)
+    codes = tuple(fault.code for fault in faults)
+    return LogError(got, element=where, expected=RIGHT, do=do, codes=codes)
 
 
 def find_unexplained(
@@ -102,8 +102,8 @@ def find_unexplained(
     )
     if best is None:
         return Diagnostic("warning", UNEXPLAINED, where, None, f"{got}; {do}")
-    do += f"; --accept {UNEXPLAINED} if it is right"
-    return LogError(got, element=where, expected="joint torques of a rigid arm with friction", do=do)
+    expected = "joint torques of a rigid arm with friction"
+    return LogError(got, element=where, expected=expected, do=do, codes=(UNEXPLAINED,))
 
 
 def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> tuple[np.ndarray, float]:

@@ -115,8 +115,8 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
         "torques without sign: they keep one direction, although the motion needs both (with signs, the squared torque "
         f"error of least squares falls to {ratio[joints].max():.1%})"
     )
-    do = f"log torques or currents with their sign; --accept {UNSIGNED} if it is right"
-    return [LogError(got, element=where, expected="torques in both directions", do=do)]
+    do, codes = "log torques or currents with their sign", (UNSIGNED,)
+    return [LogError(got, element=where, expected="torques in both directions", do=do, codes=codes)]
 
 
 def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
@@ -158,9 +158,9 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
                 f"torques that stop at {limits} {unit} in {flat.shares[is_clipped, k].sum():.1%} of the "
                 f"samples, in which the motion needs up to {needed:.4g} {unit} by least squares on the others"
             )
-            do = f"log torques without this limit, or record slower motion; --accept {CLIPPED} if it is right"
-            where = f"joint {coordinate.name!r}, tau"
-            findings.errors.append(LogError(got, element=where, expected="the torques that moved it", do=do))
+            where, expected = f"joint {coordinate.name!r}, tau", "the torques that moved it"
+            do = "log torques without this limit, or record slower motion"
+            findings.errors.append(LogError(got, element=where, expected=expected, do=do, codes=(CLIPPED,)))
     for k, coordinate in enumerate(problem.arm.coordinates if not findings.errors else ()):
         for level, rows in zip(flat.q[:, k], at_position[..., k], strict=True):
             difference = _median((np.abs(residual) - certain * deviation)[rows, k])

@@ -120,8 +120,10 @@ class Findings:
         do = mapping_line(keys) if keys else check.do
         if is_partial:
             do = f"{do} if this is true of all recordings; else correct this one, or omit it"
-        do = f"{do}; --accept {check.code} if it is right"
-        self.errors.append(LogError(message, file=file, element=where, expected=check.expected, do=do))
+        codes = (check.code,)
+        self.errors.append(
+            LogError(message, file=file, element=where, expected=check.expected, do=do, codes=codes)
+        )
 
 
 def run_checks(
