@@ -165,6 +165,23 @@ def test_two_reversed_joints_are_not_taken_for_a_third(shared):
     assert "torques of either sense" in error
 
 
+@pytest.mark.parametrize("arm", ["ur10e", "panda"], indirect=True)
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_torques_of_one_joint_that_are_half_or_twice_as_large_are_named(arm, factor):
+    """Other joints carry the same links: their torques and the inertials show the factor of one joint's torques."""
+    log = recorded(arm, 4, excitation, 0.01)
+    tau = log.tau.copy()
+    tau[:, 2] *= factor
+    report = check_logs([replace(log, tau=tau)], arm)
+    (warning,) = [x for x in report.findings if x.code == "torque-scale"]
+    name = arm.chain.joint_names[2]
+    assert (
+        f"joint {name!r}" in warning.where and f"torques about {factor:g} times as large" in warning.message
+    )
+    assert f"write 'joints: {{{name}: {{gain: {1 / factor:g}}}}}' under 'logs'" in warning.message
+    assert report.errors == ()
+
+
 def slowly(arm, rng):
     """Return 8 s of motion at up to 0.15 Hz: torques contain hardly any inertia."""
     t = np.arange(0.0, 8.0, 1 / RATE)

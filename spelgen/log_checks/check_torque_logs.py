@@ -12,7 +12,7 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import UNITS, TorqueSense
+from spelgen.identification.column_faults import UNITS, TorqueGain, TorqueSense
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
 from spelgen.identification.hypotheses import Correction, Fault, HypothesisFit
@@ -326,6 +326,13 @@ class TorqueLogs:
             yield change
             return
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
+        # Factors of single torques are tested by themselves: combined with other faults, they could explain any log.
+        is_open = np.array([self._mapping.unit("tau", name) is None for name in self._arm.chain.joint_names])
+        if is_open.any() and not self._guessed:
+            base, *scaled = compare_hypotheses(problem, [TorqueGain(is_open)])
+            limit = min([base.cost - TorqueGain.needed, *(x.cost - GEOMETRY.ambiguous for x in better)])
+            if scaled and scaled[0].cost < limit:
+                unchanged, better = base, scaled
         unexplained = find_unexplained(problem, unchanged, better[0] if better else None)
         if isinstance(unexplained, LogError) and UNEXPLAINED in accepted:
             return
