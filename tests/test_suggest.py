@@ -740,39 +740,3 @@ def test_matrices_with_a_column_per_time_are_to_be_transposed(scara, tmp_path):
     np.savez(tmp_path / "log.npz", t=T, q=Q.T, qd=QD.T, tau=TAU.T)
     with pytest.raises(LogError, match="transpose it: rows are times"):
         suggested(tmp_path / "log.npz", scara)
-
-
-@pytest.mark.parametrize("form", ["data/demo_{}/{}", "episode{}/obs/{}"])
-@pytest.mark.parametrize("times", [True, False])
-def test_an_archive_with_a_folder_for_each_recording_is_read_as_several_recordings(
-    scara, tmp_path, form, times
-):
-    """NPZ archives of HDF5 files of robomimic have the arrays `data/demo_0/...`, `data/demo_1/...` and so on."""
-    signals = {"joint_pos": Q, "joint_vel": QD, "joint_torque": TAU, **({"t": T} if times else {})}
-    lengths = (150, 200, 199)
-    arrays = {form.format(k, x): y[:n] for k, n in enumerate(lengths) for x, y in signals.items()}
-    np.savez(tmp_path / "log.npz", **arrays)
-    text = suggest_mapping(tmp_path / "log.npz", scara.chain.joint_names).text
-    (tmp_path / "log.yaml").write_text(text.replace("sample_rate:", "sample_rate: 125"))
-    found = read_logs(tmp_path / "log.npz", scara, tmp_path / "log.yaml")
-    assert [(x.name, len(x)) for x in found] == [("0", 150), ("1", 200), ("2", 199)]
-    require_same(found[1])
-
-
-def test_names_of_joints_in_single_columns_that_differ_between_rows_are_an_error(scara, tmp_path):
-    joints, orders = scara.chain.joint_names, ([0, 1, 2, 3], [2, 0, 3, 1])
-    head = ["t", *(f"{x}{k}" for x in ("name", "position", "velocity", "effort") for k in range(4))]
-
-    def rows(orders):
-        for k, t in enumerate(T):
-            order = orders[k % len(orders)]
-            yield [t, *(joints[j] for j in order), *(x[k, j] for x in (Q, QD, TAU) for j in order)]
-
-    found, _ = suggested(written(tmp_path / "log.csv", head, rows(orders[1:])), scara)
-    require_same(found)
-    wrong = written(tmp_path / "wrong.csv", head, rows(orders))
-    message = "column name0: got names of joints that differ between rows"
-    with pytest.raises(LogError, match=message):
-        suggest_mapping(wrong, joints)
-    with pytest.raises(LogError, match=message):
-        read_logs(wrong, scara, tmp_path / "log.yaml")

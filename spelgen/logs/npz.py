@@ -18,11 +18,6 @@ from spelgen.settings.log_mapping import LogMapping
 # Names of the optional array with the joints' names, in the order of matrix columns, such as `joints`, `joint_names`.
 JOINT_NAMES = re.compile(r"(joint|dof|motor|actuator)(s|_?names?)", re.IGNORECASE)
 TRAJECTORY = "{trajectory}"
-# Beginning of the name of an array in an archive with several recordings, such as `data/demo_0/` of robomimic.
-RECORDING = re.compile(
-    r"((?:[^/]+/)*?[^/\d]*(?:demo|episode|ep|traj|trajectory|trial|run|rollout|recording|rec)[_-]?)(\d+)/",
-    re.IGNORECASE,
-)
 
 
 class NpzArrays:
@@ -80,14 +75,11 @@ class NpzArrays:
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return one table per recording in an NPZ archive; only the arrays that the mapping names are read.
 
-    If a name of a column in the mapping contains `{trajectory}`, the archive contains several recordings: with
+    If the mapping's name of the times contains `{trajectory}`, the archive contains several recordings: with
     "t_{trajectory}", the arrays "t_a" and "t_b" are the times of the recordings "a" and "b".
     """
-    arrays, signals = NpzArrays(file), starmap(mapping.column, mapping.signals(joints))
-    # logs without times have a sample rate, and the first column is a signal
-    names = [mapping.columns.t, *(re.sub(r"\[\d+\]$", "", name) for name in signals)]
-    times = next((name for name in names if TRAJECTORY in name), None)
-    if times is None:
+    arrays, times = NpzArrays(file), mapping.columns.t
+    if TRAJECTORY not in times:
         return [_table(None, arrays, joints, mapping)]
     # If the placeholder occurs several times in a name, its first occurrence becomes a wildcard and the others back
     # references to it. Several wildcards could take exponential time on long names.
@@ -152,15 +144,10 @@ def _equally_long(arrays: NpzArrays, names: Sequence[str], vectors: Collection[s
 def _longest(arrays: NpzArrays) -> pa.Table:
     """Return a table of all arrays that have the largest number of rows in the archive, for the draft of a mapping.
 
-    A matrix becomes a column of lists. Of an archive with several recordings (see `RECORDING`), only the first one is
-    used, with the placeholder `{trajectory}` in its names. Raises LogError for an array that may be transposed or one
-    row too short.
+    A matrix becomes a column of lists. Raises LogError for an array that may be transposed or one row too short.
     """
     shapes, faults = {}, []
-    recordings = [match[0] for match in map(RECORDING.match, arrays.names) if match]
     for name in arrays.names:
-        if not name.startswith(recordings[0] if recordings else ""):
-            continue
         try:
             shapes[name] = arrays[name].shape
         # Arrays that are no numbers, such as a dict with the settings of the recorder, contain no signals and are
@@ -186,7 +173,6 @@ def _longest(arrays: NpzArrays) -> pa.Table:
                 name, f"an array of shape {shape}", f"a row for each of the {samples} times", do
             )
     table = _equally_long(arrays, chosen, vectors)
-    table = table.rename_columns([RECORDING.sub(r"\1{trajectory}/", x, 1) for x in table.column_names])
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
 
 

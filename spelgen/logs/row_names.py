@@ -14,8 +14,6 @@ RowsByNames: TypeAlias = dict[tuple[str, ...], pa.ChunkedArray]
 """{list of names: mask (T,) of the rows with this list}. Indices of a mapping refer to the first list."""
 # A text that is the name of a joint, and no number.
 NAME = re.compile(r"[^\W\d][\w/.:-]*")
-# Name of a column with the name of one joint per row, such as `name0` or `/joint_states/name[0]`.
-NAME_COLUMN = re.compile(r".*names?\W?\d+\W?", re.IGNORECASE)
 
 
 def first_list(column: pa.ChunkedArray) -> list[str]:
@@ -35,28 +33,13 @@ def are_names(values: pa.DataType) -> bool:
     return bool(pa.types.is_list(values) and pa.types.is_string(values.value_type))
 
 
-def may_be_names(column: pa.Field) -> bool:
-    """Return True for a column that may contain names of joints: a list of texts per row, or see `NAME_COLUMN`."""
-    is_label = pa.types.is_string(column.type) and NAME_COLUMN.fullmatch(column.name)
-    return are_names(column.type) or bool(is_label)
-
-
 def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> RowsByNames:
     """Return {list of joint names: mask of the rows with this list}; {} if all rows of a table have the same list.
 
     The first list is the first one in the table that contains all joints of the arm, or else the list of the first row.
     A LogError is raised if the rows are of several arms: no list contains all joints of the arm, and some list with at
-    least as many names shares no name with the list of the first row. It is also raised if the names are not in lists,
-    but in a column for each position, and differ between rows. names: {joint: its name in the log}.
+    least as many names shares no name with the list of the first row. names: {joint: its name in the log}.
     """
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        labels = column.unique().drop_null().to_pylist() if NAME_COLUMN.fullmatch(name) else []
-        if len(labels) > 1 and not set(names.values()).isdisjoint(labels):
-            raise LogError(
-                f"names of joints that differ between rows: {', '.join(map(str, labels[:3]))}", file=file,
-                element=f"column {name}", expected="one order of the joints in all rows",
-                do="sort the values of each row by the names of the row",
-            )  # fmt: skip
     lengths = [len(first_list(column)) for column in table.columns]
     for column in table.columns:
         if are_names(column.type):
