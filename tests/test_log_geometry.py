@@ -165,6 +165,30 @@ def test_two_reversed_joints_are_not_taken_for_a_third(shared):
     assert "torques of either sense" in error
 
 
+def slowly(arm, rng):
+    """Return 8 s of motion at up to 0.15 Hz: torques contain hardly any inertia."""
+    t = np.arange(0.0, 8.0, 1 / RATE)
+    omega, phase = 2 * np.pi * rng.uniform(0.06, 0.15, (2, 1, len(arm.chain.coordinates))), rng.uniform(0, 6, 2)
+    return t, sum(0.4 * np.sin(x * t[:, None] + y) for x, y in zip(omega, phase, strict=True))
+
+
+@pytest.mark.parametrize("arm", ["rpr"], indirect=True)
+def test_a_reversed_torque_that_another_link_explains_is_named_with_the_link(arm):
+    log = flipped(recorded(arm, 2, slowly, 0.01), 2, False, True)
+    report = check_logs([log], arm)
+    (message,) = [x.message for x in report.findings if x.code == "urdf-inertials"]
+    assert "torques of the opposite sense at joint 'joint3' would explain it" in message
+    assert "write 'joints: {joint3: {gain: -1}}' under 'logs'" in message
+
+
+def test_friction_with_hysteresis_does_not_hide_a_reversed_torque(shared):
+    """The last joint of the xArm6 carries no gravity: only friction and inertia show the sign of its torque."""
+    arm = load_arm(shared / "arms" / "xarm6.urdf")
+    log = recorded(arm, 0, excitation, 0.01)
+    assert check_logs([log], arm).errors == ()
+    assert "joint 'joint6': got torques of the opposite sense" in told(arm, flipped(log, 5, False, True))
+
+
 @pytest.mark.parametrize("angle", [90, 180, -90, 37])
 def test_a_zero_offset_is_named_to_a_tenth_of_a_radian(arm, angle, tmp_path):
     rng = np.random.default_rng(angle % 360)

@@ -360,11 +360,14 @@ class GeometryProblem:
         armature, viscous, coulomb = (self._bodies + n * effect + drives for effect in range(3))
         functionals = np.zeros((2 * n + len(self._last), len(x)))
         functionals[drives, armature] = 1.0
-        # `functionals` @ x: first the n rotor inertias, then for each joint the power dissipated by friction, qd
-        # (viscous qd + Coulomb sign(qd)), summed over the samples. The sums of qd^2 and qd sign(qd) are entries of the
-        # joint's Gram matrix. The last rows are the mass and moments of inertia of bodies that carry no joint.
-        functionals[n + drives, viscous] = normal[drives, viscous, viscous]
-        functionals[n + drives, coulomb] = normal[drives, viscous, coulomb]
+        # `functionals` @ x: first the n rotor inertias, then for each joint the power dissipated by friction, qd times
+        # the friction torque, summed over the samples. The sums of qd times a column of friction are entries of the
+        # joint's Gram matrix. Columns of bristles, if there are any, are the last ones: without them, friction with
+        # hysteresis could drive the motion. The last rows are the mass and moments of inertia of bodies that carry no
+        # joint.
+        bristles = np.arange(self._bodies + n * len(FRICTION.effects), len(x)).reshape(n, -1).T
+        for columns in (viscous, coulomb, *bristles):
+            functionals[n + drives, columns] = normal[drives, viscous, columns]
         functionals[2 * n + np.arange(len(self._last)), self._last] = 1.0
         negative = np.minimum(functionals @ x, 0.0)
         variance = (functionals @ covariance * functionals).sum(axis=1)

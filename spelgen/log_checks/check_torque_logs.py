@@ -12,10 +12,10 @@ import numpy as np
 
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
-from spelgen.identification.column_faults import UNITS
+from spelgen.identification.column_faults import UNITS, TorqueSense
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
-from spelgen.identification.hypotheses import Fault, HypothesisFit
+from spelgen.identification.hypotheses import Correction, Fault, HypothesisFit
 from spelgen.identification.least_squares import varying
 from spelgen.identification.load_changes import LoadChange, load_changes, torque_change
 from spelgen.identification.log_geometry import GeometryProblem
@@ -340,7 +340,7 @@ class TorqueLogs:
             return
         faults = better[0].hypothesis.faults if better else ()
         if not better or {fault.code for fault in faults} <= accepted:
-            yield from () if better else _link_notes(problem, unchanged)
+            yield from () if better else _link_notes(problem, self._mapping, unchanged)
             if WITHOUT_GRAVITY not in accepted:
                 yield from _without_gravity(problem, [joint.report for joint in evidence])
             return
@@ -349,7 +349,7 @@ class TorqueLogs:
         # this difference, so warnings about links are added.
         changed = better[0].hypothesis.scale != problem.unchanged.scale
         if changed.sum() == 1 and not any(fault.needed for fault in faults):
-            yield from _link_notes(problem, unchanged)
+            yield from _link_notes(problem, self._mapping, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
     def _torque_change(self, problem: GeometryProblem) -> LogError | None:
@@ -449,7 +449,9 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
             yield Diagnostic("warning", WITHOUT_GRAVITY, f"joint {name!r}", None, message)
 
 
-def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagnostic]:
+def _link_notes(
+    problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFit
+) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
     The first moment is the mass times the centre of mass. The ratio is the least-squares ratio of the torque due to the
@@ -483,13 +485,32 @@ def _link_notes(problem: GeometryProblem, fit: HypothesisFit) -> Iterator[Diagno
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
             message = (
-                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: check its mass and "
-                "centre of mass in the URDF"
+                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: "
+                f"{_reversed_torque(problem, mapping) if ratio < 0 else ''}check its mass and centre of mass in the URDF"
             )
             if all(x.parent != k for x in problem.arm.bodies):
                 message += ", or add the tool or load that it carries"
             yield Diagnostic("warning", WRONG_LINK, f"link {body.link!r}", None, message)
             break
+
+
+def _reversed_torque(problem: GeometryProblem, mapping: LogMapping) -> str:
+    """Return the advice to correct a torque of the opposite sense, if this fits the log better; otherwise "".
+
+    The reversed torque of a joint and a reversed first moment of its link explain gravity equally well. Only friction
+    that drives the motion, or a negative rotor inertia, then shows the reversed torque. They are no certain evidence,
+    since a drive may compensate friction.
+    """
+    coarse = problem.thinned(GEOMETRY.coarse_samples)
+    unchanged, sense = coarse.fit(problem.unchanged), TorqueSense(len(problem.arm.joint_names))
+    best = min(sense.fits(coarse, unchanged), key=lambda fit: fit.cost)
+    stateful = coarse.with_hysteresis()
+    decreases = (x.fit(problem.unchanged).cost - x.fit(best.hypothesis).cost for x in (coarse, stateful))
+    if min(decreases) < GEOMETRY.ambiguous:
+        return ""
+    correction = Correction(problem.arm, mapping, False, problem.unchanged, best.hypothesis)
+    joints = ", ".join(map(repr, sense.joints(correction)))
+    return f"{sense.text(correction)} at joint {joints} would explain it: write {correction.lines()}, or "
 
 
 def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic:
