@@ -827,7 +827,7 @@ OF_ROW = {
 
 
 @pytest.mark.parametrize("rows", OF_ROW)
-@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet"])
+@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet", "cells.csv", "cells.parquet"])
 def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, suffix):
     """Each value is assigned by the joint name in its row, if rows have other names or their joints in another order.
 
@@ -842,7 +842,15 @@ def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, s
             lists = {"position": values, "velocity": values + 1, "effort": values + 2}
             log.append({"time": now, "name": list(names)} | {x: y.tolist() for x, y in lists.items()})
     path = tmp_path / f"x.{suffix}"
-    if suffix == "jsonl":
+    if suffix.startswith("cells"):
+        log = [
+            {"time": row.pop("time")}
+            | {f"{x}{k}": y for x, cells in row.items() for k, y in enumerate(cells)}
+            for row in log
+        ]
+        table = pa.Table.from_pydict({x: [row.get(x) for row in log] for x in max(log, key=len)})
+        (pa.parquet.write_table if suffix.endswith("parquet") else pa.csv.write_csv)(table, path)
+    elif suffix == "jsonl":
         path.write_text("\n".join(map(json.dumps, log)))
     elif suffix == "parquet":
         pa.parquet.write_table(pa.Table.from_pylist(log), path)
