@@ -389,6 +389,33 @@ def test_a_trajectory_named_twice_in_a_column_is_one_text(tmp_path):
     assert [x.name for x in found] == ["a", "b"]
 
 
+@pytest.mark.parametrize("form", ["demo_{}/{}", "data/demo_{}/obs/{}", "{}_{}", "{1}_{0}"])
+@pytest.mark.parametrize("timed", [True, False])
+def test_numbered_demonstrations_of_an_archive_are_drafted_as_recordings(tmp_path, form, timed):
+    """Arrays that differ in one number, as of HDF5 groups, are recordings; `sample_rate` replaces absent times."""
+    arrays = {}
+    for k in range(3):
+        quantities = {"q": Q + k, "qd": QD, "tau": TAU} | ({"t": T} if timed else {})
+        arrays |= {form.format(k, name): values for name, values in quantities.items()}
+    np.savez(tmp_path / "x.npz", **arrays, filters=["all", "none"])
+    text = suggest_mapping(tmp_path / "x.npz", JOINTS).text
+    found = read_logs(
+        tmp_path / "x.npz", JOINTS, yaml.safe_load(text.replace("sample_rate:", "sample_rate: 100"))
+    )
+    assert [x.name for x in found] == ["0", "1", "2"]
+    for k, log in enumerate(found):
+        np.testing.assert_allclose(log.q, Q + k)
+        np.testing.assert_allclose(log.t, T)
+
+
+def test_numbered_arrays_with_shared_times_are_of_several_arms(tmp_path):
+    """Arrays that have the times of a common array are simultaneous signals, and no recordings one after another."""
+    arrays = {f"{name}_{k}": x + k for name, x in (("q", Q), ("qd", QD), ("tau", TAU)) for k in range(2)}
+    np.savez(tmp_path / "x.npz", t=T, **arrays)
+    with pytest.raises(LogError, match="positions of 2 arms"):
+        suggest_mapping(tmp_path / "x.npz", JOINTS)
+
+
 def test_repeated_patterns_do_not_backtrack(tmp_path):
     """A column pattern with six placeholders is matched quickly against a name of 5000 letters.
 
