@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from test_log_geometry import arm, excitation, mended, recorded, told  # noqa: F401  (a fixture)
 
 from spelgen.arm.configured_arm import load_arm
@@ -49,6 +50,26 @@ def test_torques_of_all_joints_that_are_late_have_one_line(arm):  # noqa: F811
     late = np.stack([np.interp(log.t - 0.09, log.t, x) for x in log.tau.T], axis=1)
     error = told(arm, replace(log, tau=late))
     assert "'torque_delay: 0.0" in error and "all joints" in error and "delay: {" not in error
+
+
+@pytest.mark.parametrize("delay", [0.3, 0.45, -0.25])
+def test_torques_of_all_joints_that_are_late_by_several_tenths_of_a_second_have_no_wrong_clock(arm, delay):  # noqa: F811
+    log = recorded(arm, 12, noise=0.01)
+    late = np.stack([np.interp(log.t - delay, log.t, x) for x in log.tau.T], axis=1)
+    error = told(arm, replace(log, tau=late)[50:-50])
+    assert float(re.search(r"'torque_delay: (-?[\d.]+)' under", error)[1]) == pytest.approx(delay, abs=0.015)
+
+
+@pytest.mark.parametrize("joints", [slice(None), [1]])
+@pytest.mark.parametrize("cutoff", [1.0, 2.0])
+def test_torques_after_a_low_pass_filter_are_not_called_late(arm, cutoff, joints):  # noqa: F811
+    log = recorded(arm, 12, noise=0.01)
+    keep, tau = np.exp(-2 * np.pi * cutoff * np.diff(log.t[:2])[0]), log.tau.copy()
+    tau[:, joints] = lfilter([1 - keep], [1, -keep], tau[:, joints], axis=0, zi=keep * tau[:1, joints])[0]
+    error = told(arm, replace(log, tau=tau))
+    named = re.search(r"after a low-pass filter of about ([\d.]+) Hz", error)
+    assert float(named[1]) == pytest.approx(cutoff, rel=0.2)
+    assert "write" not in error and "log the torques without this filter" in error
 
 
 @pytest.mark.parametrize(("rate", "torque"), [(1.015, True), (0.985, True), (1.006, False)])

@@ -168,7 +168,8 @@ def test_two_reversed_joints_are_not_taken_for_a_third(shared):
 def slowly(arm, rng):
     """Return 8 s of motion at up to 0.15 Hz: torques contain hardly any inertia."""
     t = np.arange(0.0, 8.0, 1 / RATE)
-    omega, phase = 2 * np.pi * rng.uniform(0.06, 0.15, (2, 1, len(arm.chain.coordinates))), rng.uniform(0, 6, 2)
+    omega = 2 * np.pi * rng.uniform(0.06, 0.15, (2, len(arm.chain.coordinates)))
+    phase = rng.uniform(0, 6, 2)
     return t, sum(0.4 * np.sin(x * t[:, None] + y) for x, y in zip(omega, phase, strict=True))
 
 

@@ -118,8 +118,16 @@ class GeometryProblem:
 
         For example, `signs` restores the signs of torques that were logged as magnitudes.
         """
+        return self._on_torques(self.samples.values[:, :, 3] * signs[..., None])
+
+    def with_added_torques(self, torques: np.ndarray) -> GeometryProblem:
+        """Return the least-squares problem with `torques` (S, n), in the unit of the log, added to the torques."""
+        return self._on_torques(self.samples.values[:, :, 3] + torques[..., None])
+
+    def _on_torques(self, tau: np.ndarray) -> GeometryProblem:
+        """Return the least-squares problem with the torques tau (S, n, E), in the unit of the log."""
         other, values = copy(self), self.samples.values.copy()
-        values[:, :, 3] *= signs[..., None]
+        values[:, :, 3] = tau
         other.samples = self.samples._replace(values=values)
         return other
 

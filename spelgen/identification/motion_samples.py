@@ -86,14 +86,14 @@ class MotionSamples(NamedTuple):
         """Return q, qd, qdd and tau (S, n, 4) at the times `delays` [s] after the samples, interpolated by a spline.
 
         A sample has the signals at E times around it (`values`), up to `longest_delay` before and after it. `delays` of
-        shape (n, 4) are common to all samples and at most `longest_delay` in magnitude: a signal is interpolated
-        between the E values of its sample. `delays` of shape (S, n, 4) may be of any magnitude: a signal is
+        shape (n, 4) are common to all samples. If they are at most `longest_delay` in magnitude, a signal is
+        interpolated between the E values of its sample. Otherwise, and for `delays` of shape (S, n, 4), a signal is
         interpolated between the E values of the sample nearest to the delayed time.
         """
         if not delays.any():
             return self.central
         spline = interpolation()
-        if delays.ndim == 2:
+        if delays.ndim == 2 and np.abs(delays).max() <= self.longest_delay:
             return np.asarray(np.einsum("snie,nie->sni", self.values, spline(delays)))
         # `present`: times of the samples on a common axis. 1e6 s are added from one recording to the next, so that the
         # nearest sample always belongs to the same recording.
@@ -101,7 +101,7 @@ class MotionSamples(NamedTuple):
         times = present[:, None, None] + delays
         nearest = np.searchsorted((present[1:] + present[:-1]) / 2, times)
         rest = np.clip(times - present[nearest], -self.longest_delay, self.longest_delay)
-        joint, signal = np.ogrid[: delays.shape[1], :4]
+        joint, signal = np.ogrid[: delays.shape[-2], :4]
         return np.asarray(np.einsum("snie,snie->sni", self.values[nearest, joint, signal], spline(rest)))
 
     @property

@@ -14,6 +14,7 @@ import numpy as np
 
 from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.motion_samples import interpolation
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.logs.joint_signals import plain_number
 
@@ -37,8 +38,8 @@ class Delay(Fault):
         apparent delays. Nothing is yielded if the hypothesis of the fit `base` already has a delay, or if the samples
         do not contain the signals at earlier and later times, which delayed signals need.
         """
-        reading, longest, reference = base.hypothesis, problem.samples.longest_delay, base
-        if not longest or reading.delay.any():
+        reading, reference = base.hypothesis, base
+        if not problem.samples.longest_delay or reading.delay.any():
             return
         for signals in _delayed_signals(len(reading.offset)):
 
@@ -52,13 +53,15 @@ class Delay(Fault):
             # The descent starts at the best of three delays: a Gauss-Newton step from 0 would be too short for noisy
             # torques, whose derivative with respect to time is mostly noise.
             starts = GEOMETRY.delay_start * np.array([[0.0], [1.0], [-1.0]])
+            start = min(starts, key=lambda x: problem.fit(delayed(x)).cost)
             delay, delayed_fit = problem.descend(
-                delayed, min(starts, key=lambda x: problem.fit(delayed(x)).cost), largest=0.05, smallest=0.002,
-                allowed=lambda x: np.clip(x, -longest, longest),
+                delayed, min((start, 4 * start), key=lambda x: problem.fit(delayed(x)).cost), largest=0.1,
+                smallest=0.002, allowed=lambda x: np.clip(x, -GEOMETRY.longest_delay, GEOMETRY.longest_delay),
             )  # fmt: skip
             if abs(delay[0]) >= GEOMETRY.min_delay:
                 fit = problem.fit(delayed(delay.round(3)))
-                yield from [fit] if _explains_more(problem, reference, fit) else []
+                if _explains_more(problem, reference, fit):
+                    yield _low_passed(problem, base, fit) or fit
             elif signals[1].all() and delayed_fit.cost < base.cost:
                 # The delay of one joint must explain more than a short delay of all torques, which is not reported.
                 reference = delayed_fit
@@ -93,6 +96,20 @@ class Delay(Fault):
         if not delay.any() or (delay != delay[0]).any():
             return {}
         return {"torque_delay": plain_number(correction.mapping.torque_delay + delay[0])}
+
+
+class LowPass(Delay):
+    """Kind of fault of a log: torques that a low-pass filter delays, as the filter of a drive or sensor does."""
+
+    advice = "no setting corrects it: log the torques without this filter"
+
+    def __init__(self, lag: float) -> None:
+        """Define the filter by its time constant `lag` [s]."""
+        self._lag = lag
+
+    def text(self, correction: Correction) -> str:
+        """Return the text about the filter with its cutoff frequency."""
+        return f"torques after a low-pass filter of about {1 / (2 * np.pi * self._lag):.2g} Hz"
 
 
 class JointClock(Fault):
@@ -205,6 +222,26 @@ class JointClock(Fault):
         """Return the names of the joints that have a signal with another clock according to `correction`."""
         names = np.array(correction.arm.joint_names)
         return list(names[correction.hypothesis.drift.any(axis=0)].tolist())
+
+
+def _low_passed(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> HypothesisFit | None:
+    """Return `fit`, the fit with delayed torques, with the fault `LowPass` if this fault explains them better.
+
+    A first-order low-pass filter with the time constant T has the output tau for the input tau + T dtau/dt. The torques
+    are replaced by this input, with the T of lowest cost, and their residual is compared with the residual of `fit`.
+    base: fit without the delay.
+    """
+    delay = fit.hypothesis.delay
+    if delay[0].any() or delay.min() < 0:
+        return None
+    rate = problem.samples.values[:, :, 3] @ interpolation()(0.0, 1)
+    lags = float(delay.max()) * np.linspace(0.9, 1.6, 8)
+    inputs = [problem.with_added_torques(lag * (delay[1] > 0) * rate) for lag in lags]
+    errors = np.array([x.fit(base.hypothesis).errors.mean() for x in inputs])
+    if errors.min() > GEOMETRY.delay_gain * fit.errors.mean():
+        return None
+    reading = base.hypothesis.changed(LowPass(float(lags[errors.argmin()])), delay=delay)
+    return replace(fit, hypothesis=reading)
 
 
 def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: HypothesisFit) -> bool:

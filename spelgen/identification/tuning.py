@@ -113,8 +113,10 @@ class LogGeometryTuning:
     min_shift: float = 0.01
     # [s] Delays of single joints below this bound are not reported: friction causes an apparent delay of up to 30 ms.
     min_delay: float = 0.03
-    # [s] The search for a delay starts from zero, from this delay or from its negative, whichever fits best.
+    # [s] The search for a delay starts from zero, this delay, its quadruple or their negatives, whichever fits best.
     delay_start: float = 0.06
+    # [s] Longest delay that is searched; delays of buffers and of other topics are shorter.
+    longest_delay: float = 0.5
     # [s] Initial guesses of the delay at the end of a log, for the search for the rate of a clock.
     clock_starts: tuple[float, ...] = (-0.4, -0.15, 0.15, 0.4)
     # [1] Largest relative error of a clock's rate. A larger error is rejected, since it would explain other errors of

@@ -449,9 +449,7 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
             yield Diagnostic("warning", WITHOUT_GRAVITY, f"joint {name!r}", None, message)
 
 
-def _link_notes(
-    problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFit
-) -> Iterator[Diagnostic]:
+def _link_notes(problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFit) -> Iterator[Diagnostic]:
     """Yield a warning for each link whose fitted mass or first moment is outside 0.4 to 2.5 times the URDF's.
 
     The first moment is the mass times the centre of mass. The ratio is the least-squares ratio of the torque due to the
@@ -484,9 +482,10 @@ def _link_notes(
             # difference of two standard deviations may occur by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
+            other = _reversed_torque(problem, mapping) if ratio < 0 else ""
             message = (
-                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: "
-                f"{_reversed_torque(problem, mapping) if ratio < 0 else ''}check its mass and centre of mass in the URDF"
+                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: {other}check its mass "
+                "and centre of mass in the URDF"
             )
             if all(x.parent != k for x in problem.arm.bodies):
                 message += ", or add the tool or load that it carries"
