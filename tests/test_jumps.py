@@ -359,20 +359,6 @@ def test_quick_but_sound_signals_have_no_jumps():
         )
 
 
-def test_torque_peaks_of_gears_with_backlash_are_no_outliers():
-    # When the torque of the link changes its sign, the motor crosses the backlash of 1 mrad within some milliseconds.
-    # Its inertia then causes a torque peak, of which a log at 50 Hz contains single samples.
-    t = 0.001 * np.arange(20000)
-    link = np.sin(1.1 * t)
-    motor = 0.0005 * np.tanh(link / 0.006)
-    peaks = 0.2 * np.gradient(np.gradient(motor, t), t)
-    tau = (link + peaks + 0.01 * np.random.default_rng(0).standard_normal(len(t)))[::20]
-    assert np.flatnonzero(np.abs(tau) > 2.2).tolist() == [143, 571, 857]
-    assert not is_outlier(tau, smooth=False).any()
-    tau[500] = 8.0
-    assert np.flatnonzero(is_outlier(tau, smooth=False)).tolist() == [500]
-
-
 def test_velocities_of_single_encoder_steps_are_no_outliers():
     # Slow motion of a coarse encoder, differentiated at 1 kHz: the velocity is 0 or one encoder step per sample, apart
     # from rounding errors.

@@ -79,7 +79,8 @@ def test_c_equals_python_along_recordings(name, tmp_path):
     estimator = Estimator(load_run(saved_run(model, urdf, tmp_path).path), levels=levels)
     compiled = CompiledEstimator(model, arm, levels, *([PLAIN] if name != "ur10e" else []))
     found = compiled.run(log.t, log.q, log.qd, log.tau)
-    require_equal(found, estimator.replay(log), 1e-11)
+    # Rounding differs between processors: on one of them, the difference is 1.2e-11 for the AR5.
+    require_equal(found, estimator.replay(log), 1e-10)
     at = log.q[-1], log.qd[-1], 0.5 * log.qd[-1]
     for ahead, external in ((0.0, False), (0.1, False), (0.1, True), (1.0, True)):
         estimator.compensate_external = external

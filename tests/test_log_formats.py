@@ -389,6 +389,33 @@ def test_a_trajectory_named_twice_in_a_column_is_one_text(tmp_path):
     assert [x.name for x in found] == ["a", "b"]
 
 
+@pytest.mark.parametrize("form", ["demo_{}/{}", "data/demo_{}/obs/{}", "{}_{}", "{1}_{0}"])
+@pytest.mark.parametrize("timed", [True, False])
+def test_numbered_demonstrations_of_an_archive_are_drafted_as_recordings(tmp_path, form, timed):
+    """Arrays that differ in one number, as of HDF5 groups, are recordings; `sample_rate` replaces absent times."""
+    arrays = {}
+    for k in range(3):
+        quantities = {"q": Q + k, "qd": QD, "tau": TAU} | ({"t": T} if timed else {})
+        arrays |= {form.format(k, name): values for name, values in quantities.items()}
+    np.savez(tmp_path / "x.npz", **arrays, filters=["all", "none"])
+    text = suggest_mapping(tmp_path / "x.npz", JOINTS).text
+    found = read_logs(
+        tmp_path / "x.npz", JOINTS, yaml.safe_load(text.replace("sample_rate:", "sample_rate: 100"))
+    )
+    assert [x.name for x in found] == ["0", "1", "2"]
+    for k, log in enumerate(found):
+        np.testing.assert_allclose(log.q, Q + k)
+        np.testing.assert_allclose(log.t, T)
+
+
+def test_numbered_arrays_with_shared_times_are_of_several_arms(tmp_path):
+    """Arrays that have the times of a common array are simultaneous signals, and no recordings one after another."""
+    arrays = {f"{name}_{k}": x + k for name, x in (("q", Q), ("qd", QD), ("tau", TAU)) for k in range(2)}
+    np.savez(tmp_path / "x.npz", t=T, **arrays)
+    with pytest.raises(LogError, match="positions of 2 arms"):
+        suggest_mapping(tmp_path / "x.npz", JOINTS)
+
+
 def test_repeated_patterns_do_not_backtrack(tmp_path):
     """A column pattern with six placeholders is matched quickly against a name of 5000 letters.
 
@@ -827,7 +854,7 @@ OF_ROW = {
 
 
 @pytest.mark.parametrize("rows", OF_ROW)
-@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet"])
+@pytest.mark.parametrize("suffix", ["jsonl", "csv", "parquet", "cells.csv", "cells.parquet"])
 def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, suffix):
     """Each value is assigned by the joint name in its row, if rows have other names or their joints in another order.
 
@@ -842,7 +869,15 @@ def test_values_of_a_row_are_those_of_the_joints_that_it_names(tmp_path, rows, s
             lists = {"position": values, "velocity": values + 1, "effort": values + 2}
             log.append({"time": now, "name": list(names)} | {x: y.tolist() for x, y in lists.items()})
     path = tmp_path / f"x.{suffix}"
-    if suffix == "jsonl":
+    if suffix.startswith("cells"):
+        log = [
+            {"time": row.pop("time")}
+            | {f"{x}{k}": y for x, cells in row.items() for k, y in enumerate(cells)}
+            for row in log
+        ]
+        table = pa.Table.from_pydict({x: [row.get(x) for row in log] for x in max(log, key=len)})
+        (pa.parquet.write_table if suffix.endswith("parquet") else pa.csv.write_csv)(table, path)
+    elif suffix == "jsonl":
         path.write_text("\n".join(map(json.dumps, log)))
     elif suffix == "parquet":
         pa.parquet.write_table(pa.Table.from_pylist(log), path)

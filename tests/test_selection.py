@@ -430,11 +430,24 @@ def test_the_tip_error_is_radius_times_angle_error():
 
 
 @pytest.mark.parametrize(
-    ("evidence", "unlikely"),
-    [((-1.0, -20.0), [True, True]), ((-1.0, 20.0), [False, False]), ((9.0, -20.0), [False, True])],
+    ("evidence", "ratios", "rejected"),
+    [
+        ((-1.0, -20.0), (1.0, 1.0), [True, True]),
+        ((-1.0, 20.0), (1.0, 0.3), [False, False]),
+        ((9.0, -20.0), (0.3, 3.0), [False, True]),
+        # Strong evidence without a significantly smaller residual is ignored.
+        ((-30.0, 20.0), (1.0, 1.0), [True, True]),
+        ((30.0, -20.0), (1.0, 1.0), [False, False]),
+    ],
 )
-def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, unlikely):
-    assert stages._rejected(torch.tensor(evidence)).tolist() == unlikely
+def test_weak_evidence_of_a_joint_yields_to_all_joints(evidence, ratios, rejected):
+    """A friction model is rejected by the sum of the evidence, except at joints with strong evidence.
+
+    ratios: squared residual of the model divided by the squared residual of the simpler model, per joint.
+    """
+    simple = torch.ones(1000, 2).double()
+    residual = simple * torch.tensor(ratios).double().sqrt()
+    assert stages._rejected(torch.tensor(evidence), residual, simple).tolist() == rejected
 
 
 def test_a_friction_state_must_lower_the_residual_in_most_blocks():

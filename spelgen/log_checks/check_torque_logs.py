@@ -215,7 +215,7 @@ class TorqueLogs:
             for error in results:
                 if isinstance(error, LogError) and not str(error.element).startswith("trajectory"):
                     where = f"trajectory {name}, {error.element}"
-                    error = replace(error, file=file, element=where, do=OF_ONE)
+                    error = replace(error, file=file, element=where, do=OF_ONE, codes=())
                 findings += [error] if isinstance(error, LogError) else []
         return findings
 
@@ -491,8 +491,8 @@ def _link_notes(problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFi
                 continue
             other = _reversed_torque(problem, mapping) if ratio < 0 else ""
             message = (
-                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: {other}check its mass "
-                "and centre of mass in the URDF"
+                f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: {other}check its "
+                "mass and centre of mass in the URDF"
             )
             if all(x.parent != k for x in problem.arm.bodies):
                 message += ", or add the tool or load that it carries"

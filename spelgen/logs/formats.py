@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, SpelgenError
 from spelgen.files import local, require_regular_file
-from spelgen.logs.row_names import are_names
+from spelgen.logs.row_names import are_names, sorted_by_names
 from spelgen.logs.tables import Layout, LogFormat, LogTable, reading, stored_columns, table_layout
 from spelgen.settings.log_mapping import LogMapping
 
@@ -96,8 +96,10 @@ def read_tables(path: Path, joints: Sequence[str], mapping: LogMapping) -> Itera
     with reading(path):
         for log in log_format.read(path, joints, mapping):
             layout = table_layout(log, joints, path)
-            names = [x.name for x in log.schema if are_names(x.type)]
-            yield layout, log.read([*stored_columns(layout, log.schema.names), *names])
+            names = [x.name for x in log.schema if are_names(x)]
+            table = log.read([*stored_columns(layout, log.schema.names), *names])
+            of_columns = [layout.mapping.log_name(joint) for _, joint in layout.mapping.signals(joints)]
+            yield layout, sorted_by_names(table, dict(zip(layout.columns[1:], of_columns, strict=True)))
 
 
 def log_files(paths: LogPaths, role: str | None = None) -> tuple[list[Path], list[SpelgenError]]:

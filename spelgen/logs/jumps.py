@@ -75,9 +75,8 @@ def is_lost(values: np.ndarray) -> np.ndarray:
 def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     """Return a mask (T,) of the samples that are lost (see `is_lost`) or outliers.
 
-    An outlier is one of at most five samples between two opposite jumps. Torques and velocities may have genuine steps
-    and peaks: their outliers must also lie outside the range of all other samples by more than this range. A peak of a
-    single sample occurs, for example, when gears with backlash change the tooth flank.
+    An outlier is one of at most five samples between two opposite jumps. Torques and velocities may have genuine steps:
+    their outliers must also lie outside the range of all other samples by more than half of this range.
 
     smooth: True for positions, which change gradually; False for torques and velocities.
     """
@@ -123,9 +122,7 @@ def is_outlier(values: np.ndarray, *, smooth: bool) -> np.ndarray:
     if smooth or not outliers.any():
         return outliers
     inliers = values[~outliers]
-    # Of 516 simulated recordings with errors of real arms (benchmarks/real_errors.py), 3 have torque peaks beyond this
-    # margin, and 12 beyond half of it. Within it, an outlier of one sample hardly changes a low-pass filtered fit.
-    margin = np.ptp(inliers)
+    margin = np.ptp(inliers) / 2
     is_beyond = (values > inliers.max() + margin) | (values < inliers.min() - margin) | is_lost(values)
     return np.asarray(outliers & is_beyond)
 

@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Collection, Sequence
-from itertools import starmap
+from collections.abc import Collection, Mapping, Sequence
+from itertools import islice, starmap
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -75,20 +75,30 @@ class NpzArrays:
 def read_npz(file: Path, joints: Sequence[str], mapping: LogMapping) -> list[LogTable]:
     """Return one table per recording in an NPZ archive; only the arrays that the mapping names are read.
 
-    If the mapping's name of the times contains `{trajectory}`, the archive contains several recordings: with
-    "t_{trajectory}", the arrays "t_a" and "t_b" are the times of the recordings "a" and "b".
+    If names of the mapping contain `{trajectory}`, the archive contains several recordings: with "t_{trajectory}", the
+    arrays "t_a" and "t_b" are the times of the recordings "a" and "b".
     """
-    arrays, times = NpzArrays(file), mapping.columns.t
-    if TRAJECTORY not in times:
+    arrays = NpzArrays(file)
+    # If the archive has no times (setting `sample_rate`), the placeholder is searched in the names of other columns.
+    patterns = [mapping.columns.t, *map(_matrix, map(mapping.pattern, mapping.quantities))]
+    patterns += [re.sub(r"\[\d+\]$", "", mapping.column(*signal)) for signal in mapping.signals(joints)]
+    patterns = [x for x in patterns if TRAJECTORY in x]
+    if not patterns:
         return [_table(None, arrays, joints, mapping)]
-    # If the placeholder occurs several times in a name, its first occurrence becomes a wildcard and the others back
-    # references to it. Several wildcards could take exponential time on long names.
-    first, *others = map(re.escape, times.split(TRAJECTORY))
-    pattern = re.compile(first + "(.+)" + r"\1".join(others), re.DOTALL)
-    texts = [match[1] for match in map(pattern.fullmatch, arrays.names) if match]
-    if not texts:
-        raise missing_columns([times], arrays.names, file, mapping, joints)
-    return [_table(text, arrays, joints, mapping.of_trajectory(text)) for text in texts]
+    for names in patterns:
+        # If the placeholder occurs several times in a name, its first occurrence becomes a wildcard and the others back
+        # references to it. Several wildcards could take exponential time on long names.
+        first, *others = map(re.escape, names.split(TRAJECTORY))
+        pattern = re.compile(first + "(.+)" + r"\1".join(others), re.DOTALL)
+        texts = [match[1] for match in map(pattern.fullmatch, arrays.names) if match]
+        if texts:
+            return [_table(text, arrays, joints, mapping.of_trajectory(text)) for text in texts]
+    raise missing_columns(patterns[:1], arrays.names, file, mapping, joints)
+
+
+def _matrix(pattern: str) -> str:
+    """Return the name of the matrix of all joints, such as "q", for the name of a column, such as "q_{joint}"."""
+    return pattern.replace("{joint}", "").rstrip("_")
 
 
 def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapping: LogMapping) -> LogTable:
@@ -99,7 +109,7 @@ def _table(recording: str | None, arrays: NpzArrays, joints: Sequence[str], mapp
     """
     columns: dict[str, dict[str, str | None]] = {joint: {} for joint in joints}
     for quantity in mapping.quantities if joints else ():
-        matrix = mapping.pattern(quantity).replace("{joint}", "").rstrip("_")
+        matrix = _matrix(mapping.pattern(quantity))
         if matrix in arrays.names and arrays[matrix].ndim > 1:
             order = _order(matrix, arrays, [mapping.log_name(joint) for joint in joints])
             for joint, index in zip(joints, order, strict=True):
@@ -144,7 +154,9 @@ def _equally_long(arrays: NpzArrays, names: Sequence[str], vectors: Collection[s
 def _longest(arrays: NpzArrays) -> pa.Table:
     """Return a table of all arrays that have the largest number of rows in the archive, for the draft of a mapping.
 
-    A matrix becomes a column of lists. Raises LogError for an array that may be transposed or one row too short.
+    A matrix becomes a column of lists. Of an archive with several recordings (`_of_first_recording`), the table has the
+    arrays of the first recording, whose names have the placeholder `{trajectory}`. Raises LogError for an array that
+    may be transposed or one row too short.
     """
     shapes, faults = {}, []
     for name in arrays.names:
@@ -155,6 +167,8 @@ def _longest(arrays: NpzArrays) -> pa.Table:
         except LogError as fault:
             faults.append(fault)
     collect([] if any(shapes.values()) else faults)
+    of_recording = _of_first_recording(shapes)
+    shapes = {name: shapes[name] for name in of_recording} or shapes
     samples = max(map(max, filter(None, shapes.values())), default=0)
     vectors = set(filter(arrays.is_vector, shapes))
     columns = [x for x, shape in shapes.items() if x in vectors or len(shape) == 2]
@@ -173,7 +187,38 @@ def _longest(arrays: NpzArrays) -> pa.Table:
                 name, f"an array of shape {shape}", f"a row for each of the {samples} times", do
             )
     table = _equally_long(arrays, chosen, vectors)
+    table = table.rename_columns([of_recording.get(x, x) for x in table.column_names])
     return table.replace_schema_metadata({JOINTS_KEY: json.dumps(arrays.joint_names()[1])})
+
+
+def _of_first_recording(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, str]:
+    """Return {array of the first recording: its name with the placeholder `{trajectory}`}; {} for a single recording.
+
+    Arrays of several recordings have names that differ in one number, such as `data/demo_0/q` and `data/demo_1/q`. They
+    are matrices, or have different lengths: vectors of one length are signals of several joints. If another array of
+    the archive, such as the times, has the same length, the arrays are signals of one recording, such as of two arms.
+
+    shapes: {name of an array: its shape}.
+    """
+    numbers: dict[str, dict[str, str]] = {}  # {name with the placeholder: {number: name of the array}}
+    for name in shapes:
+        # Only the first numbers of a name are used, since the time is quadratic in their count.
+        for number in islice(re.finditer(r"\d+", name), 4):
+            pattern = name[: number.start()] + TRAJECTORY + name[number.end() :]
+            numbers.setdefault(pattern, {})[number[0]] = name
+    groups: dict[tuple[str, ...], list[str]] = {}  # {numbers of recordings: their names with the placeholder}
+    for pattern, names in numbers.items():
+        if len(names) > 1:
+            groups.setdefault(tuple(names), []).append(pattern)
+    for patterns in sorted(groups.values(), key=len, reverse=True):
+        first = {next(iter(numbers[x].values())): x for x in patterns}
+        lengths = [{shapes[name][:1] for name in numbers[x].values()} for x in patterns]
+        is_matrix = any(len(shapes[x]) == 2 and min(shapes[x]) > 1 for x in first)
+        is_divided = is_matrix or any(len(x) > 1 for x in lengths)
+        others = shapes.keys() - {name for x in patterns for name in numbers[x].values()}
+        if is_divided and max(shapes[x][:1] for x in first) not in {shapes[x][:1] for x in others}:
+            return first
+    return {}
 
 
 def _order(matrix: str, arrays: NpzArrays, names: list[str]) -> list[int]:

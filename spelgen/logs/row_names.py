@@ -1,4 +1,4 @@
-"""Names of joints in the rows of a log: a list per row, as in messages of ROS, which may differ from row to row."""
+"""Names of joints in the rows of a log, as in messages of ROS: a list or several cells, which may differ per row."""
 
 import re
 from collections.abc import Mapping
@@ -14,6 +14,8 @@ RowsByNames: TypeAlias = dict[tuple[str, ...], pa.ChunkedArray]
 """{list of names: mask (T,) of the rows with this list}. Indices of a mapping refer to the first list."""
 # A text that is the name of a joint, and no number.
 NAME = re.compile(r"[^\W\d][\w/.:-]*")
+# The number at the end of a column's name.
+NUMBER = re.compile(r"\d+$")
 
 
 def first_list(column: pa.ChunkedArray) -> list[str]:
@@ -28,9 +30,11 @@ def _list_of(cell: object) -> list[str]:
     return cell if isinstance(cell, list) else []
 
 
-def are_names(values: pa.DataType) -> bool:
-    """Return True for the type of a column with a list of texts in each row."""
-    return bool(pa.types.is_list(values) and pa.types.is_string(values.value_type))
+def are_names(field: pa.Field) -> bool:
+    """Return True for a column that may contain joint names: lists of texts, or texts in a numbered column."""
+    if pa.types.is_string(field.type):
+        return bool(NUMBER.search(field.name))
+    return bool(pa.types.is_list(field.type) and pa.types.is_string(field.type.value_type))
 
 
 def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> RowsByNames:
@@ -42,7 +46,7 @@ def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> Rows
     """
     lengths = [len(first_list(column)) for column in table.columns]
     for column in table.columns:
-        if are_names(column.type):
+        if pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type):
             column = pa.compute.binary_join_element_wise("[", pa.compute.binary_join(column, ","), "]", "")
         first = first_list(column)
         if not (first and pa.types.is_string(column.type) and all(map(NAME.fullmatch, first))):
@@ -62,3 +66,36 @@ def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> Rows
             ordered = sorted(lists, key=lambda text: lists[text] not in of_arm[:1])
             return {lists[text]: pa.compute.equal(column, text) for text in ordered}
     return {}
+
+
+def sorted_by_names(table: pa.Table, columns: Mapping[str, str]) -> pa.Table:
+    """Return a table in which each column contains the values of one joint in all rows, by the names in the rows.
+
+    The names of joints are in cells of columns such as `name0`, `name1`, ...: the value in the column `q1` is of the
+    joint with the name in `name1`. Values become null in rows without the name of the joint. A table without columns
+    of joint names is unchanged.
+
+    columns: {column: name of its joint in the log}, such as {"q0": "elbow"}.
+    """
+    stems: dict[str, dict[str, pa.ChunkedArray]] = {}
+    for column, texts in zip(table.column_names, table.columns, strict=True):
+        if pa.types.is_string(texts.type) and (number := NUMBER.search(column)):
+            stems.setdefault(column[: number.start()], {})[number[0]] = texts
+    # `names`: {number in the name of a column, such as "0": joint names (T,) in the rows}. The columns of another
+    # stem, such as `mode0`, do not contain the names of all joints.
+    names: dict[str, pa.ChunkedArray] = {}
+    for numbered in stems.values():
+        logged = {text for texts in numbered.values() for text in texts.unique().to_pylist()}
+        names = numbered if logged.issuperset(columns.values()) else names
+    result = table
+    for column, joint in columns.items():
+        number = NUMBER.search(column)
+        if not number or number[0] not in names or column not in table.column_names:
+            continue
+        values = pa.nulls(len(table))
+        for other, name in names.items():
+            source = column[: number.start()] + other
+            if table.column_names.count(source) == 1:
+                values = pa.compute.if_else(pa.compute.equal(name, joint), table[source], values)
+        result = result.set_column(table.column_names.index(column), column, values)
+    return result

@@ -172,8 +172,10 @@ def _mapping_lines(
     units = _units(by_joint, joints)
     common = {"t": unit_of_times} | _common(units)
     rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
+    is_divided = any("{trajectory}" in x.name for x in by_joint["q"].values())
     lines = [
         f"# Drafted from the column names of {json.dumps(file)}: check it, and the order of the joints.",
+        *(["# {trajectory}: number of each recording of this arm, in the names of its arrays"] * is_divided),
         f"columns: {{t: {json.dumps(clock.name)}}}" if clock.name else rate,
         f"units: {json.dumps(common)}",
     ]

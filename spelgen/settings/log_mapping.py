@@ -401,7 +401,13 @@ class LogMapping(Group):
         """
         # A column name without `{trajectory}` is unchanged: its column belongs to all recordings.
         named = {key: name.replace("{trajectory}", text) for key, name in self.columns}
-        return self.model_copy(update={"columns": LogColumns(**named)})
+        of_joints = {
+            joint: {
+                key: name and name.replace("{trajectory}", text) for key, name in self.joint(joint).columns
+            }
+            for joint in self.joints
+        }
+        return self.model_copy(update={"columns": LogColumns(**named)}).with_joint_columns(of_joints)
 
     def with_joint_columns(self, columns: Mapping[str, Mapping[str, str | None]]) -> LogMapping:
         """Return the mapping with other names of columns.
