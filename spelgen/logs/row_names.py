@@ -34,7 +34,11 @@ def are_names(field: pa.Field) -> bool:
     """Return True for a column that may contain joint names: lists of texts, or texts in a numbered column."""
     if pa.types.is_string(field.type):
         return bool(NUMBER.search(field.name))
-    return bool(pa.types.is_list(field.type) and pa.types.is_string(field.type.value_type))
+    return _is_list_of_texts(field.type)
+
+
+def _is_list_of_texts(values: pa.DataType) -> bool:
+    return bool(pa.types.is_list(values) and pa.types.is_string(values.value_type))
 
 
 def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> RowsByNames:
@@ -46,7 +50,7 @@ def rows_by_names(table: pa.Table, names: Mapping[str, str], file: Path) -> Rows
     """
     lengths = [len(first_list(column)) for column in table.columns]
     for column in table.columns:
-        if pa.types.is_list(column.type) and pa.types.is_string(column.type.value_type):
+        if _is_list_of_texts(column.type):
             column = pa.compute.binary_join_element_wise("[", pa.compute.binary_join(column, ","), "]", "")
         first = first_list(column)
         if not (first and pa.types.is_string(column.type) and all(map(NAME.fullmatch, first))):
