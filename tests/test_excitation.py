@@ -131,6 +131,19 @@ def test_the_same_arguments_give_the_same_motion(loaded):
     assert not np.allclose(other.motion.q, found.motion.q)
 
 
+def test_rounding_errors_of_the_processor_do_not_change_the_motion(loaded, monkeypatch):
+    expected = excite(loaded, **CHOICE, trials=100).motion
+    noise, exact = np.random.default_rng(0), Criterion.value_and_gradient
+
+    def rounded_otherwise(criterion, parameters):
+        value, gradient = exact(criterion, parameters)
+        return value * (1 + 1e-14), gradient * (1 + 1e-14 * noise.standard_normal(len(gradient)))
+
+    monkeypatch.setattr(Criterion, "value_and_gradient", rounded_otherwise)
+    motion = excite(loaded, **CHOICE, trials=100).motion
+    np.testing.assert_allclose(motion.q, expected.q, rtol=0, atol=1e-12)
+
+
 def test_effort_limits_are_kept_where_they_can_be(robots):
     found = excite(load_arm(robots / "rpr.urdf"), **CHOICE | {"harmonics": 3}, trials=60)
     assert (found.efforts < 1).all()

@@ -222,7 +222,11 @@ def _improved(
     The criterion is not differentiable if singular values are equal, or if two samples have the largest speed. L-BFGS
     is efficient for such functions (Lewis and Overton, Math. Program. 141:135, 2013). The last parameters may not be
     the best, so the values of all `trials` evaluations are compared.
+
+    The search amplifies rounding errors, which depend on the processor, to other motions. The parameters, the criterion
+    and its gradient are therefore rounded, and the motion is the same on all processors.
     """
+    initial = initial.round(TUNING.decimals)
     best, lowest, done = initial, criterion.value(initial), 0
     if not isfinite(lowest):
         return initial
@@ -233,10 +237,12 @@ def _improved(
         The parameters are stored in `best` if the criterion is smaller than at all earlier parameters.
         """
         nonlocal best, lowest, done
+        parameters = parameters.round(TUNING.decimals)
         value, gradient = criterion.value_and_gradient(parameters)
+        value, gradient = round(value, TUNING.decimals), gradient.round(TUNING.decimals)
         done += 1
         if value < lowest:
-            best, lowest = parameters.copy(), value
+            best, lowest = parameters, value
         progress(min(done, trials), trials)
         return value, gradient
 
