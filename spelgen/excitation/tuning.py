@@ -16,8 +16,8 @@ class ExcitationTuning:
     min_harmonics: int = 5
     # [1] Number of steps from which L-BFGS approximates the curvature.
     history: int = 30
-    # [1] Decimal places to which the optimizer rounds the parameters, the criterion and its gradient. Rounding errors of
-    # processors are far smaller, and the parameters of random motions have a standard deviation of one.
+    # [1] Decimal places to which the optimizer rounds the parameters, the criterion and its gradient. Rounding errors
+    # of processors are far smaller, and the parameters of random motions have a standard deviation of one.
     decimals: int = 6
     # [1] Number of samples of a motion at which the criterion is evaluated, divided by the number of harmonics.
     samples_per_harmonic: int = 12
