@@ -335,6 +335,20 @@ def test_velocities_that_are_magnitudes_are_an_error_and_differentiating_remedie
     assert errors([log], arm) == ""
 
 
+def test_noise_of_coarse_positions_does_not_make_velocities_magnitudes(arm, tmp_path):
+    """A joint that moves one way and stops has negative dq/dt at single samples: positions are coarse."""
+    columns, joints = motion(arm, 7), arm.chain.joint_names
+    joint, t = joints[-1], np.asarray(columns["t"])
+    random, dt = np.random.default_rng(1), t[1] - t[0]
+    s = np.clip(t / (0.6 * t[-1]), 0.0, 1.0)
+    q = 1900 * dt * 0.02 * (10 * s**3 - 15 * s**4 + 6 * s**5)
+    columns[f"qd_{joint}"] = np.gradient(q, t)
+    step = 0.01 * dt
+    columns[f"q_{joint}"] = step * np.round(q / step + 0.5 * random.standard_normal(len(t)))
+    (log,) = read_logs(written(columns, tmp_path / "log.csv"), joints)
+    assert "magnitude" not in errors([log], arm)
+
+
 def test_quick_but_sound_signals_have_no_jumps():
     t = 0.02 * np.arange(3000)
     random = np.random.default_rng(0)

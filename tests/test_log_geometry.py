@@ -390,6 +390,23 @@ def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
         assert report.errors == () and "small-motion" in [x.code for x in report.findings]
 
 
+def test_the_geometry_of_motions_in_one_direction_is_not_tested(arm):
+    """Most joints move one way in synchronous motions between two positions: their friction is a constant torque.
+
+    Wrong hypotheses, such as exchanged columns and another torque unit at once, can explain such torques better.
+    """
+
+    def one_way(arm, rng):
+        t = np.arange(0.0, SECONDS, 1 / RATE)
+        s = (t / SECONDS)[:, None]
+        return t, rng.uniform(0.5, 1.5, len(arm.chain.coordinates)) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+
+    log = recorded(arm, 18, one_way)
+    for logged in (log, flipped(log, 1, False, True)):
+        report = check_logs([logged], arm)
+        assert report.errors == () and "small-motion" in [x.code for x in report.findings]
+
+
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_a_held_joint_does_not_prevent_the_tests_of_the_others(arm):
     """A reversed joint is found although a controller holds the last joint.

@@ -397,6 +397,21 @@ def test_a_frozen_column_is_refused(trajectory, got):
     )
 
 
+@pytest.mark.parametrize("step", [0.005, 0.022])
+def test_a_joint_at_rest_whose_drive_has_no_word_for_zero_velocity_is_not_frozen(step):
+    """Drives with 12 bits for -limit ... limit send velocities of at least half a step, also at rest.
+
+    Their integral grows with time, and the position of the joint at rest is constant or changes by one encoder step.
+    """
+    log, random = swing(), np.random.default_rng(0)
+    t = 0.1 * np.arange(len(log.t))
+    qd = step * (random.integers(-1, 2, len(t)) - 0.5)
+    for q in (np.full(len(t), 0.7), 0.7 + 4e-4 * (np.arange(len(t)) > 100)):
+        resting = Trajectory(t, *(np.column_stack([x, x]) for x in (q, qd, 0.1 + 0 * q)), name="x")
+        notes = check([resting], JOINTS, ("revolute", "revolute"))
+        assert "joint-at-rest" in [note.code for note in notes]
+
+
 def test_what_never_changes_in_any_trajectory_is_said():
     resting = changed(q={1: 0.5}, qd={1: 0.0}, tau={1: 0.0})
     notes = check([resting], JOINTS, ("revolute", "revolute"))

@@ -662,13 +662,15 @@ def test_units_of_velocities_are_read_in_each_notation(robots, tmp_path, form, f
         ("tau_m{}", "tau_g{}"),
         ("tau{}_raw", "tau{}_filt"),
         ("actual_current_as_torque_{}", "actual_current_{}"),
+        ("tau_measured{}", "tau_feedback{}"),
+        ("tau_feedback{}", "tau_feedforward{}"),
     ],
 )
 @pytest.mark.parametrize("is_first", [True, False])
 def test_measured_torques_are_preferred_to_computed_ones_and_currents(
     scara, tmp_path, measured, computed, is_first
 ):
-    """Measured torques are read instead of computed torques or currents, in any order of the columns."""
+    """Measured torques are read instead of computed torques, terms of a controller or currents, in any order."""
     torques = [(measured, TAU), (computed, 3 * TAU)]
     torques = torques if is_first else torques[::-1]
     head = ["t", *(name.format(k) for name in ("q{}", "qd{}", *(x for x, _ in torques)) for k in range(4))]

@@ -37,6 +37,7 @@ from spelgen.log_checks.robot_checks import (
     CHECKS,
     TUNING,
     JointEvidence,
+    find_one_way,
     fit_gravity,
     torque_factors,
 )
@@ -302,11 +303,14 @@ class TorqueLogs:
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
         # A motion may only seem small because the mapping states a wrong unit of positions. Logs with a stated unit are
         # therefore tested even if their motion is small.
+        small = ""
         if not is_stated and np.ptp(motion, axis=0).max() < TUNING.smallest_motion:
-            message = (
-                f"all joints stay within {TUNING.smallest_motion:g} rad or m: too little motion to test senses, order, "
-                "zeros, units and gravity"
-            )
+            small = f"all joints stay within {TUNING.smallest_motion:g} rad or m"
+        # Dry friction of a joint that moves one way is a constant torque, which wrong hypotheses explain as well.
+        elif sum(find_one_way(joint) is not None for joint in evidence) > len(evidence) / 2:
+            small = "most joints move one way only"
+        if small:
+            message = f"{small}: too little motion to test senses, order, zeros, units and gravity"
             yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
             return
         # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit

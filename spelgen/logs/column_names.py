@@ -27,7 +27,7 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
-        "ipo set soll u leader consigne заданное заданный 目标 指令 设定 目標 목표",
+        "ipo set soll u leader consigne feedforward ff заданное заданный 目标 指令 设定 目標 목표",
         "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
         "현재 실제",
         "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance dist interact dd "
@@ -35,6 +35,9 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
         "computed model predicted pred sim simulated g c f",
     )
 )
+# Words of `MEASURED` that may also name a term of a controller: if a log has `tau_measured`, `tau_feedback` is a part of
+# the torque command.
+FEEDBACK = {"feedback", "feed", "fb"}
 # {letter: quantity} for names such as `i_actual` (motor current) and `m_actual` (moment).
 LETTERS = {"i": "tau", "m": "tau"}
 # Letters that count as units only in brackets, as in `time (s)`: without brackets they may be part of a name.

@@ -10,6 +10,7 @@ from spelgen.logs.column_names import (
     COMMANDED,
     COMPUTED,
     CURRENT,
+    FEEDBACK,
     FILTERED,
     KNOWN,
     MEASURED,
@@ -56,9 +57,9 @@ def best_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[ColumnNa
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
     differ only in the words of the joint. In this order, measurements are preferred to values that a model computed,
-    torques to currents, signals of joints to signals of motors, names with a word such as "actual" to other names,
-    unfiltered to filtered values, and names with few words to longer names. Example: `tau_J` is preferred to
-    `tau_hat_filtered`.
+    torques to currents, signals of joints to signals of motors, names with a word such as "actual" to names with
+    "feedback", which may be a term of a controller, and these to other names, unfiltered to filtered values, and names
+    with few words to longer names. Example: `tau_J` is preferred to `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
     """
@@ -113,7 +114,8 @@ def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> N
 def _rank(words: frozenset[str]) -> list[int]:
     """Return the sort key of a signal with these words; `best_signal` prefers the signal with the smallest key."""
     ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
-    return [*ranks, words.isdisjoint(MEASURED), not words.isdisjoint(FILTERED), len(words)]
+    measured = [words.isdisjoint(MEASURED - FEEDBACK), words.isdisjoint(FEEDBACK)]
+    return [*ranks, *measured, not words.isdisjoint(FILTERED), len(words)]
 
 
 def columns_by_joint(

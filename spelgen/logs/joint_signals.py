@@ -25,7 +25,7 @@ from spelgen.logs.jumps import (
     read_as_words,
     unwrapped,
 )
-from spelgen.logs.recording import COMMANDED, listed_times, outlier_rows, stale_rows
+from spelgen.logs.recording import COMMANDED, listed_times, outlier_rows, stale_rows, travel
 from spelgen.logs.trajectory import Trajectory, split_at_gaps
 from spelgen.logs.tuning import SIGNALS, shows_accelerations
 from spelgen.settings.log_mapping import Decoding
@@ -174,15 +174,13 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
 
     Other signals of the joint show that it moves: the commands of a position servo, otherwise q and qd.
     """
-    from scipy.integrate import cumulative_trapezoid
-
     # `motion` [rad, m] is a threshold. A constant qd is frozen if the difference of q and the integral of qd changes by
     # more than `motion`. A constant q is frozen if the integral of qd changes by more than `motion`.
     t, q, qd, u, motion = signals.trajectory.t, signals.q, signals.qd, signals.signal("u"), 0.05
     if np.ptp(qd) == 0 and np.ptp(q - qd * (t - t[0])) > motion:
         return f"qd always {qd[0]:g} while q goes from {q.min():.3g} to {q.max():.3g}"
     # A constant q is compared with the integral of qd and not with qd, because the integral averages the noise of qd.
-    drift = np.abs(cumulative_trapezoid(qd, t)).max(initial=0.0)
+    drift = np.abs(travel(t, qd)).max(initial=0.0)
     if np.ptp(q) == 0 and drift > motion:
         return f"q always {q[0]:g} while qd says that it moves by {drift:.3g}"
     if np.ptp(q) == 0 and u.size and np.ptp(u) > COMMANDED:

@@ -248,11 +248,22 @@ def stale_rows(
     if quantity == "tau":
         stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
         return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
-    from scipy.integrate import cumulative_trapezoid  # SciPy is slow to import, so it is imported only here
-
     # If q or qd is frozen while the joint moves, the difference between q and the integral of qd changes. A block of
     # equal values is stale if this difference changes by more than 0.05 rad or m within the block.
-    return is_stale(values, cumulative_trapezoid(qd, t, initial=0) - q, 0.05)
+    return is_stale(values, travel(t, qd) - q, 0.05)
+
+
+def travel(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
+    """Return the integral of velocities qd (T,) [rad/s, m/s] over the times t (T,) [s], as positions (T,) [rad, m].
+
+    Velocities of at most three quantisation steps, and at most 0.05 rad/s or m/s, count as zero: the registers of some
+    drives have no word for zero, so a joint at rest has velocities around half a step, whose integral grows with time.
+    """
+    from scipy.integrate import cumulative_trapezoid  # SciPy is slow to import, so it is imported only here
+
+    step = np.diff(np.unique(qd)).min(initial=np.inf)
+    at_rest = np.abs(qd) <= min(3 * step, 0.05)
+    return np.asarray(cumulative_trapezoid(np.where(at_rest, 0.0, qd), t, initial=0))
 
 
 def listed_times(t: np.ndarray) -> str:

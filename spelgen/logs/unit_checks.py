@@ -399,4 +399,7 @@ def find_unsigned_velocity(signals: JointSignals) -> str | None:
         return None
     if not np.corrcoef(np.abs(speed), np.abs(qd))[0, 1] > 0.9:
         return None
+    # Quantised positions make dq/dt negative for single samples. The magnitudes must agree far better than the values.
+    if np.sum((np.abs(speed) - np.abs(qd)) ** 2) > 0.5 * np.sum((speed - qd) ** 2):
+        return None
     return f"qd that is the magnitude of dq/dt: from {qd.min():.3g} to {qd.max():.3g} while q goes both ways"
