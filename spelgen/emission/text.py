@@ -17,7 +17,7 @@ from spelgen.emission import parts
 from spelgen.emission.parts import Call, Code
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
-from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.labels import UNITS, cell_text, counted, entry_name, joints_in_ranges
 from spelgen.spec import ConstantSpec, ModelSpec, OutputSpec, spec_from_json
 from spelgen.templates import render
 
@@ -147,7 +147,7 @@ def _picture(spec: ModelSpec) -> str:
     """
     cells = {}
     for row, column, kind, joints in spec.entries:
-        cells[row, column] = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
+        cells[row, column] = cell_text(kind, joints)
     width = max(2, *map(len, cells.values()))
     lines = ["Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero", ""]
     for row in range(len(spec.joints)):
@@ -209,7 +209,9 @@ def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
 
 def _mass_entries(spec: ModelSpec) -> str:
     """Return the source of ``mass_entries``, which computes M from values of its learned functions and constants."""
-    names = parts.term_names(spec)
+    # The terms of M are named f1, f2, ... (functions), then c1, c2, ... (constants).
+    names = [f"f{k + 1}" for k in range(len(spec.outputs))]
+    names += [f"c{k + 1}" for k in range(len(spec.constants))]
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"
     if len(start) > _WIDTH:
