@@ -85,6 +85,14 @@ def joint_ranges(joints: tuple[int, ...]) -> str:
     return ",".join(texts)
 
 
+def cell_text(kind: str, joints: tuple[int, ...]) -> str:
+    """Return the text of an entry of M in tables: the joints on which it depends, "C" if constant, "0" if always zero.
+
+    kind: "zero", "constant" or "varying".
+    """
+    return {"zero": "0", "constant": "C"}.get(kind, joint_ranges(joints))
+
+
 def joints_in_ranges(joints: tuple[int, ...]) -> str:
     """Return joint indices (from 0) as text with ranges: ``joint 2`` for (1,), ``joints 2-4,6`` for (1, 2, 3, 5)."""
     return f"joint{'s' * (len(joints) > 1)} {joint_ranges(joints)}"

@@ -17,8 +17,8 @@ from spelgen.design import PRESET_NAMES, load_design
 from spelgen.dynamics.body_regressor import pseudo_inertia
 from spelgen.dynamics.parameters import parameter_table, parameters_of_kind
 from spelgen.emission.build import build
-from spelgen.emission.source import names_in
 from spelgen.emission.standalone import bundle, load_runtime
+from spelgen.emission.text import names_in
 from spelgen.fitting.torque.parameters import log_cholesky_parameters, upper_cholesky
 from spelgen.runtime.body_chain import InertialParameters
 from spelgen.runtime.derived_mass import DerivedMass

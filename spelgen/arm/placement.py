@@ -88,8 +88,7 @@ class AngleRounding:
                 self._note("snapped-inertia", f"link {link.name!r} inertial products", inertial.line, message)
             xy, xz, yz = products
         rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-        tensor: np.ndarray = np.vectorize(exact, otypes=[object])(rows)
-        return tensor
+        return np.asarray(np.vectorize(exact, otypes=[object])(rows))
 
     def axis(self, joint: UrdfJoint) -> np.ndarray:
         """Return the axis of a joint as a unit vector in the frame of the joint, (3,)."""
@@ -280,5 +279,4 @@ class Placement:
             candidates.append((lost, len(candidates), candidate))
             if not lost:
                 break
-        rotation: np.ndarray = segment[-1][1].T @ min(candidates)[2]
-        return rotation
+        return np.asarray(segment[-1][1].T @ min(candidates)[2])

@@ -84,8 +84,7 @@ def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation (3, 3), float64, by ``angle`` [rad] about the unit vector ``axis`` (3,) (Rodrigues)."""
     cross = np.cross(np.eye(3), axis)
-    rotation: np.ndarray = np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
-    return rotation
+    return np.asarray(np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross))
 
 
 def alignment(axis: np.ndarray) -> np.ndarray:
@@ -109,8 +108,7 @@ def alignment(axis: np.ndarray) -> np.ndarray:
     if sign < 0 and index == 2:
         # For the axis -z, the rotation is by pi about x; parameters of existing modules depend on this convention.
         columns = [first, -second, closest]
-    turned: np.ndarray = smallest @ np.stack(columns, axis=1)
-    return turned
+    return np.asarray(smallest @ np.stack(columns, axis=1))
 
 
 def exact_rotation(rotation: np.ndarray, error: float = TUNING.rotation_error) -> np.ndarray:
@@ -150,8 +148,7 @@ def _quaternion_ratios(rotation: np.ndarray) -> list[float]:
     largest = int(np.argmax(np.diag(squares)))
     ratios = squares[largest] / squares[largest, largest]
     ratios[np.abs(ratios) < TUNING.zero_noise] = 0.0
-    components: list[float] = ratios.tolist()
-    return components
+    return list(map(float, ratios))
 
 
 def lost_zeros(candidate: np.ndarray, rotation: np.ndarray) -> int:
@@ -169,8 +166,7 @@ def _rotation_with_zero(rotation: np.ndarray, row: int, column: int, error: floa
     first = _turn(row, rotation[(row + 1) % 3, column], rotation[(row + 2) % 3, column], error)
     last = _turn(column, rotation[row, (column + 1) % 3], -rotation[row, (column + 2) % 3], error)
     between = np.rint(first.T.astype(float) @ rotation @ last.T.astype(float)).astype(int)
-    result: np.ndarray = first @ between @ last
-    return result
+    return np.asarray(first @ between @ last)
 
 
 def _turn(axis: int, cosine: float, sine: float, error: float) -> np.ndarray:
@@ -220,5 +216,4 @@ def _rotation_of(quaternion: Sequence[Fraction]) -> np.ndarray:
     v = np.array([x, y, z], dtype=object)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=object)
     # Euler-Rodrigues for a quaternion (w, v) of any norm: R = 1 + (2 w [v]x + 2 [v]x [v]x) / (w^2 + v.v).
-    turned: np.ndarray = IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v)
-    return turned
+    return np.asarray(IDENTITY + 2 * (w * cross + cross @ cross) * Fraction(1, w * w + v @ v))

@@ -1,4 +1,4 @@
-"""List of all baselines, in the order of tables. `evaluate` compares a model with them; `baselines.fit` fits them."""
+"""List of all baselines, in the order of tables, to which `evaluate` compares a model, and their fit to logs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,21 +8,30 @@ from typing import Any
 import numpy as np
 
 from spelgen.arm.configured_arm import Arm
-from spelgen.baselines.fit import FRICTION, FittedBaselines
 from spelgen.baselines.predictor import CommandFollower, Predictors, Solver, States
+from spelgen.dynamics.friction import FrictionModel
 from spelgen.dynamics.regressor_dynamics import identified_dynamics
-from spelgen.errors import Diagnostic, in_one_line
+from spelgen.errors import Diagnostic, LogError, in_one_line
 from spelgen.labels import (
     CONSTANT_VELOCITY,
     DELAYED_COMMAND,
+    LEAST_SQUARES,
+    LEAST_SQUARES_WITH_MEMORY,
     LINEAR_SERVOS,
     URDF,
     URDF_WITH_DRIVES,
 )
+from spelgen.logs.preprocessing import Preprocessing
+from spelgen.logs.trajectory import Trajectory, coverage, require_torques
 from spelgen.logs.windows import Windows
 
-LinearServoRecord = Mapping[str, Any]
-"""Parameters of `LinearServos` in the record of a fit, by name."""
+FittedBaselines = dict[str, Any]
+"""Content of least_squares.json: the fitted baselines, and the range of motion of the training logs."""
+FRICTION = {
+    LEAST_SQUARES: ("parameters", FrictionModel()),
+    LEAST_SQUARES_WITH_MEMORY: ("parameters_with_memory", FrictionModel(memory=True)),
+}
+"""{name of a predictor: (key of its parameters in least_squares.json, its friction model)}."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +124,35 @@ BASELINES: tuple[Callable[[EvaluatedArm], Predictors], ...] = (
 """Functions that return predictors under torques, or {} if data or a package that they need is absent."""
 
 
+def fit_baselines(arm: Arm, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> FittedBaselines:
+    """Return the content of least_squares.json: the motion that the logs cover, and identified parameters.
+
+    The motion is described by the duration, and by ranges and histograms of positions and velocities (see `coverage`).
+    For each friction model, inertial and friction parameters are identified by linear least squares. The parameters are
+    absent if the logs have no torques or no accelerations.
+
+    preprocessing: resampling and filters of the logs, as in the fit of the model, with all default values resolved.
+    """
+    # The identification is imported here: an evaluation imports this file, too, but needs no identification.
+    from spelgen.identification.identification import LeastSquares
+    from spelgen.identification.identify import identify_by
+
+    # The coverage of the training logs is stored, because an evaluation compares the motion in test logs with it.
+    fitted: FittedBaselines = {"coverage": coverage(logs)}
+    methods = [LeastSquares(friction=friction) for _, friction in FRICTION.values()]
+    try:
+        require_torques(logs)
+        identified = identify_by(arm, logs, methods, preprocessing)
+    # An error of the identification is ignored, because the model can be fitted without this baseline.
+    except (LogError, np.linalg.LinAlgError):
+        return fitted
+    fits = {key: fit for (key, _), fit in zip(FRICTION.values(), identified, strict=True)}
+    # Parameters are recorded for both friction models, because predictors are made from them. The statistics of the
+    # identification are recorded only for the model without bristles.
+    parameters = {key: fit.parameters.tolist() for key, fit in fits.items()}
+    return {**fitted, **fits["parameters"].to_dict(), **parameters}
+
+
 def torque_predictors(arm: EvaluatedArm) -> Predictors:
     """Return all baselines for an arm under torques."""
     predictors: Predictors = {}
@@ -124,7 +162,7 @@ def torque_predictors(arm: EvaluatedArm) -> Predictors:
 
 
 def command_followers(
-    linear_servos: LinearServoRecord | None, notes: list[Diagnostic]
+    linear_servos: Mapping[str, Any] | None, notes: list[Diagnostic]
 ) -> dict[str, CommandFollower]:
     """Return {name: baseline} for an arm under position commands.
 

@@ -171,16 +171,13 @@ def grouped(functions: Sequence[tuple[Symbol, Terms]]) -> Expr:
 
 def text(expression: Expr) -> str:
     """Return an expression as plain text; fractions are decimals of at most twelve digits."""
-    result: str = StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, 12))
-    return result
+    return str(StrPrinter({"full_prec": False}).doprint(_rounded(expression, 1, 12)))
 
 
 def python(expression: Expr) -> str:
     """Return an expression as Python code for SymPy, with exact fractions up to 17 digits; longer ones are decimals."""
-    result: str = _PythonPrinter({"sympy_integers": True}).doprint(
-        _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
-    )
-    return result
+    rounded = _rounded(expression, 10**FLOAT_DIGITS, FLOAT_DIGITS)
+    return str(_PythonPrinter({"sympy_integers": True}).doprint(rounded))
 
 
 def lines(formula: str, start: str, width: int, end: str = "") -> list[str]:
@@ -206,8 +203,7 @@ class _PythonPrinter(StrPrinter):  # type: ignore[misc]  # SymPy has no types
     def _print_Add(self, expression: Add, order: str | None = None) -> str:
         """Print a long sum as one call of ``Add``, because Python cannot parse thousands of nested additions."""
         if len(expression.args) <= 20:
-            result: str = super()._print_Add(expression, order)
-            return result
+            return str(super()._print_Add(expression, order))
         return f"Add({', '.join(map(self._print, expression.args))})"
 
 

@@ -15,10 +15,10 @@ from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm, load_arm
 from spelgen.certificate.facts import Fact, facts
 from spelgen.errors import Diagnostic
-from spelgen.labels import UNITS, counted, joint_ranges, joints_in_ranges, printable, short_name
+from spelgen.labels import UNITS, cell_text, counted, joints_in_ranges, printable, short_name
 from spelgen.listing import WIDTH, Listing
 from spelgen.structure.servo_rank import servo_rank
-from spelgen.structure.structure import MassEntry, Structure, derive
+from spelgen.structure.structure import Structure, derive
 from spelgen.urdf.robot import Assume
 
 if TYPE_CHECKING:  # These modules are not imported at run time, since they import SymPy, which is slow.
@@ -191,7 +191,7 @@ class Inspection:
         return "\n".join(lines)
 
     def _cells(self) -> dict[tuple[int, int], str]:
-        return {(entry.row, entry.column): cell_text(entry) for entry in self.structure.entries}
+        return {(x.row, x.column): cell_text(x.kind, x.joints) for x in self.structure.entries}
 
     def _matrix(self) -> str:
         """Return a text table of the lower triangle of M with a cell per entry, see `cell_text`."""
@@ -257,11 +257,6 @@ def range_text(coordinate: Coordinate) -> str:
     if coordinate.lower is None or coordinate.upper is None:
         return "no limits"
     return f"{coordinate.lower:g} .. {coordinate.upper:g} {UNITS[coordinate.joint_type].position}"
-
-
-def cell_text(entry: MassEntry) -> str:
-    """Return text for an entry of M: the joints on which it depends, "C" if it is constant, "0" if always zero."""
-    return {"zero": "0", "constant": "C"}.get(entry.kind, joint_ranges(entry.joints))
 
 
 def inspect(arm: Arm | str | Path, assume: Assume = "kinematics") -> Inspection:

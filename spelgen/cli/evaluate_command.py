@@ -46,16 +46,14 @@ def evaluate(
     limits = list(map(_limit, limit or []))
     from spelgen.evaluation.evaluate import SECONDS, STEPS, read_test_logs
     from spelgen.evaluation.evaluate import evaluate as evaluate_model
-    from spelgen.fitting.fitted import load_run
     from spelgen.fitting.run_folder import RunFolder
     from spelgen.logs.preprocessing import Preprocessing
 
-    logs = read_test_logs(run, paths, mapping)
     # The logs are read before the run is loaded: errors in logs are frequent, and are reported without delay.
-    model = load_run(run)
+    logs = read_test_logs(run, paths, mapping)
     with progress_bar("evaluating") as progress:
         results = evaluate_model(
-            model,
+            run,
             logs,
             preprocessing=None if filter is None else Preprocessing(cutoff=filter),
             steps=() if quick else STEPS,

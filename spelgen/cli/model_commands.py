@@ -120,7 +120,6 @@ def export(
     """
     from spelgen.exporting.export import export as export_run
     from spelgen.exporting.exported import format_by_extension, require_fitting
-    from spelgen.fitting.fitted import load_run
 
     # By default the suffix of the output file selects the format of the export.
     if to is None:
@@ -128,7 +127,7 @@ def export(
     # The name of the output is checked first, because loading the model takes seconds.
     require_fitting(to, output)
     options.require_free(output, force=force)
-    result = export_run(load_run(run), to, entries=entry or (), float32=float32)
+    result = export_run(run, to, entries=entry or (), float32=float32)
     # `export_run` has compared the export with the model. If they differ, it raises an error and nothing is written.
     files = [str(path) for path in result.write(output, force=force)]
     lines = [f"wrote {path}" for path in files]

@@ -163,10 +163,8 @@ class FrictionModel:
             motors: matrix C, (n, n): the velocities of the drives are C qd.
         """
         speed = qd @ motors.T
-        torque: np.ndarray = (self._effects(speed, np.zeros_like(speed), bent) * constants).sum(
-            axis=-2
-        ) @ motors
-        return torque
+        effects = self._effects(speed, np.zeros_like(speed), bent)
+        return np.asarray((effects * constants).sum(axis=-2) @ motors)
 
     def _effects(self, speed: np.ndarray, rise: np.ndarray, bent: np.ndarray | None) -> np.ndarray:
         """Return the torque at the drives of each effect in `effects` per unit of its coefficient, (..., effects, n).

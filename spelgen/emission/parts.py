@@ -354,11 +354,6 @@ def entry_sums(spec: ModelSpec) -> list[list[Sums]]:
     return [[ordered.get((row, column), []) for column in range(row + 1)] for row in range(len(spec.joints))]
 
 
-def term_names(spec: ModelSpec) -> list[str]:
-    """Return the names of the terms of M in a module: f1, f2, ... for functions, then c1, c2, ... for constants."""
-    return [f"f{k + 1}" for k in range(len(spec.outputs))] + [f"c{k + 1}" for k in range(len(spec.constants))]
-
-
 def mean_mass(n: int, outputs: Sequence[OutputSpec], constants: Sequence[ConstantSpec]) -> np.ndarray:
     """Return the lower triangle of the mean of M without armature, (n, n) [kg m^2, kg m, kg], to 6 significant digits.
 

@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib.resources import files
 from typing import NamedTuple
 
-from spelgen.emission.source import names_in
+from spelgen.emission.text import names_in
 
 _OURS = "spelgen.runtime."
 

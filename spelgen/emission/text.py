@@ -14,13 +14,16 @@ from pathlib import Path
 from textwrap import fill, wrap
 
 from spelgen.emission import parts
-from spelgen.emission.source import SKIP, WIDTH, filled, listed_call, names_in
+from spelgen.emission.parts import Call, Code
 from spelgen.errors import ModuleError
 from spelgen.files import read_bytes
-from spelgen.labels import UNITS, counted, entry_name, joint_ranges, joints_in_ranges
+from spelgen.labels import UNITS, cell_text, counted, entry_name, joints_in_ranges
 from spelgen.spec import ConstantSpec, ModelSpec, OutputSpec, spec_from_json
 from spelgen.templates import render
 
+_WIDTH = 110
+_STEP = 4  # blanks per level of indentation
+_SKIP = "  # fmt: skip"  # With this comment in a module, ruff does not reformat its rows of numbers.
 _COMMENTS = {
     "JOINTS": ["Positions [rad, m], speed [rad/s, m/s], friction [Nm, N], armature [kg m^2, kg]."],
     "LINKS": [
@@ -55,7 +58,7 @@ def module_text(spec: ModelSpec, *, standalone: bool = False) -> str:
     torch only.
     """
     assembly = parts.model_parts(spec)
-    call = listed_call("super().__init__", parts.Call("", assembly.model.arguments), 8) + SKIP
+    call = _listed_call("super().__init__", Call("", assembly.model.arguments), 8) + _SKIP
     names = names_in(ast.parse(call))
     arm = "\n\n".join(_rows(spec, assembly))
     if parts.MASS_ENTRIES.text in names:
@@ -110,7 +113,7 @@ def header(spec: ModelSpec) -> str:
     """Return the docstring of the module: arm, example, structure of M, and table of joints."""
     # Names from the URDF are quoted, see `_quoted`, so that they cannot end the docstring.
     example = _EXAMPLE.format(module=module_name(spec), n=len(spec.joints))
-    about = fill(description(spec), WIDTH, break_long_words=False, break_on_hyphens=False)
+    about = fill(description(spec), _WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n\n".join([about, example, _picture(spec), _joint_table(spec)])
 
 
@@ -144,7 +147,7 @@ def _picture(spec: ModelSpec) -> str:
     """
     cells = {}
     for row, column, kind, joints in spec.entries:
-        cells[row, column] = {"varying": joint_ranges(joints), "constant": "C", "zero": "0"}[kind]
+        cells[row, column] = cell_text(kind, joints)
     width = max(2, *map(len, cells.values()))
     lines = ["Mass matrix: numbers of the joints that each entry depends on; C constant, 0 always zero", ""]
     for row in range(len(spec.joints)):
@@ -186,8 +189,8 @@ def _rows(spec: ModelSpec, assembly: parts.ModelParts) -> list[str]:
             end = ""
             if name in terms:
                 end = f"  # {name[0].lower()}{k + 1}: {_term_description(spec, terms[name][k])}"
-            lines.append(f"    {filled('', row, 4, len(end))},{end}")
-        statements.append("\n".join([*lines, f"){SKIP}"]))
+            lines.append(f"    {_filled('', row, 4, len(end))},{end}")
+        statements.append("\n".join([*lines, f"){_SKIP}"]))
     return statements
 
 
@@ -206,12 +209,14 @@ def _term_description(spec: ModelSpec, term: OutputSpec | ConstantSpec) -> str:
 
 def _mass_entries(spec: ModelSpec) -> str:
     """Return the source of ``mass_entries``, which computes M from values of its learned functions and constants."""
-    names = parts.term_names(spec)
+    # The terms of M are named f1, f2, ... (functions), then c1, c2, ... (constants).
+    names = [f"f{k + 1}" for k in range(len(spec.outputs))]
+    names += [f"c{k + 1}" for k in range(len(spec.constants))]
     arguments = ", ".join(f"{name}: Tensor" for name in names)
     start = f"def mass_entries({arguments}) -> Tensor:"
-    if len(start) > WIDTH:
-        lines = wrap(f"{arguments},", WIDTH - 4, initial_indent=" " * 4, subsequent_indent=" " * 4)
-        start = "\n".join(["def mass_entries(", *lines, f") -> Tensor:{SKIP}"])
+    if len(start) > _WIDTH:
+        lines = wrap(f"{arguments},", _WIDTH - 4, initial_indent=" " * 4, subsequent_indent=" " * 4)
+        start = "\n".join(["def mass_entries(", *lines, f") -> Tensor:{_SKIP}"])
     result = "the residual of M" if spec.links else "M without armature"
     about = f'    """Return {result}, (..., n, n), from functions of q and constants."""'
     body, rows = [], []
@@ -225,8 +230,8 @@ def _mass_entries(spec: ModelSpec) -> str:
                 body.append(f"    {texts[column]} = {text}")
         rows.append(f"[{', '.join(texts)}]")
     end = f"    return symmetric({', '.join(rows)})"
-    if len(end) > WIDTH:
-        end = "\n".join(["    return symmetric(", *(f"        {row}," for row in rows), f"    ){SKIP}"])
+    if len(end) > _WIDTH:
+        end = "\n".join(["    return symmetric(", *(f"        {row}," for row in rows), f"    ){_SKIP}"])
     return "\n".join([start, about, *body, end])
 
 
@@ -297,3 +302,82 @@ def _no_module(reason: str, file: Path | None) -> ModuleError:
     if file is not None and file.suffix in (".urdf", ".xacro", ".xml"):
         got, do = "a robot description", f"`spelgen build {file}` writes its module"
     return ModuleError(got, file=file, expected=_EXPECTED, do=do)
+
+
+def _filled(start: str, value: object, indent: int, reserved: int = 0) -> str:
+    """Return the text ``start`` followed by the source text of ``value``, in one line or several lines.
+
+    The result is one line if the text and ``reserved`` more characters fit into ``_WIDTH`` columns.
+
+    Args:
+        start: text before the value, such as "name=".
+        value: the value.
+        indent: column at which the text starts.
+        reserved: number of characters that the caller adds after the text, such as a comment.
+    """
+    text = start + _flat(value)
+    if indent + len(text) + reserved < _WIDTH or not _items(value) or _is_repeated(value):
+        return text
+    inner = " " * (indent + _STEP)
+    opening, closing = "{}" if isinstance(value, dict) else "()"
+    callee = value.callee if isinstance(value, Call) else ""
+    # Each line is filled with as many items as fit. An item that has several lines starts on its own line.
+    lines = [f"{start}{callee}{opening}", inner]
+    for key, item in _items(value):
+        text = f"{_filled(key, item, indent + _STEP)},"
+        line = lines[-1]
+        if line == inner:
+            lines[-1] += text
+        elif "\n" in text or "\n" in line or len(line) + len(text) >= _WIDTH:
+            lines.append(inner + text)
+        else:
+            lines[-1] += f" {text}"
+    return "\n".join([*lines, " " * indent + closing])
+
+
+def _listed_call(start: str, value: Call, indent: int) -> str:
+    """Return ``start`` followed by the source text of a call with one line per argument; indent: column of the call."""
+    inner = " " * (indent + _STEP)
+    lines = [f"{inner}{_filled(key, item, indent + _STEP)}," for key, item in _items(value)]
+    return "\n".join([f"{start}{value.callee}(", *lines, " " * indent + ")"])
+
+
+def _flat(value: object) -> str:
+    """Return the source text of a value in one line. Texts become string literals of ASCII characters."""
+    if isinstance(value, Code):
+        return value.text
+    if isinstance(value, str):
+        return json.dumps(value) if value.isascii() and value.isprintable() else ascii(value)
+    if isinstance(value, tuple):
+        if _is_repeated(value):
+            return f"({_flat(value[0])},) * {len(value)}"
+        return f"({_flat(value[0])},)" if len(value) == 1 else f"({_joined(value)})"
+    if isinstance(value, dict):
+        return "{" + _joined(value) + "}"
+    return f"{value.callee}({_joined(value)})" if isinstance(value, Call) else repr(value)
+
+
+def _items(value: object) -> list[tuple[str, object]]:
+    """Return (prefix, item) for each argument of a ``Call``, or item of a dictionary or tuple; [] for other values.
+
+    The prefix is "key=" for a keyword argument of a call, "key: " for a dictionary, otherwise "".
+    """
+    if isinstance(value, Call):
+        return [(f"{key}=" if key else "", item) for key, item in value.arguments]
+    if isinstance(value, dict):
+        return [(f"{_flat(key)}: ", item) for key, item in value.items()]
+    return [("", item) for item in value] if isinstance(value, tuple) else []
+
+
+def _is_repeated(value: object) -> bool:
+    """Return True for a tuple of more than three equal items, which is written as a product: ``(0.0,) * 6``."""
+    return isinstance(value, tuple) and len(value) > 3 and value.count(value[0]) == len(value)
+
+
+def _joined(value: object) -> str:
+    return ", ".join(key + _flat(item) for key, item in _items(value))
+
+
+def names_in(tree: ast.AST) -> set[str]:
+    """Return all names that occur in a syntax tree, including names in annotations."""
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}

@@ -7,14 +7,14 @@ import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.fit import FittedBaselines
 from spelgen.baselines.predictor import Solver
-from spelgen.baselines.registry import EvaluatedArm, LinearServoRecord, command_followers, torque_predictors
+from spelgen.baselines.registry import EvaluatedArm, FittedBaselines, command_followers, torque_predictors
 from spelgen.dynamics.bristles import bristle_reach, reach_of
 from spelgen.dynamics.parameters import used_parameter_count, without_idle_residuals
 from spelgen.dynamics.protocol import RigidDynamics
@@ -85,7 +85,7 @@ class Subject:
         self.preprocessing: Preprocessing | None = None
         self.trained_on = Fingerprints()
         self.baselines: FittedBaselines = {}
-        self.linear_servos: LinearServoRecord | None = None
+        self.linear_servos: Mapping[str, Any] | None = None
         if isinstance(fit, Fit):
             self.urdf, self.fitted_urdf = self.urdf or fit.urdf, fit.urdf
             self.preprocessing, self.baselines = fit.preprocessing, fit.baselines

@@ -4,33 +4,86 @@ All curves are arrays in SI units [rad, m, s, Nm, N, kg m^2, J], with NaN for un
 five significant digits.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from spelgen.dynamics.protocol import RigidDynamics
-from spelgen.evaluation.drawn_motions import (
-    DrawnMotion,
-    PredictedMotion,
-    TorqueTrace,
-    predicted_motion,
-    replayed_motion,
-    thinned,
-    torque_motions,
-    torque_trace,
-    typical_and_worst,
-)
 from spelgen.evaluation.horizons import EvaluatedLogs, Predictions
 from spelgen.evaluation.plain import Curve, number
 from spelgen.evaluation.replay import PositionErrors
+from spelgen.evaluation.torque import friction_past, mean_nmse, predicted_torques
 from spelgen.evaluation.tuning import TUNING
 from spelgen.fitting.rollout import AT_REST, loss_scales, position_difference
 from spelgen.labels import MODEL, is_drawn
+from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 from spelgen.logs.windows import Windows
+from spelgen.runtime.port_hamiltonian import PortHamiltonian
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnMotion:
+    """Base class of the motions that charts show: positions q (T, n) [rad, m] along a segment of a log.
+
+    t: times (T,) [s] since the first sample of the segment. which: "typical" for the motion of median error, "worst"
+    for the motion of largest error. error: error of the model on this motion, None if not finite; its definition and
+    unit are given in the derived classes.
+    """
+
+    which: str = ""
+    trajectory: str
+    error: float | None = None
+    t: Curve
+    q: Curve
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PredictedMotion(DrawnMotion):
+    """A measured motion and its prediction, (T, n) each: a predicted window of a log, or a replayed log.
+
+    Attributes:
+        start: Time t of the first sample of the window in the log [s]; None for a replayed log.
+        predicted_q: Predicted positions, (T, n) [rad, m].
+        qd: Measured velocities, (T, n) [rad/s, m/s]; None for a replayed log.
+        predicted_qd: Predicted velocities, (T, n) [rad/s, m/s]; None for a replayed log.
+        u: Commands of position servos, (T, n) [rad, m]; None for a window.
+        error: For a window: RMS over joints of the relative errors of q and qd at the last sample [1]. A relative error
+            is an error divided by the RMS change of its quantity since the first sample, over all windows. For a
+            replayed log: RMS position error [rad, m].
+    """
+
+    start: float | None = None
+    predicted_q: Curve
+    qd: Curve | None = None
+    predicted_qd: Curve | None = None
+    u: Curve | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TorqueTrace(DrawnMotion):
+    """Measured joint torques along ten seconds of a log, and the torques of the predictors (model and baselines).
+
+    Attributes:
+        error: Normalised mean squared error (nMSE) of the torques of the model.
+        measured: Measured joint torques, (T, n) [Nm, N].
+        predicted: {name of a predictor: predicted joint torques, (T, n) [Nm, N]}.
+        parts: {name of a term: torque, (T, n) [Nm, N]}, for the inertia, Coriolis, gravity and friction term of the
+            model.
+    """
+
+    qd: Curve
+    measured: Curve
+    predicted: dict[str, Curve]
+    parts: dict[str, Curve]
+
+
+_Drawn = TypeVar("_Drawn", bound=DrawnMotion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +179,7 @@ def motion_traces(
         errors = _relative_errors(predictions, logs.joint_types)
         growth = _growth(predictions.windows, errors)
         predicted = _predicted_motions(predictions, errors[MODEL][:, -1])
-    torques = typical_and_worst([torque_trace(dynamics, motion) for motion in torque_motions(logs)])
+    torques = _typical_and_worst([_torque_trace(dynamics, motion) for motion in _torque_motions(logs)])
     drawn = (*torques, *predicted)
     return Traces(
         coverage=coverage(logs.pieces),
@@ -144,8 +197,8 @@ def replay_traces(errors: Sequence[PositionErrors]) -> Traces:
     One log has the median position error of all replayed logs, the other log the largest. The result also contains the
     range of motion of the logs. errors: replayed logs with the position errors of the model, (T, n) [rad, m].
     """
-    motions = [thinned(replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
-    return Traces(coverage([log for log, _ in errors]), trajectories=typical_and_worst(motions))
+    motions = [_thinned(_replayed_motion(log, error), TUNING.log_samples) for log, error in errors]
+    return Traces(coverage([log for log, _ in errors]), trajectories=_typical_and_worst(motions))
 
 
 def _relative_errors(predictions: Predictions, joint_types: Sequence[str]) -> dict[str, Tensor]:
@@ -175,14 +228,25 @@ def _growth(windows: Windows, errors: Mapping[str, Tensor]) -> Growth:
 def _predicted_motions(predictions: Predictions, errors: Tensor) -> tuple[PredictedMotion, ...]:
     """Return two predicted windows of the model: the window of median error and the window of largest error.
 
-    errors: relative error of the model at the end of each of W windows, (W,).
+    The first sample of a predicted motion is the measured initial state. errors: relative error of the model at the end
+    of each of W windows, (W,).
     """
+    windows = predictions.windows
+    q, qd = predictions.states[MODEL]
     motions = []
     for k, ((piece, first), error) in enumerate(zip(predictions.starts, errors.tolist(), strict=True)):
-        motion = predicted_motion(piece.name, predictions.windows, predictions.states[MODEL], k)
-        start = number(piece.t[first])
-        motions.append(replace(thinned(motion, TUNING.curve_samples), start=start, error=number(error)))
-    return typical_and_worst(motions)
+        motion = PredictedMotion(
+            trajectory=piece.name,
+            start=number(piece.t[first]),
+            error=number(error),
+            t=torch.cat([windows.dt.new_zeros(1), windows.dt[k].cumsum(dim=0)]).numpy(),
+            q=windows.q[k].numpy(),
+            qd=windows.qd[k].numpy(),
+            predicted_q=torch.cat([windows.q[k, :1], q[k]]).numpy(),
+            predicted_qd=torch.cat([windows.qd[k, :1], qd[k]]).numpy(),
+        )
+        motions.append(_thinned(motion, TUNING.curve_samples))
+    return _typical_and_worst(motions)
 
 
 def _quantiles(values: Tensor) -> Quantiles:
@@ -225,3 +289,98 @@ def _friction_trace(dynamics: Mapping[str, RigidDynamics], pieces: Sequence[Traj
             torque = torch.as_tensor(predictor.friction_torque(positions, alone))
         curves[name] = torch.diagonal(torque, dim1=-2, dim2=-1).mT.numpy()
     return FrictionTrace(speeds.mT.numpy(), curves)
+
+
+def _typical_and_worst(motions: Sequence[_Drawn]) -> tuple[_Drawn, ...]:
+    """Return the motion of median error and the motion of largest error; a single motion is returned once.
+
+    The field `which` of the returned motions is set to "typical" and "worst".
+    """
+    # Sorting keeps the order of motions with equal errors, so the same logs always give the same page.
+    ordered = sorted(motions, key=lambda motion: math.inf if motion.error is None else motion.error)
+    if not ordered:
+        return ()
+    chosen = [replace(ordered[(len(ordered) - 1) // 2], which="typical")]
+    if len(ordered) > 1:
+        chosen.append(replace(ordered[-1], which="worst"))
+    return tuple(chosen)
+
+
+def _thinned(motion: PredictedMotion, max_samples: int) -> PredictedMotion:
+    """Return every k-th sample of a motion, for a chart; k is the smallest stride that gives at most `max_samples`."""
+    # Samples are omitted, not averaged: a filter would hide spikes, which the reported errors contain.
+    stride = -(-len(motion.t) // max_samples)
+    arrays = {name: values for name, values in vars(motion).items() if isinstance(values, np.ndarray)}
+    curves: dict[str, Any] = {name: values[::stride] for name, values in arrays.items()}
+    return replace(motion, **curves)
+
+
+def _replayed_motion(log: Trajectory, error: np.ndarray) -> PredictedMotion:
+    """Return the measured and the predicted motion along a replayed log of position servos, for a chart.
+
+    error: (T-1, n) predicted minus measured positions [rad, m] at all samples except the first.
+    """
+    return PredictedMotion(
+        trajectory=log.name,
+        error=number(float(np.sqrt(np.square(error).mean()))),
+        t=log.t - log.t[0],
+        q=log.q,
+        u=log.u,
+        # The first position is the initial condition, so it is measured and not predicted.
+        predicted_q=np.concatenate([log.q[:1], log.q[1:] + error]),
+    )
+
+
+def _torque_motions(logs: EvaluatedLogs) -> list[DynamicsSamples]:
+    """Return the middle ten seconds of each log, subsampled for charts.
+
+    The middle is used because logs begin and end at rest.
+    """
+    motions = []
+    for samples in logs.samples:
+        count = min(len(samples.q), round(TUNING.torque_seconds * samples.rate) + 1)
+        start = (len(samples.q) - count) // 2
+        motions.append(samples[start : start + count : -(-count // TUNING.curve_samples)])
+    return motions
+
+
+def _torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSamples) -> TorqueTrace:
+    """Return the torques along `samples` for a chart: measured, predicted by each predictor, and terms of the model.
+
+    dynamics: {name of a predictor: dynamics}, with the trained model under the name `MODEL`. Its torque is also
+    returned as a sum of four terms: inertia, Coriolis, gravity and friction torque.
+    """
+    model = dynamics[MODEL]
+    q, qd, qdd = map(torch.from_numpy, (samples.q, samples.qd, samples.qdd))
+    with torch.no_grad():
+        inputs = np.eye(q.shape[-1])
+        # The input matrix G of a model may couple motors and joints; other dynamics have G = 1.
+        if isinstance(model, PortHamiltonian):
+            inputs = model.input_matrix(q).numpy()
+        gravity = model.gravity(q)
+        curves = {
+            "inertia": (model.mass_matrix(q) @ qdd.unsqueeze(-1)).squeeze(-1).numpy(),
+            "Coriolis": (model.nonlinear_effects(q, qd) - gravity).numpy(),
+            "gravity": gravity.numpy(),
+            "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),
+        }
+    torques = {name: predicted_torques(predictor, samples) for name, predictor in dynamics.items()}
+    predicted = {name: _at_joints(inputs, torque) for name, torque in torques.items()}
+    # Logs contain motor torques. They are converted to joint torques, because the terms of the model are joint torques.
+    measured = _at_joints(inputs, samples.tau)
+    return TorqueTrace(
+        trajectory=samples.name,
+        error=mean_nmse(predicted[MODEL] - measured, measured),
+        # The samples are evenly spaced, so the times are computed from the sample rate.
+        t=np.arange(len(samples.q)) / samples.rate,
+        q=samples.q,
+        qd=samples.qd,
+        measured=measured,
+        predicted=predicted,
+        parts=curves,
+    )
+
+
+def _at_joints(inputs: np.ndarray, torques: np.ndarray) -> np.ndarray:
+    """Return joint torques (T, n) [Nm, N] for motor torques (T, n); inputs: input matrix G, (n, n) or (T, n, n)."""
+    return np.asarray((inputs @ torques[..., None])[..., 0])

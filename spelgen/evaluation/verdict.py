@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from spelgen.baselines.fit import FittedBaselines
+from spelgen.baselines.registry import FittedBaselines
 from spelgen.errors import shortened
 from spelgen.evaluation.horizons import StateErrors
 from spelgen.evaluation.results import Results, Verdict

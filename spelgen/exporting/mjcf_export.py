@@ -12,6 +12,7 @@ from lxml import etree
 from spelgen.arm.arm import Chain, Coordinate
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.body_regressor import about_center, quaternion
+from spelgen.dynamics.protocol import motors_of
 from spelgen.dynamics.regressor_dynamics import body_chain
 from spelgen.dynamics.tip_frame import body_constraint, link_poses, tip_frame
 from spelgen.exporting.describe import Servos, Trained
@@ -158,10 +159,11 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     _add(root, "option", gravity=arm.gravity)
     world, equality, tendons, actuators, assets = (etree.SubElement(root, tag) for tag in _SECTIONS)
     # `is_coupled`: motors whose speed depends on several joints; their inertia is the armature of a tendon, not of a
-    # joint.
-    is_coupled = np.count_nonzero(projection.motors, axis=1) > 1
+    # joint. `motors`: matrix C, (n, n), motor velocities = C qd.
+    bodies, motors = projection.bodies, motors_of(projection.bodies).numpy()
+    is_coupled = np.count_nonzero(motors, axis=1) > 1
     elements, tip = [world], tip_frame(projection.arm)
-    for body, inertia in zip(tip.chain.bodies, projection.inertias, strict=True):
+    for body, inertia in zip(tip.chain.bodies, bodies.inertial_parameters.numpy(), strict=True):
         name = projection.arm.robot.joint[body.name].child
         pose = {"pos": body.translation, "quat": quaternion(body.rotation)}
         element = _add(elements[body.parent + 1], "body", name=name, **pose)
@@ -184,8 +186,8 @@ def mjcf_text(projection: RigidBodyProjection) -> tuple[bytes, str]:
     pose = {"pos": tip.pose[:3, 3], "quat": quaternion(tip.pose[:3, :3])}
     _add(elements[tip.carrier + 1], "site", name=tip.link, **pose)
     for k in np.flatnonzero(is_coupled).tolist():
-        rotor = _add_tendon(tendons, f"rotor{k + 1}", arm.coordinates, projection.motors[k])
-        rotor.set("armature", _text(projection.armature[k]))
+        rotor = _add_tendon(tendons, f"rotor{k + 1}", arm.coordinates, motors[k])
+        rotor.set("armature", _text(float(bodies.armature[k])))
     if projection.servos is None:
         _add_motors(actuators, tendons, projection)
     else:
@@ -210,7 +212,7 @@ def _drive(projection: RigidBodyProjection, k: int, is_coupled: np.ndarray) -> d
     effort = joint.effort if projection.servos is None else None
     return {
         # The armature of a coupled motor is an attribute of a tendon, see `mjcf_text`.
-        "armature": 0.0 if is_coupled[k] else projection.armature[k],
+        "armature": 0.0 if is_coupled[k] else float(projection.bodies.armature[k]),
         "damping": friction.viscous[k],
         "frictionloss": friction.coulomb[k],
         "solimpfriction": " ".join(f"{number:g}" for number in TUNING.friction_impedance),

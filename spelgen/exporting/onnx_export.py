@@ -18,7 +18,7 @@ from spelgen.dynamics.prepared import PreparedModel
 from spelgen.exporting import torch_export
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, with_readme
-from spelgen.exporting.parity import Called, Values
+from spelgen.exporting.parity import Called, Values, check_parity
 from spelgen.exporting.tuning import TUNING
 
 
@@ -29,16 +29,14 @@ def export_onnx(trained: Trained) -> Exported:
     """
     model = torch_export.prepared(trained)
     models = {name: onnx_model(model, name) for name in torch_export.program_names(trained)}
-    checked = torch_export.check_programs(
-        called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance
-    )
+    parity = check_parity(called_by_onnx(models), trained, list(models), TUNING.onnx_tolerance)
     use = f"ONNX files for any runtime, {torch_export.number_shapes(model)}."
     about = f"one file per entry point: {', '.join(models)}."
     files = {f"{name}.onnx": content for name, content in models.items()}
     imports = ["import numpy as np", "import onnxruntime"]
     run = 'onnxruntime.InferenceSession(f"{name}.onnx").run(None, inputs)[0]'
     example = torch_export.example_lines(model, list(models), imports, run, "np.zeros(({}), np.{})")
-    summary = [f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {checked}"]
+    summary = [f"Checked when exported, by ONNX Runtime {onnxruntime.__version__}: {parity.summary}"]
     return with_readme(trained, "onnx", files, use=use, about=about, summary=summary, example=example)
 
 

@@ -182,12 +182,15 @@ def check_parity(
         called: function that evaluates an entry point of the export.
         trained: the torch model and its arm.
         names: names of the entry points to compare.
-        tolerance: largest allowed difference, relative to the largest value of an output.
+        tolerance: largest allowed difference, relative to the largest value of an output. For programs in float32
+            (``trained.float32``), it is `ExportTuning.float32_tolerance`.
         states: number of random states.
         dtype: number type of the export; the inputs of export and torch model are rounded to this type.
 
     Raises RunError if a difference is above the tolerance.
     """
+    if trained.float32:
+        tolerance, dtype = TUNING.float32_tolerance, np.float32
     # The torch model computes in double precision, since rounding errors in float32 exceed the tolerance.
     exact = PreparedModel(copy.deepcopy(trained.model).cpu(), tip_kinematics(trained.arm))
     inputs = random_inputs(trained.arm.chain.coordinates, states, exact.n * exact.elements)

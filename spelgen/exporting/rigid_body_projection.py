@@ -12,7 +12,6 @@ from torch import Tensor
 from spelgen.arm.arm import Chain
 from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.parameters import without_residuals
-from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.emission.build import build
 from spelgen.exporting.describe import Servos, array, servos_of
@@ -51,9 +50,6 @@ class RigidBodyProjection:
 
     Attributes:
         arm: arm of the model, with n joints.
-        inertias: (bodies, 10), inertial parameters in the frames of the joints.
-        armature: (n,) [kg m^2, kg], rotor inertia of the motors.
-        motors: C, (n, n), motor velocities = C qd.
         friction: viscous and Coulomb friction that approximate the model's friction.
         inputs: G at q = 0, (n, n), joint torques = G times motor torques.
         servos: position servos of the model; None for an arm under torques.
@@ -62,13 +58,10 @@ class RigidBodyProjection:
         mass_error: RMS of (M of the rigid bodies - M of the trained model), divided by the RMS of M of the trained
             model.
         gravity_error: the same ratio for the gravity torque.
-        bodies: float64 model that consists of the rigid bodies only.
+        bodies: float64 model that consists of the rigid bodies and rotor inertias only.
     """
 
     arm: Arm
-    inertias: np.ndarray
-    armature: np.ndarray
-    motors: np.ndarray
     friction: NearestFriction
     inputs: np.ndarray
     servos: Servos | None
@@ -110,9 +103,6 @@ def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:
     bodies = without_residuals(model) if exact else _nearest_bodies(model, arm, q)
     return RigidBodyProjection(
         arm=arm,
-        inertias=bodies.inertial_parameters.numpy(),
-        armature=bodies.armature.numpy(),
-        motors=motors_of(bodies).numpy(),
         friction=nearest_friction(arm.chain, model, q),
         inputs=array(model.input_matrix(torch.zeros(model.n, dtype=torch.float64))),
         servos=servos_of(model),

@@ -4,7 +4,6 @@ import io
 import warnings
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -28,7 +27,8 @@ def export_torch(trained: Trained) -> Exported:
     """
     model = prepared(trained)
     programs = {name: _saved(export_program(model, name)) for name in program_names(trained)}
-    checked = check_programs(_called_by_torch(programs, model), trained, list(programs), TUNING.tolerance)
+    called = _called_by_torch(programs, model)
+    parity = check_parity(called, trained, list(programs), TUNING.tolerance)
     # Tensors are cloned, since safetensors refuses tensors that share memory.
     parameters = {key: x.cpu().contiguous().clone() for key, x in trained.model.state_dict().items()}
     use = (
@@ -40,7 +40,7 @@ def export_torch(trained: Trained) -> Exported:
     files["model.safetensors"] = save(parameters)
     run = 'torch.export.load(f"{name}.pt2").module()(*inputs.values())'
     example = example_lines(model, list(programs), ["import torch"], run, "torch.zeros({}, dtype=torch.{})")
-    summary = [f"Checked when exported, by torch {torch.__version__}: {checked}"]
+    summary = [f"Checked when exported, by torch {torch.__version__}: {parity.summary}"]
     return with_readme(trained, "torch", files, use=use, about=about, summary=summary, example=example)
 
 
@@ -60,20 +60,6 @@ def program_names(trained: Trained) -> list[str]:
     """
     available = [name for name in PROGRAMS if trained.model.elements or name not in FRICTION_STATE]
     return select_names(trained.entries, available)
-
-
-def check_programs(called: Called, trained: Trained, names: Sequence[str], tolerance: float) -> str:
-    """Compare exported programs with the torch model; return a summary. Raises RunError if a difference is too large.
-
-    Args:
-        called: function that evaluates an exported program.
-        trained: the model and its arm.
-        names: names of the programs.
-        tolerance: largest allowed difference of float64 programs; for float32 it is `ExportTuning.float32_tolerance`.
-    """
-    if trained.float32:
-        return check_parity(called, trained, names, TUNING.float32_tolerance, dtype=np.float32).summary
-    return check_parity(called, trained, names, tolerance).summary
 
 
 def number_shapes(model: PreparedModel) -> str:

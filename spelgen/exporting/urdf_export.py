@@ -38,7 +38,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     joints = {element.get("name"): element for element in root.findall("joint")}
     chain = choose_chain(robot, arm.joint_names, None)
     lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
-    for body, inertia in zip(lumped.moved, projection.inertias, strict=True):
+    for body, inertia in zip(lumped.moved, projection.bodies.inertial_parameters.numpy(), strict=True):
         for link in body.links:
             etree.strip_elements(links[link.name], "inertial")
         name = body.joint.child
@@ -65,11 +65,11 @@ def _settings_text(projection: RigidBodyProjection) -> str:
     if path.exists():
         content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     joints = content.setdefault("joints", {})
-    friction = projection.friction
+    friction, armature = projection.friction, projection.bodies.armature.tolist()
     for index, coordinate in enumerate(projection.arm.chain.coordinates):
         # The settings specify the inertia at the rotor; the model has the inertia at the joint, gear^2 times
         # as large.
-        rotor = projection.armature[index] / projection.arm.settings.joint(coordinate.name).gear ** 2
+        rotor = armature[index] / projection.arm.settings.joint(coordinate.name).gear ** 2
         numbers = rotor, friction.viscous[index], friction.forward[index], friction.backward[index]
         rotor, viscous, *coulomb = (float(_number(number)) for number in numbers)
         values = {"rotor_inertia": rotor, "viscous": viscous, "coulomb": coulomb}

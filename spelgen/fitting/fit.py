@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from spelgen.arm.configured_arm import Arm, urdf_path
-from spelgen.baselines.fit import FittedBaselines, fit_baselines
+from spelgen.baselines.registry import FittedBaselines, fit_baselines
 from spelgen.emission.assemble import ArmModel, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import Diagnostic, OptionError, RunError, SettingsError, SpelgenError

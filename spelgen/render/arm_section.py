@@ -10,10 +10,9 @@ from markupsafe import Markup
 
 from spelgen.arm.arm import Chain
 from spelgen.certificate.facts import Fact, facts
-from spelgen.certificate.inspection import cell_text
 from spelgen.evaluation.plain import Curve, record
 from spelgen.evaluation.traces import Traces
-from spelgen.labels import MODEL, entry_name, joints_in_ranges
+from spelgen.labels import MODEL, cell_text, entry_name, joints_in_ranges
 from spelgen.render.scene import scene
 from spelgen.structure.structure import MassEntry, Structure
 from spelgen.templates import json_data
@@ -80,7 +79,7 @@ def matrix(arm: Chain, structure: Structure) -> list[list[Cell]]:
     cells = {}
     for entry in structure.entries:
         explanation = _explanation(entry, every_fact)
-        cell = Cell(entry.kind, cell_text(entry), tuple(entry.joints), explanation)
+        cell = Cell(entry.kind, cell_text(entry.kind, entry.joints), tuple(entry.joints), explanation)
         cells[entry.row, entry.column] = cells[entry.column, entry.row] = cell
     joints = range(len(structure.joints))
     return [[cells[row, column] for column in joints] for row in joints]

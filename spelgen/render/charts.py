@@ -17,26 +17,16 @@ Values = Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
-class Margins:
-    """Margins around the plot area of a chart [pixels].
+class RenderTuning:
+    """Margins and limits of the charts, and limits of the 3D view of a page."""
 
-    `bare` replaces `bottom` if the x axis has no numbers and no label.
-    """
-
+    # [pixels] Margins around the plot area of a chart. `bare` replaces `bottom` if the x axis has no numbers and no
+    # label.
     left: int = 52
     right: int = 14
     top: int = 22
     bottom: int = 36
     bare: int = 8
-
-
-MARGINS = Margins()
-
-
-@dataclass(frozen=True)
-class RenderTuning:
-    """Limits of the charts and the 3D view of a page."""
-
     # [1] Largest number of points of a line: on 400 pixels more points are not visible, and the page becomes larger.
     points: int = 300
     # [1] Largest number of decades of a logarithmic axis. Values that are smaller by more decades are cut off.
@@ -224,10 +214,10 @@ def line_chart(
         y_values = _shown([mark.heights for mark in marks], log)
     if not x_values.size or not y_values.size:
         return Chart(render("chart.html.jinja", **size, x=None), ())
-    bottom = height - (MARGINS.bottom if x_label else MARGINS.bare)
-    x_axis = _axis(x_values, MARGINS.left, width - MARGINS.right, pad=0.0, log=log_x)
+    bottom = height - (TUNING.bottom if x_label else TUNING.bare)
+    x_axis = _axis(x_values, TUNING.left, width - TUNING.right, pad=0.0, log=log_x)
     # SVG counts pixels from the top, so the y axis starts at the larger coordinate `bottom`.
-    y_axis = _axis(y_values, bottom, MARGINS.top, pad=0.0 if limits else 0.06, log=log)
+    y_axis = _axis(y_values, bottom, TUNING.top, pad=0.0 if limits else 0.06, log=log)
     legend, beyond = [], []
     for mark in marks:
         inside = y_axis.contains(_shown([mark.heights], log))
@@ -360,7 +350,7 @@ def stacks(
             # Only the last chart of a column has a time axis. It is higher, so that all plot areas are equally high.
             time, height = "", row.height
             if row is rows[-1]:
-                time, height = "t [s]", row.height + MARGINS.bottom - MARGINS.bare
+                time, height = "t [s]", row.height + TUNING.bottom - TUNING.bare
             axis = joint.axis(row.quantity, row.axis) if row.quantity else row.axis
             title = f"{row.title} of {joint.name}"
             charts.append(line_chart(lines, title, time, axis, motion=motion, height=height))

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spelgen.evaluation.drawn_motions import PredictedMotion, TorqueTrace
 from spelgen.evaluation.plain import array
-from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, Traces
+from spelgen.evaluation.traces import FrictionTrace, Growth, MassTrace, PredictedMotion, TorqueTrace, Traces
 from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, NamedJoint, entry_name, named_joints, thousandths

@@ -391,8 +391,7 @@ class LogMapping(Group):
 
     def pattern(self, quantity: str) -> str:
         """Return the name of the columns of a quantity for all joints, with the placeholder `{joint}`."""
-        name: str = getattr(self.columns, quantity)
-        return name
+        return str(getattr(self.columns, quantity))
 
     def of_trajectory(self, text: str) -> LogMapping:
         """Return the mapping for one recording of a file with several recordings.
