@@ -35,8 +35,8 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
         "computed model predicted pred sim simulated g c f",
     )
 )
-# Words of `MEASURED` that may also name a term of a controller: if a log has `tau_measured`, `tau_feedback` is a part of
-# the torque command.
+# Words of `MEASURED` that may also name a term of a controller: in a log with `tau_measured`, `tau_feedback` is a part
+# of the torque command.
 FEEDBACK = {"feedback", "feed", "fb"}
 # {letter: quantity} for names such as `i_actual` (motor current) and `m_actual` (moment).
 LETTERS = {"i": "tau", "m": "tau"}
