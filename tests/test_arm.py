@@ -155,7 +155,7 @@ class TestChain:
         [
             (
                 {},
-                "FILE: got 2 chains of 1 joints: one to the link '1' (a ... a) and one to the link '2' "
+                "FILE: got 2 chains of 1 joint: one to the link '1' (a ... a) and one to the link '2' "
                 "(b ... b), "
                 "expected one longest chain; choose one with --tip LINK or --joints A,B,..., "
                 "or write tip or moving_joints into the settings",

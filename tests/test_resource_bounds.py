@@ -144,7 +144,7 @@ CASES = {
     "2000 links fixed in a row": Case(
         lambda: chain(1999, general, kind="fixed"), "no joint that moves independently"
     ),
-    "2000 links around one": Case(lambda: star(2000, "continuous"), "1999 chains of 1 joints"),
+    "2000 links around one": Case(lambda: star(2000, "continuous"), "1999 chains of 1 joint"),
     "2000 links fixed around one": Case(
         lambda: star(2000, "fixed").replace('"fixed"', '"revolute"', 1), None
     ),

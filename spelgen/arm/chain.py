@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from spelgen.arm.rational import bounded, exact
 from spelgen.errors import ArmError, Diagnostic, Severity, suggestion
+from spelgen.labels import counted
 from spelgen.urdf.robot import Robot, UrdfJoint
 
 # Words in names of gripper joints. The arm ends before the gripper.
@@ -176,13 +177,14 @@ def _longest(robot: Robot) -> ChainChoice:
     # A joint without effort limit (absent, or 0 in the file) probably has no motor: the chain without such joints is
     # the arm.
     driven = [chain for chain in longest if all(joint.effort is not None for joint in chain)]
+    got = f"{len(longest)} chains of {counted(length, 'joint')}: "
     if len(driven) == 1:
-        message = f"{len(longest)} chains of {length} joints: the only one with effort limits of all joints is taken"
+        message = f"{got}the only one with effort limits of all joints is taken"
         return ChainChoice(driven[0], _remark(driven[0][-1], "warning", message))
     listed = [f"one to the link {x[-1].child!r} ({x[0].name} ... {x[-1].name})" for x in longest[:4]]
     if len(longest) > 4:
         listed.append(f"{len(longest) - 4} more")
-    got = f"{len(longest)} chains of {length} joints: {' and '.join(listed)}"
+    got += " and ".join(listed)
     do = "choose one with --tip LINK or --joints A,B,..., or write tip or moving_joints into the settings"
     raise ArmError(got, file=robot.source, expected="one longest chain", do=do)
 
