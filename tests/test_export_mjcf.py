@@ -195,7 +195,8 @@ def test_shapes_and_effort_limits_go_along(tmp_path):
         '<collision><origin xyz="0 0.1 0"/><geometry><cylinder radius="0.05" length="0.3"/></geometry></collision>',
         '<visual><geometry><mesh filename="ball.stl" scale="1 2 1"/></geometry></visual>',
         '<visual><geometry><mesh filename="gone.stl"/></geometry></visual>'
-        '<collision><geometry><sphere radius="0.04"/></geometry></collision>',
+        '<collision><geometry><sphere radius="0.04"/></geometry></collision>'
+        '<visual><geometry><box size="0 0 0"/></geometry></visual>',
     )
     (tmp_path / "arm.urdf").write_text(ROUNDED.format(*shapes))
     arm = load_arm(tmp_path / "arm.urdf")

@@ -278,7 +278,7 @@ def _add_shapes(assets: etree._Element, elements: Sequence[etree._Element], arm:
         shapes = link_shapes(arm.robot.path, kind, names, TUNING.faces)
         omitted |= dict.fromkeys(shapes.unread)
         for shape in shapes.shapes:
-            if shape.mesh is not None and _is_flat(shape.mesh[0]):
+            if min(shape.size) == 0 or (shape.mesh is not None and _is_flat(shape.mesh[0])):
                 omitted[shape.link] = None
                 continue
             carrier, pose = poses[shape.link]
