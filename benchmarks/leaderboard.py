@@ -71,7 +71,9 @@ SECONDS: tuple[float, ...] = (3.0, 5.0, 10.0, 20.0, np.inf)
 RIDGES = tuple(10.0**k for k in range(-9, 3))
 RIDGE_FOLDS = 5
 # [s] duration of the training part, of arms with a single recording
-TRAINED_FIRST = {"panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4}
+TRAINED_FIRST = {
+    "panda": 12.0, "xmate3": 12.0, "ar5": 36.0, "tx40": 5.4, "unisa_ur10": 16.5, "unisa_panda": 14.5,
+}  # fmt: skip
 AIRBOT_TRAINING = ("ps_N7T25QR-5", "ps_N7T25QR-6_again")
 
 
@@ -242,19 +244,24 @@ METHODS: dict[str, Method] = {
 
 
 def folds(folder: Path) -> Iterator[Fold]:
-    """Yield all folds (training and test recordings) of the arms in a folder of recordings.
+    """Yield all folds (training and test recordings) of the arms in a folder of recordings; absent arms are skipped.
 
     The documented splits (docs/real_logs.md) are first, each split of a single recording with its reversal. Folds that
     are trained on one motion are last.
     """
     motions: list[Fold] = []
+    present = {path.name for path in folder.iterdir()}
     for name in ("ur10e", "airbot", "shanghai"):
+        if name not in present:
+            continue
         urdf = folder / name / f"{name}.urdf"
         logs = recordings_of(folder / name, urdf)
         unloaded = {k: x for k, x in logs.items() if "load" not in k.lower() or "unload" in k}
         yield from splits(name, urdf, unloaded)
         motions += motion_folds(name, urdf, unloaded)
     for name, seconds in TRAINED_FIRST.items():
+        if name not in present:
+            continue
         urdf = panda_urdf(folder) if name == "panda" else folder / name / f"{name}.urdf"
         (log,) = recordings_of(folder / name, urdf).values()
         yield Fold(f"{name}/split", urdf, (first(log, seconds),), {"remainder": (after(log, seconds),)})

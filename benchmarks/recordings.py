@@ -19,6 +19,7 @@ import json
 import pickle
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ from typing import ClassVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+
+from spelgen.logs.read import read_logs
 
 FOLDER = Path(__file__).parents[1] / "runs" / "recordings"
 Read = Callable[[str], bytes]
@@ -78,6 +81,7 @@ def numbers(content: bytes, delimiter: str | None = ",", skiprows: int = 0) -> n
 UR10E_JOINTS = [
     f"{x}_joint" for x in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
+PANDA_JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
 # [Nm/A] drive gains that the authors of the logs identified
 UR10E_GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])
 # {folder and name of a log: rows that the authors of the data use}; the file is FOLDER/ur-NAME.csv for "FOLDER/NAME"
@@ -121,8 +125,23 @@ def panda(read: Read, folder: Path) -> None:
     log = "matlab/data/Exciting_Traj/Trajectory_1/rbt_log/exciting_traj_{}.txt"
     t, *rest = (numbers(read(log.format(x)), None) for x in ("time", "positions", "velocity", "torques"))
     q, qd, tau = (values.reshape(-1, 7) for values in rest)
-    joints = [f"panda_joint{k}" for k in range(1, 8)]
-    write_log(folder / "exciting_traj1.parquet", t, joints, q=q, qd=qd, tau=tau)
+    write_log(folder / "exciting_traj1.parquet", t, PANDA_JOINTS, q=q, qd=qd, tau=tau)
+
+
+def from_bag(path: str, logged: Sequence[str], joints: Sequence[str]) -> Callable[[Read, Path], None]:
+    """Return a function that writes the joint states of a ROS 2 bag in SQLite; torques are the logged efforts.
+
+    path: path of the bag in the repository. logged, joints: names of the joints in the bag and in the URDF.
+    """
+
+    def write(read: Read, folder: Path) -> None:
+        with tempfile.TemporaryDirectory() as scratch:
+            bag = Path(scratch) / Path(path).name
+            bag.write_bytes(read(path))
+            (log,) = read_logs([bag], logged)
+        write_log(folder / f"{bag.stem}.parquet", log.t, joints, q=log.q, qd=log.qd, tau=log.tau)
+
+    return write
 
 
 def shanghai(read: Read, folder: Path) -> None:
@@ -360,6 +379,9 @@ SO_ARM = Repository(
 ROBOTS = Repository(
     f"{GITHUB}/Gepetto/example-robot-data", "39aa94379908fa743da90b21dc9e1fb8308f746b", "BSD-3-Clause"
 )
+UNISA = Repository(
+    f"{GITHUB}/unisa-acg/inverse-dynamics-solver", "41e196de5ca340f2b48e443484a7c74a77533da4", "BSD-3-Clause"
+)
 
 SOURCES = {
     "ur10e": Source(
@@ -376,6 +398,21 @@ SOURCES = {
         (AIRBOT, "state_machine_demo/resources/urdf/play.urdf"),
     ),
     "tx40": Source(TX40, tx40, "first 5.4 s", "rest", (TX40, "examples/staubli_TX40/urdf/tx40_mdh_modified.urdf")),
+    "unisa_ur10": Source(
+        UNISA,
+        from_bag(
+            "ur10_inverse_dynamics_solver/bagfiles/ur10_exciting_trajectory.db3", UR10E_JOINTS, UR10E_JOINTS
+        ),
+        "first 16.5 s", "rest", (ROBOTS, "robots/ur_description/urdf/ur10_robot.urdf"),
+    ),
+    "unisa_panda": Source(
+        UNISA,
+        from_bag(
+            "franka_inria_inverse_dynamics_solver/bagfiles/panda_exciting_trajectory.db3",
+            [f"fer_joint{k}" for k in range(1, 8)], PANDA_JOINTS,
+        ),
+        "first 14.5 s", "rest", (ROBOTS, "robots/panda_description/urdf/panda.urdf"),
+    ),
     "so101": Source(SAGE, so101, SO101_TRAIN, SO101_TEST, (SO_ARM, "Simulation/SO101/so101_new_calib.urdf")),
     "delan_characters": Source(DELAN, delan_characters, "17 characters", "e, q, v"),
 }  # fmt: skip
