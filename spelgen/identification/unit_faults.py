@@ -292,12 +292,16 @@ class PositionUnit(WrongScale):
         is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
         fault = self if is_sure else self._open_fault or self
         rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
-        unit = problem.fit(scaled(np.where(is_unit, nearest, rounded), form, fault))
-        return (
-            unit
-            if unit.cost < best.cost + GEOMETRY.right_angle
-            else problem.fit(scaled(rounded, form, fault))
-        )
+        options = [(np.where(is_unit, nearest, rounded), fault)]
+        if len(joints) > 1:
+            # A unit of all joints that explains the log about equally well is no coincidence, even if single factors
+            # are uncertain. Each free factor lowers the cost a little, since it explains errors of the friction model.
+            options = [(exact[np.abs(np.median(exact - exponents, axis=1)).argmin()], self), *options]
+        for values, kind in options:
+            unit = problem.fit(scaled(values, form, kind))
+            if unit.cost < best.cost + GEOMETRY.right_angle * len(joints):
+                return unit
+        return problem.fit(scaled(rounded, form, fault))
 
     def _descended(
         self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
