@@ -73,36 +73,18 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets, with the largest of `_shifts`."""
-        shifts = self._shifts(correction)
+        """Return the text about zero offsets, with the largest change of an offset."""
+        shifts = correction.hypothesis.offset - correction.unchanged.offset
         k = int(np.abs(shifts).argmax())
         size = f"{np.rad2deg(shifts[k]):.3g} degrees"
         if correction.arm.coordinates[k].joint_type == "prismatic":
             size = f"{shifts[k]:.3g} m"
         return f"positions with another zero, by {size}"
 
-    def joints(self, correction: Correction) -> list[str]:
-        """Return the names of the joints with another zero."""
-        shifts = self._shifts(correction)
-        return [name for name, shift in zip(correction.arm.joint_names, shifts, strict=True) if shift]
-
-    def _shifts(self, correction: Correction) -> np.ndarray:
-        """Return the changes (n,) of the zero offsets [rad, m]; 0 for reversed joints, unless no others have a change.
-
-        The zero offset of a reversed joint may be a part of another correction (`JointSense`), which has its own text.
-        """
-        shifts = correction.hypothesis.offset - correction.unchanged.offset
-        others = np.where(correction.factors[0] < 0, 0.0, shifts)
-        return np.asarray(others if others.any() else shifts)
-
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
-
-        {} is also returned if `correction` reverses the sense of the joint: `JointSense.joint_keys` then returns the
-        offset together with the sign, since the offset may depend on the sign.
-        """
+        """Return the setting `offset` [rad, m] of a joint whose zero `correction` changes; {} for other joints."""
         offset = correction.hypothesis.offset[joint]
-        if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
+        if offset == correction.unchanged.offset[joint]:
             return {}
         return {"offset": plain_number(offset)}
 

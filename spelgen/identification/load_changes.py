@@ -21,8 +21,8 @@ SAMPLES = 1200
 """Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
-Candidate = tuple[float, int, float, int | None]
-"""Change of the cost, recording, time [s] and joint (None: all joints) of a possible change of the torques."""
+Candidate = tuple[float, int, float, int]
+"""Change of the cost, recording, time [s] and joint (n: all n joints) of a possible change of the torques."""
 
 
 class LoadChange(NamedTuple):
@@ -136,7 +136,7 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
         torque[:, k] = rows[:, k] @ subset.on_torques(others).fit(subset.unchanged).parameters
     residual = torque - tau
     number = subset.samples.recording
-    single, common = list[Candidate](), list[Candidate]()
+    candidates = list[Candidate]()
     for recording in np.unique(number).tolist():
         # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
         # enough samples before and after each time; and the start of the recording, for a change between recordings.
@@ -151,17 +151,11 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
             falls = falls / np.maximum(tau.var(axis=0), 1e-30) / len(tau)
             errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
             misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
-            split, joint = np.unravel_index(misfits.argmin(), misfits.shape)
-            single.append((float(misfits.min()), recording, float(starts[split]), int(joint)))
-            total = misfits.sum(axis=1)
-            common.append((float(total.min()), recording, float(starts[total.argmin()]), None))
-    changes = []
-    for candidates in filter(None, (single, common)):
-        # The exact comparison takes time: it is made for three changes, and omitted if the residual shows hardly any
-        # change.
-        for misfit, recording, time, joint in sorted(candidates, key=itemgetter(0))[:3]:
-            if misfit < -GEOMETRY.needed:
-                changes.append(_change(subset, fit, recording, time, joint))
+            misfits = np.column_stack([misfits, misfits.sum(axis=1)])
+            for joint, split in enumerate(misfits.argmin(axis=0).tolist()):
+                candidates.append((float(misfits[split, joint]), recording, float(starts[split]), joint))
+    # The exact comparison takes time: it is made for six changes, and omitted if the residual shows hardly any change.
+    changes = [_change(subset, fit, *x) for misfit, *x in sorted(candidates)[:6] if misfit < -GEOMETRY.needed]
     fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
     return change if fall > GEOMETRY.needed else None
 
@@ -195,22 +189,18 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
 
 
 def _change(
-    problem: GeometryProblem,
-    fit: HypothesisFit,
-    recording: int,
-    time: float,
-    joint: int | None,
+    problem: GeometryProblem, fit: HypothesisFit, recording: int, time: float, joint: int
 ) -> tuple[float, TorqueChange]:
     """Return the evidence for a change of the logged torques at `time`, and the change: a new factor or a new offset.
 
     The evidence is the difference of two negative log likelihoods: the value of the best alternative minus the value of
     the change. The alternatives are another load from `time` on, and other friction from `time` on with drifting
     offsets. The evidence is 0 if the change does not explain the torques. fit: fit of `problem` without a change.
-    recording, time, joint: see `TorqueChange`.
+    recording, time, joint: see `Candidate`.
     """
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
-    chosen = np.arange(n) if joint is None else np.array([joint])
+    chosen = np.arange(n) if joint == n else np.array([joint])
     in_recording = (problem.samples.recording == recording)[:, None, None]
     late = in_recording * (problem.samples.times[:, None, None] >= time)
     # `torque` was fitted to the samples before and after the change together; the torques before it are more exact.
@@ -219,13 +209,13 @@ def _change(
     offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
     columns = [torque[..., None] * np.any(offsets, axis=2, keepdims=True) * late]
     # Sensors of torques are often zeroed before a recording: another zero in a whole recording is no change.
-    columns += [offsets * late] if joint is not None and time else []
+    columns += [offsets * late] if joint < n and time else []
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
     quantity = float(best.quantities[0, 0])
     factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
-    change = TorqueChange(recording, time, joint, factor, offset)
+    change = TorqueChange(recording, time, joint if joint < n else None, factor, offset)
     # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
     remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
     # Between recordings, motor constants may change by a fifth with temperature.
@@ -233,7 +223,9 @@ def _change(
     if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained or is_usual:
         return 0.0, change
     duration = problem.samples.times.max()
-    drift = offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
+    drift = (
+        offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
+    )
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
     alternatives = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)

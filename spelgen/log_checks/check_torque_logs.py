@@ -202,11 +202,9 @@ class TorqueLogs:
             chosen = [x.part(np.isin(x.recording, numbers)) if deviating else x for x in samples]
             problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
             problem = next((x for x in problems if x is not None), None)
-            results = list[LogError | Diagnostic]()
-            if problem is not None:
-                joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
-                flat = FlatTops.joined([self._flat[k] for k in numbers])
-                results = list(self._findings(problem, flat, joints, accepted))
+            joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
+            flat = FlatTops.joined([self._flat[k] for k in numbers])
+            results = list(self._findings(problem, flat, joints, accepted)) if problem else []
             errors.append([x for x in results if isinstance(x, LogError)])
             findings += results if numbers is agreeing else []
             if errors[0] and 2 * len(agreeing) > len(self._sources):
@@ -215,7 +213,9 @@ class TorqueLogs:
         if errors[0] and all(errors):
             return findings
         named = [self._of_recordings(x, y) for found, y in zip(errors, groups, strict=True) for x in found]
-        change = self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
+        change = (
+            self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
+        )
         return [*(x for x in findings if not isinstance(x, LogError)), *named, *filter(None, [change])]
 
     def _of_recordings(self, error: LogError, numbers: Sequence[int]) -> LogError:
@@ -245,9 +245,8 @@ class TorqueLogs:
         masses = []
         for change in loads:
             width = 2 * change.deviation
-            text = (
-                f"{change.mass:+.2g} +- {width:.1g} kg" if abs(change.mass) > width else "mass undetermined"
-            )
+            mass = f"{change.mass:+.2g} +- {width:.1g} kg"
+            text = mass if abs(change.mass) > width else "mass undetermined"
             masses.append(f"{self._sources[change.recording][0]} ({text})")
         if masses:
             message = (
@@ -318,9 +317,9 @@ class TorqueLogs:
             return
         # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit
         # contradict all torques.
-        wrong: Sequence[SpelgenError] = (
-            find_unsigned(problem) if not self._guessed and UNSIGNED not in accepted else []
-        )
+        wrong: Sequence[SpelgenError] = []
+        if not self._guessed and UNSIGNED not in accepted:
+            wrong = find_unsigned(problem)
         if not wrong and not self._guessed:
             limits = find_limits(problem, flat)
             yield from limits.notes
@@ -372,12 +371,14 @@ class TorqueLogs:
         if change is None:
             return None
         name, file = self._sources[change.recording]
-        joints = ", all joints" if change.joint is None else f", joint {problem.arm.joint_names[change.joint]!r}"
-        since, others = f" from about {change.time:.2g} s after the start on", "those before it"
+        joints = (
+            ", all joints" if change.joint is None else f", joint {problem.arm.joint_names[change.joint]!r}"
+        )
+        since, others = f", from about {change.time:.2g} s after the start on,", "those before it"
         do = "use the part before or after it"
         if not change.time:
             since, others, do = "", "those of the other recordings", "omit or correct the wrong recordings"
-        torque = f"{round(change.factor, 2):g} times {others}"
+        torque = f"{round(change.factor, 2) + 0.0:g} times {others}"
         if change.offset:
             torque = f"another zero than before it, by {change.offset:.2g}"
         return LogError(
@@ -410,12 +411,8 @@ class TorqueLogs:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
         # two turns. If this is true of most joints, they may all be logged at their motors.
-        width = np.array(
-            [
-                min(high - low, 4 * np.pi) if high > low else np.inf
-                for low, high in (x.limits() for x in evidence)
-            ]
-        )
+        limits = np.diff([x.limits() for x in evidence], axis=1)[:, 0]
+        width = np.where(limits > 0, np.minimum(limits, 4 * np.pi), np.inf)
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
         turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]
