@@ -74,7 +74,10 @@ def test_a_torque_of_another_scale_in_one_recording_is_named(arm, recordings, co
     assert check_logs(logs, arm).errors == ()
     logs[1] = replace(logs[1], tau=logs[1].tau * np.array([1, 1.6, 1, 1, 1, 1]))
     (error,) = map(str, check_logs(logs, arm).errors)
-    assert "trajectory run 1, joint 'joint2', tau" in error and "1.6 times those of the other recordings" in error
+    assert (
+        "trajectory run 1, joint 'joint2', tau" in error
+        and "1.6 times those of the other recordings" in error
+    )
 
 
 SERVO_FAULTS = {

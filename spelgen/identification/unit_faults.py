@@ -262,9 +262,8 @@ class PositionUnit(WrongScale):
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
         # For several joints, only the two forms without reversal are tried here; `_descended` then reverses joints.
-        forms: list[Form] = [
-            (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
-        ]
+        tried = signs[: 5 if len(ones) == 1 else 2]
+        forms: list[Form] = [(x * ones, y * ones, power) for x, y, power in tried]
         # `common`: logarithms of the tried factors. The factor makes the largest motion at least 0.05 rad or m and at
         # most two turns, and is at most exp(-0.6) = 0.55: a factor near 1 is neither a unit nor a gear.
         common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)

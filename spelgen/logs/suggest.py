@@ -104,11 +104,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     columns_of = columns_by_quantity(columns, commands, len(joints))
     # A column named "load" does not count as torque here, since servos have a register with this name.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
-    if (
-        not commands
-        and not torques
-        and len(columns_by_quantity(columns, True, len(joints))["u"]) >= len(joints)
-    ):
+    commanded = columns_by_quantity(columns, True, len(joints))["u"]
+    if not (commands or torques) and len(commanded) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
     moving = _changing(columns_of["q"], table)
