@@ -174,11 +174,11 @@ class Gravity(Compensation):
         descents = []
         for fit in [start, *([base] if size else [])]:
             direction = np.array(fit.hypothesis.gravity)
-            descents.append(
-                problem.descend(
-                    turned, direction, largest=standard, smallest=0.01 * standard, allowed=normalised
-                )
+            smallest = 0.01 * standard
+            descent = problem.descend(
+                turned, direction, largest=standard, smallest=smallest, allowed=normalised
             )
+            descents.append(descent)
         new, best = min(descents, key=lambda x: x[1].cost)
         # Gravity parallel to the axes of all joints causes no torque. If the torques contain no gravity, such a
         # direction therefore explains them as well as zero gravity does, and a gravity compensation is more likely. A

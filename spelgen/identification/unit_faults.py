@@ -65,6 +65,15 @@ class TorqueUnit(WrongScale):
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+            # If the log has another fault, such as another zero, its torques may not show the gravity of the URDF.
+            # Torques a hundred times as large as the URDF's, or as small, are then in another unit, too: in mNm if
+            # the ratio, to which friction contributes, is near a thousand.
+            tau = base.hypothesis.signals(problem.samples).tau
+            expected = problem.residual(base.hypothesis, problem.prior_mean) + tau
+            size = float(np.linalg.norm(tau) / max(np.linalg.norm(expected), 1e-12))
+            if not (candidates or is_found) and expected.any() and not 0.01 < size < 100.0:
+                factor = 1 / size if is_other_unit(size / 1e3) else 1e-3
+                candidates.append(np.full(len(is_open), rounded_factor(factor)))
         for factor in candidates:
             # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
             # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from
@@ -110,8 +119,11 @@ class TorqueUnit(WrongScale):
             return
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
-            rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
-            return problem.fit(present.changed(self, scale=rounded))
+            rounded = [rounded_factor(x) for x in factors]
+            if len(set(rounded)) > 1:
+                rounded = [float(f"{x:.2g}") for x in factors]
+            rescaled = scale * np.stack([np.ones_like(factors), rounded])
+            return problem.fit(present.changed(self, scale=rescaled))
 
         is_common = bool(is_other_unit(common))
         # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
@@ -364,9 +376,8 @@ class PositionUnit(WrongScale):
                 ratios.setdefault(sense, []).append(f"{abs(1 / motion[k]):.3g}")
         for sense, gears in ratios.items():
             times = ", ".join(dict.fromkeys(gears))
-            texts.append(
-                f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear"
-            )
+            gear = f"positions about {times} times as large as the joint's"
+            texts.append(f"{gear}{sense}, as at the motor of a gear")
         return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 
