@@ -6,6 +6,7 @@ The parameters of lowest cost are found by Gauss-Newton steps (`GeometryProblem.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -171,14 +172,9 @@ class Gravity(Compensation):
         starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
         lowest = min(fit.cost for fit in starts)
         start = next(fit for fit in starts if fit.cost < lowest + 1.0)
-        descents = []
-        for fit in [start, *([base] if size else [])]:
-            direction = np.array(fit.hypothesis.gravity)
-            smallest = 0.01 * standard
-            descent = problem.descend(
-                turned, direction, largest=standard, smallest=smallest, allowed=normalised
-            )
-            descents.append(descent)
+        smallest = 0.01 * standard
+        find = partial(problem.descend, turned, largest=standard, smallest=smallest, allowed=normalised)
+        descents = [find(np.array(fit.hypothesis.gravity)) for fit in [start, *([base] if size else [])]]
         new, best = min(descents, key=lambda x: x[1].cost)
         # Gravity parallel to the axes of all joints causes no torque. If the torques contain no gravity, such a
         # direction therefore explains them as well as zero gravity does, and a gravity compensation is more likely. A

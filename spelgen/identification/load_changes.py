@@ -155,7 +155,8 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
             for joint, split in enumerate(misfits.argmin(axis=0).tolist()):
                 candidates.append((float(misfits[split, joint]), recording, float(starts[split]), joint))
     # The exact comparison takes time: it is made for six changes, and omitted if the residual shows hardly any change.
-    changes = [_change(subset, fit, *x) for misfit, *x in sorted(candidates)[:6] if misfit < -GEOMETRY.needed]
+    likely = [x[1:] for x in sorted(candidates)[:6] if x[0] < -GEOMETRY.needed]
+    changes = [_change(subset, fit, *candidate) for candidate in likely]
     fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
     return change if fall > GEOMETRY.needed else None
 

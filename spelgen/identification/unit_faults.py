@@ -70,10 +70,10 @@ class TorqueUnit(WrongScale):
             # the ratio, to which friction contributes, is near a thousand.
             tau = base.hypothesis.signals(problem.samples).tau
             expected = problem.residual(base.hypothesis, problem.prior_mean) + tau
-            size = float(np.linalg.norm(tau) / max(np.linalg.norm(expected), 1e-12))
+            size = float(np.linalg.norm(tau)) / max(float(np.linalg.norm(expected)), 1e-12)
             if not (candidates or is_found) and expected.any() and not 0.01 < size < 100.0:
-                factor = 1 / size if is_other_unit(size / 1e3) else 1e-3
-                candidates.append(np.full(len(is_open), rounded_factor(factor)))
+                size = size if is_other_unit(size / 1e3) else 1e3
+                candidates.append(np.full(len(is_open), rounded_factor(1 / size)))
         for factor in candidates:
             # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
             # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from

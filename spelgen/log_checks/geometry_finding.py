@@ -88,10 +88,9 @@ def find_unexplained(
         wrong, remaining = _unexplained_joints(problem, unchanged)
     else:
         affected = np.abs(best.errors - unchanged.errors) + 1e-9
-        remaining = float(np.average(best.errors, weights=affected))
         # A combination of faults is no explanation if a large residual remains in the mean of all joints.
-        if len(best.hypothesis.faults) > 1:
-            remaining = max(remaining, float(best.errors.mean()))
+        is_combined = len(best.hypothesis.faults) > 1
+        remaining = float(max(np.average(best.errors, weights=affected), is_combined * best.errors.mean()))
         wrong = (best.errors > GEOMETRY.no_advice) & (remaining > GEOMETRY.no_advice)
     if not wrong.any():
         return None
