@@ -265,12 +265,16 @@ def test_times_in_another_unit_are_named_with_the_line_to_write(tmp_path, unit, 
     assert f'"t": "{unit}"' in suggest_mapping(path, JOINTS).text
 
 
-def dataset(folder, values, fps=30, names=JOINTS):
-    """Write a LeRobot 3 data set with equal positions and commands `values` (T, n) of motors with these names."""
+def dataset(folder, values, fps=30, names=JOINTS, others=None):
+    """Write a LeRobot 3 data set with equal positions and commands `values` (T, n) of motors with these names.
+
+    others: {name of another feature: values (T, n)}. A name without a point gets the suffix ".pos".
+    """
     (folder / "meta").mkdir(parents=True)
     (folder / "data" / "chunk-000").mkdir(parents=True)
-    motors = [f"{name}.pos" for name in names]
-    features = {name: {"dtype": "float32", "names": motors} for name in ("observation.state", "action")}
+    others = others or {}
+    motors = [name if "." in name else f"{name}.pos" for name in names]
+    features = {x: {"dtype": "float32", "names": motors} for x in ("observation.state", "action", *others)}
     (folder / "meta" / "info.json").write_text(json.dumps({"fps": fps, "features": features}))
     lists = pa.array(values.tolist(), pa.list_(pa.float32(), values.shape[1]))
     times = pa.array(np.arange(len(values)) / fps, pa.float32())
@@ -279,6 +283,7 @@ def dataset(folder, values, fps=30, names=JOINTS):
         "action": lists,
         "timestamp": times,
         "episode_index": np.zeros(len(values)),
+        **{x: pa.array(y.tolist(), pa.list_(pa.float32(), y.shape[1])) for x, y in others.items()},
     }
     pa.parquet.write_table(pa.table(table), folder / "data" / "chunk-000" / "file-000.parquet")
     return folder
@@ -311,6 +316,19 @@ def test_normalised_positions_of_lerobot_are_converted_by_the_calibration_or_ref
     (folder / "calibration.json").write_text(json.dumps({"shoulder": CALIBRATION["shoulder"]}))
     with pytest.raises(LogError, match="normalised range"):
         read_logs(folder, JOINTS, POSITION)
+
+
+@pytest.mark.parametrize("form", ["features", "state"])
+def test_velocities_and_torques_of_a_lerobot_data_set_are_read(tmp_path, form):
+    if form == "features":
+        others = {"observation.velocity": QD, "observation.effort": TAU}
+        folder = dataset(tmp_path / "set", Q, fps=100, others=others)
+    else:
+        names = [f"{name}.{x}" for x in ("pos", "vel", "torque") for name in JOINTS]
+        folder = dataset(tmp_path / "set", np.hstack([Q, QD, TAU]), fps=100, names=names)
+    (log,) = read_logs(folder, JOINTS)
+    for found, expected in ((log.q, Q), (log.qd, QD), (log.tau, TAU)):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_times_of_lerobot_are_reported_as_frame_numbers_until_a_rate_is_stated(tmp_path):

@@ -279,6 +279,25 @@ def test_degrees_are_advised_also_if_a_joint_has_another_fault(arm, reversed_joi
     assert (reversed_joint is None) == ("--accept torque-sense" not in error)
 
 
+@pytest.mark.parametrize("arm", ["six_dof", "ur10e", "panda"], indirect=True)
+@pytest.mark.parametrize("seed", [18, 21, 22])
+def test_degrees_of_a_mirrored_joint_are_no_gears(arm, seed):  # noqa: F811
+    log = recorded(arm, seed, noise=0.002)
+    factors = np.where(np.arange(log.q.shape[1]) == 1, -1.0, 1.0) * 180 / np.pi
+    error = told(arm, replace(log, q=factors * log.q, qd=factors * log.qd))
+    assert "sign: -1, units: {q: deg, qd: deg/s}" in error and "counts" not in error
+
+
+@pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
+@pytest.mark.parametrize("seed", [31, 32, 38])
+def test_torques_in_mnm_are_named_although_another_zero_hides_their_gravity(arm, seed):  # noqa: F811
+    """The arm has no effort limits: only the size of the torques shows their unit before the zero is corrected."""
+    log = recorded(arm, seed, noise=0.002)
+    shift = np.where(np.arange(log.q.shape[1]) == 2, np.pi / 2, 0.0)
+    error = told(arm, replace(log, q=log.q + shift, tau=1000 * log.tau))
+    assert set(re.findall(r"gain: ([\d.e-]+)", error)) == {"0.001"} and "offset: -1.5708" in error
+
+
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 def test_torques_in_percent_of_each_rated_torque_get_a_gain_per_joint(arm):  # noqa: F811
     """Torques in percent of each joint's rated torque get one gain per joint; their ratios are right to about 30 %."""

@@ -245,6 +245,13 @@ def test_npz_matrices_by_the_arm_s_order_or_by_names(tmp_path):
     check(read_logs([tmp_path / "y.npz"], JOINTS)[0], "y")
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_arrays_of_a_simulator_of_several_arms_with_one_arm_are_read(tmp_path, axis):
+    arrays = {"q": Q, "qd": QD, "tau": TAU}
+    np.savez(tmp_path / "x.npz", t=T, **{name: np.expand_dims(x, axis) for name, x in arrays.items()})
+    check(read_logs([tmp_path / "x.npz"], JOINTS)[0], "x")
+
+
 def test_npz_with_an_array_for_each_recording(tmp_path):
     arrays = {}
     for k in (3, 4):
@@ -1065,13 +1072,14 @@ def clock_texts(kind, seconds):
                 "ms": f"{1000 * x:.0f} ms",
                 "us": f"{1e6 * x:.0f}µs",
                 "s": f"{x:.2f} s",
+                "sec": f"{x:.3f} sec",
             }[kind]
         )
     return texts
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
-@pytest.mark.parametrize("kind", ["clock", "midnight", "date", "minutes", "ms", "us", "s"])
+@pytest.mark.parametrize("kind", ["clock", "midnight", "date", "minutes", "ms", "us", "s", "sec"])
 def test_times_as_texts_of_a_clock_or_with_a_unit_are_read(tmp_path, kind, form):
     seconds = 0.01 * np.arange(400)
     values = {f"{name}_a": np.sin(seconds + k) for k, name in enumerate(("q", "qd", "tau"))}

@@ -249,6 +249,16 @@ def test_the_direction_of_gravity_is_found(arm, seed, tmp_path):
     np.testing.assert_allclose(list(map(float, lines[0].split(","))), gravity, atol=0.3)
 
 
+def test_a_reversed_joint_with_another_zero_is_named_with_its_offset(arm):
+    """The error names only this joint, and its offset."""
+    log = recorded(arm, 12)
+    is_wrong = np.arange(log.q.shape[1]) == 2
+    sign = np.where(is_wrong, -1.0, 1.0)
+    wrong = replace(log, q=sign * log.q + is_wrong * np.pi / 2, qd=sign * log.qd, tau=sign * log.tau)
+    error = told(arm, wrong)
+    assert "all joints" not in error and "by 0 degrees" not in error and "sign: -1" in error
+
+
 def test_a_small_tilt_of_the_base_is_a_warning(arm):
     """A base that is tilted by five degrees is a warning, as the mounting of a robot may have this error."""
     tilted = replace(arm, chain=replace(arm.chain, gravity=(0.0, 0.85, -9.77)))

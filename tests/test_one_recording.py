@@ -45,6 +45,41 @@ def test_the_recording_whose_torques_contradict_the_others_is_named(arm, recordi
     assert "write '" not in error
 
 
+@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
+@pytest.mark.parametrize("code", FAULTS)
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_of_two_recordings_that_contradict_each_other_the_wrong_one_is_named(arm, recordings, code, wrong):  # noqa: F811
+    logs = recordings[:2]
+    logs[wrong] = FAULTS[code](logs[wrong])
+    (error,) = map(str, check_logs(logs, arm).errors)
+    assert f"trajectory run {wrong}, " in error and OF_ONE in error and "write '" not in error
+
+
+@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
+def test_a_fault_of_both_of_two_recordings_has_lines(arm, recordings):  # noqa: F811
+    logs = [FAULTS["joint-sense"](log) for log in recordings[:2]]
+    (error,) = map(str, check_logs(logs, arm).errors)
+    assert "trajectory" not in error and "sign: -1" in error
+
+
+@pytest.mark.parametrize("arm", ["six_dof"], indirect=True)
+@pytest.mark.parametrize("count", [2, 4])
+def test_a_torque_of_another_scale_in_one_recording_is_named(arm, recordings, count):  # noqa: F811
+    log = recordings[0]
+    rows = np.array_split(np.arange(len(log)), count)
+    logs = [
+        replace(log, name=f"run {k}", t=log.t[x] - log.t[x[0]], q=log.q[x], qd=log.qd[x], tau=log.tau[x])
+        for k, x in enumerate(rows)
+    ]
+    assert check_logs(logs, arm).errors == ()
+    logs[1] = replace(logs[1], tau=logs[1].tau * np.array([1, 1.6, 1, 1, 1, 1]))
+    (error,) = map(str, check_logs(logs, arm).errors)
+    assert (
+        "trajectory run 1, joint 'joint2', tau" in error
+        and "1.6 times those of the other recordings" in error
+    )
+
+
 SERVO_FAULTS = {
     "move against commands": lambda log: replace(log, u=log.u * [1, -1]),
     "commands that other joints follow": lambda log: replace(log, u=log.u[:, ::-1]),

@@ -6,6 +6,7 @@ The parameters of lowest cost are found by Gauss-Newton steps (`GeometryProblem.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
@@ -73,12 +74,8 @@ class ZeroOffset(Fault):
                 yield fit
 
     def text(self, correction: Correction) -> str:
-        """Return the text about zero offsets, with the largest offset of the joints whose motion is not reversed.
-
-        The zero offset of a reversed joint is a part of another correction (`JointSense`), which has its own text.
-        """
+        """Return the text about zero offsets, with the largest change of an offset."""
         shifts = correction.hypothesis.offset - correction.unchanged.offset
-        shifts[correction.factors[0] < 0] = 0.0
         k = int(np.abs(shifts).argmax())
         size = f"{np.rad2deg(shifts[k]):.3g} degrees"
         if correction.arm.coordinates[k].joint_type == "prismatic":
@@ -86,13 +83,9 @@ class ZeroOffset(Fault):
         return f"positions with another zero, by {size}"
 
     def joint_keys(self, correction: Correction, joint: int) -> dict[str, object]:
-        """Return the setting `offset` [rad, m] of a joint if `correction` changes the zero of its position; {} if not.
-
-        {} is also returned if `correction` reverses the sense of the joint: `JointSense.joint_keys` then returns the
-        offset together with the sign, since the offset may depend on the sign.
-        """
+        """Return the setting `offset` [rad, m] of a joint whose zero `correction` changes; {} for other joints."""
         offset = correction.hypothesis.offset[joint]
-        if correction.factors[0, joint] < 0 or offset == correction.unchanged.offset[joint]:
+        if offset == correction.unchanged.offset[joint]:
             return {}
         return {"offset": plain_number(offset)}
 
@@ -179,14 +172,9 @@ class Gravity(Compensation):
         starts = [problem.fit(turned(standard * axis)) for axis in (*-np.eye(3)[::-1], *np.eye(3))]
         lowest = min(fit.cost for fit in starts)
         start = next(fit for fit in starts if fit.cost < lowest + 1.0)
-        descents = []
-        for fit in [start, *([base] if size else [])]:
-            direction = np.array(fit.hypothesis.gravity)
-            descents.append(
-                problem.descend(
-                    turned, direction, largest=standard, smallest=0.01 * standard, allowed=normalised
-                )
-            )
+        smallest = 0.01 * standard
+        find = partial(problem.descend, turned, largest=standard, smallest=smallest, allowed=normalised)
+        descents = [find(np.array(fit.hypothesis.gravity)) for fit in [start, *([base] if size else [])]]
         new, best = min(descents, key=lambda x: x[1].cost)
         # Gravity parallel to the axes of all joints causes no torque. If the torques contain no gravity, such a
         # direction therefore explains them as well as zero gravity does, and a gravity compensation is more likely. A

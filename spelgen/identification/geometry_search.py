@@ -118,8 +118,8 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
     """Return the indices of the recordings whose torques contradict the other recordings; at most half of all.
 
     A recording deviates if parameters fitted to all other recordings explain the torques of the others, but not its own
-    torques. Deviating recordings are removed one by one, the worst first. [] is returned for two recordings: nothing
-    shows which of the two is wrong.
+    torques. Deviating recordings are removed one by one, the worst first. Of two recordings that contradict each other,
+    one is returned, although it may be the right one.
     """
     coarse = problem.thinned(GEOMETRY.confirming_samples)
     number, unchanged = coarse.samples.recording, coarse.unchanged
@@ -136,8 +136,7 @@ def deviating_recordings(problem: GeometryProblem) -> list[int]:
         scale = np.maximum(tau.var(axis=0), 1e-30)
         return {x: np.square(residual[number == x]).mean(axis=0) / scale for x in remaining}
 
-    # If only two recordings contradict each other, nothing shows which of the two is wrong.
-    while len(remaining) > max(2, len(deviating) + 1):
+    while len(remaining) > len(deviating) + 1:
         present = errors(remaining)
         worst = max(remaining, key=lambda x: float(present[x].max()))
         if present[worst].max() < GEOMETRY.unexplained / 5:

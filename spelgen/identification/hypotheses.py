@@ -166,9 +166,11 @@ class Correction:
         entries: dict[str, dict[str, object]] = {}
         of_log: dict[str, object] = {}
         of_robot: dict[str, object] = {}
+        # The order in which faults were found must not distinguish equal settings.
+        faults = sorted(self.hypothesis.faults, key=lambda fault: fault.code)
         for k, name in enumerate(self.arm.joint_names):
             keys: dict[str, object] = {}
-            for fault in self.hypothesis.faults:
+            for fault in faults:
                 for key, value in fault.joint_keys(self, k).items():
                     previous = keys.get(key)
                     if isinstance(previous, dict) and isinstance(value, dict):
@@ -178,7 +180,7 @@ class Correction:
                 entries[name] = keys
         if entries:
             of_log = joint_keys(entries, self.arm.joint_names)
-        for fault in self.hypothesis.faults:
+        for fault in faults:
             of_log |= fault.log_keys(self)
             of_robot |= fault.robot_keys(self)
         texts = []

@@ -78,9 +78,8 @@ class Interval:
     def to_dict(self) -> dict[str, object]:
         """Return the estimate and its interval in JSON form."""
         numbers = {"value": self.value, "deviation": self.std, "low": self.low, "high": self.high}
-        finite = {
-            name: x if math.isfinite(x) else None for name, x in numbers.items()
-        }  # infinite numbers become None, since JSON has no infinity
+        # infinite numbers become None, since JSON has no infinity
+        finite = {name: x if math.isfinite(x) else None for name, x in numbers.items()}
         return {"name": self.name, "unit": self.unit, **finite, "determined": self.determined}
 
 

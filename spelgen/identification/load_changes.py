@@ -21,8 +21,8 @@ SAMPLES = 1200
 """Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
 """Number of samples below which a recording is not compared with others."""
-Candidate = tuple[float, int, float, int | None]
-"""Change of the cost, recording, time [s] and joint (None: all joints) of a possible change of the torques."""
+Candidate = tuple[float, int, float, int]
+"""Change of the cost, recording, time [s] and joint (n: all n joints) of a possible change of the torques."""
 
 
 class LoadChange(NamedTuple):
@@ -99,13 +99,13 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
 
 
 class TorqueChange(NamedTuple):
-    """Change of the scale or zero of logged torques within a recording.
+    """Change of the scale or zero of logged torques within a recording, or of the scale between recordings.
 
     Attributes:
         recording: index of the recording.
-        time: time of the change since the start of the recording [s].
+        time: time of the change since the start of the recording [s]; 0 if the whole recording differs from the others.
         joint: index of the joint, or None for a change of the torques of all joints.
-        factor: ratio of the torques after the change to the torques before it; 1 if the zero changes.
+        factor: ratio of the torques after the change to the other torques; 1 if the zero changes.
         offset: torque that is added after the change [Nm, N]; 0 if the scale changes.
     """
 
@@ -120,41 +120,43 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
 
     A change is another factor on the torque of one joint, a common factor on the torques of all joints, or another
-    offset of the torque of one joint, from a time on. Two other hypotheses are fitted: another load from this time on
-    (the arm picks it up), and other friction from this time on together with offsets that drift (warm drives, drifting
-    sensors). A change is returned only if its negative log likelihood is lower by `GEOMETRY.needed` than without a
-    change and than under both other hypotheses.
+    offset of the torque of one joint, from a time on; or another factor in a whole recording. Two other hypotheses are
+    fitted: another load from this time on (the arm picks it up), and other friction from this time on together with
+    offsets that drift (warm drives, drifting sensors). A change is returned only if its negative log likelihood is
+    lower by `GEOMETRY.needed` than without a change and than under both other hypotheses.
     """
     subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
     fit = subset.fit(subset.unchanged)
-    residual = subset.residual(subset.unchanged, fit.parameters)
-    tau = subset.unchanged.signals(subset.samples).tau
-    single, common = list[Candidate](), list[Candidate]()
-    for recording in np.unique(subset.samples.recording).tolist():
-        rows = subset.samples.recording == recording
-        times = subset.samples.times[rows]
-        if len(times) < 4 * FEWEST or not times.any():
-            continue
+    rows, tau = subset.equations(subset.unchanged)[0], subset.unchanged.signals(subset.samples).tau
+    torque = rows @ fit.parameters
+    # The fit cannot predict a torque whose sign changes: both parts cancel each other. A torque with a large residual
+    # is therefore predicted from the torques of the other joints.
+    for k in np.flatnonzero(fit.errors > GEOMETRY.unexplained):
+        others = np.broadcast_to(np.arange(tau.shape[1]) != k, tau.shape)
+        torque[:, k] = rows[:, k] @ subset.on_torques(others).fit(subset.unchanged).parameters
+    residual = torque - tau
+    number = subset.samples.recording
+    candidates = list[Candidate]()
+    for recording in np.unique(number).tolist():
         # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
-        # enough samples before and after each time.
+        # enough samples before and after each time; and the start of the recording, for a change between recordings.
+        within, others = np.flatnonzero(number == recording), np.flatnonzero(number != recording)
+        times = subset.samples.times[within]
         splits = len(times) * np.arange(2, 19) // 20
-        falls = (
-            _falls((residual + tau)[rows], residual[rows], splits)
-            / np.maximum(tau.var(axis=0), 1e-30)
-            / len(tau)
-        )
-        errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
-        misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
-        split, joint = np.unravel_index(misfits.argmin(), misfits.shape)
-        single.append((float(misfits.min()), recording, float(times[splits[split]]), int(joint)))
-        total = misfits.sum(axis=1)
-        common.append((float(total.min()), recording, float(times[splits[total.argmin()]]), None))
-    changes = []
-    for candidates in filter(None, (single, common)):
-        misfit, recording, time, joint = min(candidates, key=itemgetter(0))
-        # The exact comparison takes time: it is omitted if the residual shows hardly any change.
-        if misfit < -GEOMETRY.needed:
-            changes.append(_change(subset, fit, residual + tau, recording, time, joint))
+        cases = [(within, splits, times[splits])] if len(times) >= 4 * FEWEST and times.any() else []
+        if min(len(within), len(others)) >= FEWEST:
+            cases.append((np.append(others, within), np.array([len(others)]), np.zeros(1)))
+        for chosen, counts, starts in cases:
+            falls = _falls(torque[chosen], residual[chosen], counts)
+            falls = falls / np.maximum(tau.var(axis=0), 1e-30) / len(tau)
+            errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
+            misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
+            misfits = np.column_stack([misfits, misfits.sum(axis=1)])
+            for joint, split in enumerate(misfits.argmin(axis=0).tolist()):
+                candidates.append((float(misfits[split, joint]), recording, float(starts[split]), joint))
+    # The exact comparison takes time: it is made for six changes, and omitted if the residual shows hardly any change.
+    likely = [x[1:] for x in sorted(candidates)[:6] if x[0] < -GEOMETRY.needed]
+    changes = [_change(subset, fit, *candidate) for candidate in likely]
     fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
     return change if fall > GEOMETRY.needed else None
 
@@ -188,44 +190,43 @@ def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.n
 
 
 def _change(
-    problem: GeometryProblem,
-    fit: HypothesisFit,
-    torque: np.ndarray,
-    recording: int,
-    time: float,
-    joint: int | None,
+    problem: GeometryProblem, fit: HypothesisFit, recording: int, time: float, joint: int
 ) -> tuple[float, TorqueChange]:
     """Return the evidence for a change of the logged torques at `time`, and the change: a new factor or a new offset.
 
     The evidence is the difference of two negative log likelihoods: the value of the best alternative minus the value of
     the change. The alternatives are another load from `time` on, and other friction from `time` on with drifting
     offsets. The evidence is 0 if the change does not explain the torques. fit: fit of `problem` without a change.
-    torque: torques (S, n) [Nm, N] predicted by `fit`. recording, time, joint: see `TorqueChange`.
+    recording, time, joint: see `Candidate`.
     """
     rows, _ = problem.equations(problem.unchanged)
     last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
-    chosen = np.arange(n) if joint is None else np.array([joint])
+    chosen = np.arange(n) if joint == n else np.array([joint])
     in_recording = (problem.samples.recording == recording)[:, None, None]
     late = in_recording * (problem.samples.times[:, None, None] >= time)
+    # `torque` was fitted to the samples before and after the change together; the torques before it are more exact.
+    counted = ~(late[..., 0] & np.isin(np.arange(n), chosen))
+    torque = rows @ problem.on_torques(counted).fit(problem.unchanged).parameters
     offsets = np.broadcast_to(np.eye(n)[:, chosen], (len(rows), n, len(chosen)))
     columns = [torque[..., None] * np.any(offsets, axis=2, keepdims=True) * late]
-    columns += [offsets * late] if joint is not None else []
+    # Sensors of torques are often zeroed before a recording: another zero in a whole recording is no change.
+    columns += [offsets * late] if joint < n and time else []
     all_samples = [np.ones(len(rows), bool)]
     refits = [_refit(problem, fit, x, all_samples) for x in columns]
     best = min(refits, key=lambda x: x.misfit)
     quantity = float(best.quantities[0, 0])
-    factor, offset = 1.0, quantity
-    if best is refits[0]:
-        # `torque` was fitted to the samples before and after the change together. The parameters that were refitted
-        # with the change give the torque before it.
-        scaled, unchanged = columns[0][..., 0], rows @ best.parameters
-        factor, offset = 1 + quantity * float(np.square(scaled).sum() / (scaled * unchanged).sum()), 0.0
-    change = TorqueChange(recording, time, joint, factor, offset)
+    factor, offset = (1 + quantity, 0.0) if best is refits[0] else (1.0, quantity)
+    change = TorqueChange(recording, time, joint if joint < n else None, factor, offset)
     # Other faults of the log cause a large residual: of all joints, or twice as large a residual of the changed joint.
     remaining = max(best.errors.mean(), best.errors[chosen].mean() / 2)
-    if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained:
+    # Between recordings, motor constants may change by a fifth with temperature.
+    is_usual = not time and 0.8 < factor < 1.25
+    if fit.misfit - best.misfit <= GEOMETRY.needed or remaining > GEOMETRY.explained or is_usual:
         return 0.0, change
-    drift = offsets * (problem.samples.times / problem.samples.times.max())[:, None, None] * in_recording
+    duration = problem.samples.times.max()
+    drift = (
+        offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
+    )
     viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
     alternatives = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)

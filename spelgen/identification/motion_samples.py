@@ -201,9 +201,8 @@ class DriveLog:
         inner = samples[ENDS:-ENDS]
         assert inner.z is not None and inner.direction is not None
         moving = np.flatnonzero(is_moving(inner.qd))
-        while (
-            len(moving[:: self._every]) > 2 * HINTS.samples
-        ):  # before signals at E times are stored per sample: for all samples of a long log they need gigabytes
+        # before signals at E times are stored per sample: for all samples of a long log they need gigabytes
+        while len(moving[:: self._every]) > 2 * HINTS.samples:
             self._thin()
         signals = np.stack([samples.q, samples.qd, samples.qdd, samples.tau @ self._inputs.T], axis=2)
         signals = np.pad(signals, ((OFFSETS[-1], OFFSETS[-1]), (0, 0), (0, 0)), mode="edge")

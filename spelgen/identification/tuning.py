@@ -87,8 +87,8 @@ class LogGeometryTuning:
     # [1] A hypothesis does not explain the torques if the relative residual variance (residual variance / variance of
     # the torque) is above this value at a joint, and also in a weighted mean of the joints. The weight of a joint is
     # the change of its relative residual variance by the hypothesis: joints that the hypothesis does not affect do not
-    # count. With the right correction, logs of recorded arms have at most 0.07 in the mean of all joints, although up
-    # to 0.27 at a joint whose torque is mostly friction.
+    # count, except for combinations of faults. With the right correction, logs of recorded arms have at most 0.07 in
+    # the mean of all joints, although up to 0.27 at a joint whose torque is mostly friction.
     no_advice: float = 0.2
     # [1] If the rigid-body and friction model is fitted to the log without corrections, and the residual variance /
     # variance of the torque is above this value in the mean of the joints or at a loaded joint, the logged columns are

@@ -65,6 +65,15 @@ class TorqueUnit(WrongScale):
             ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+            # If the log has another fault, such as another zero, its torques may not show the gravity of the URDF.
+            # Torques a hundred times as large as the URDF's, or as small, are then in another unit, too: in mNm if
+            # the ratio, to which friction contributes, is near a thousand.
+            tau = base.hypothesis.signals(problem.samples).tau
+            expected = problem.residual(base.hypothesis, problem.prior_mean) + tau
+            size = float(np.linalg.norm(tau)) / max(float(np.linalg.norm(expected)), 1e-12)
+            if not (candidates or is_found) and expected.any() and not 0.01 < size < 100.0:
+                size = size if is_other_unit(size / 1e3) else 1e3
+                candidates.append(np.full(len(is_open), rounded_factor(1 / size)))
         for factor in candidates:
             # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
             # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from
@@ -110,8 +119,11 @@ class TorqueUnit(WrongScale):
             return
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
-            rounded = scale * np.stack([np.ones_like(factors), [float(f"{x:.2g}") for x in factors]])
-            return problem.fit(present.changed(self, scale=rounded))
+            rounded = [rounded_factor(x) for x in factors]
+            if len(set(rounded)) > 1:
+                rounded = [float(f"{x:.2g}") for x in factors]
+            rescaled = scale * np.stack([np.ones_like(factors), rounded])
+            return problem.fit(present.changed(self, scale=rescaled))
 
         is_common = bool(is_other_unit(common))
         # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
@@ -262,9 +274,8 @@ class PositionUnit(WrongScale):
         ones = np.ones(len(joints))
         signs = [(1, 1, 0), (1, 1, 1), (-1, 1, 0), (-1, -1, 0), (-1, -1, 1)]
         # For several joints, only the two forms without reversal are tried here; `_descended` then reverses joints.
-        forms: list[Form] = [
-            (x * ones, y * ones, power) for x, y, power in signs[: 5 if len(ones) == 1 else 2]
-        ]
+        tried = signs[: 5 if len(ones) == 1 else 2]
+        forms: list[Form] = [(x * ones, y * ones, power) for x, y, power in tried]
         # `common`: logarithms of the tried factors. The factor makes the largest motion at least 0.05 rad or m and at
         # most two turns, and is at most exp(-0.6) = 0.55: a factor near 1 is neither a unit nor a gear.
         common = np.arange(np.log(0.05 / span), min(np.log(4 * np.pi / span), -0.6), 0.15)
@@ -292,12 +303,16 @@ class PositionUnit(WrongScale):
         is_sure = min(sides) > best.cost + GEOMETRY.right_angle and largest_gear < LARGEST_GEAR
         fault = self if is_sure else self._open_fault or self
         rounded = -np.log([float(f"{x:.3g}") for x in np.exp(-exponents) / present] * present)
-        unit = problem.fit(scaled(np.where(is_unit, nearest, rounded), form, fault))
-        return (
-            unit
-            if unit.cost < best.cost + GEOMETRY.right_angle
-            else problem.fit(scaled(rounded, form, fault))
-        )
+        options = [(np.where(is_unit, nearest, rounded), fault)]
+        if len(joints) > 1:
+            # A unit of all joints that explains the log about equally well is no coincidence, even if single factors
+            # are uncertain. Each free factor lowers the cost a little, since it explains errors of the friction model.
+            options = [(exact[np.abs(np.median(exact - exponents, axis=1)).argmin()], self), *options]
+        for values, kind in options:
+            unit = problem.fit(scaled(values, form, kind))
+            if unit.cost < best.cost + GEOMETRY.right_angle * len(joints):
+                return unit
+        return problem.fit(scaled(rounded, form, fault))
 
     def _descended(
         self, problem: GeometryProblem, scaled: Callable[..., Hypothesis], start: np.ndarray, form: Form
@@ -361,9 +376,8 @@ class PositionUnit(WrongScale):
                 ratios.setdefault(sense, []).append(f"{abs(1 / motion[k]):.3g}")
         for sense, gears in ratios.items():
             times = ", ".join(dict.fromkeys(gears))
-            texts.append(
-                f"positions about {times} times as large as the joint's{sense}, as at the motor of a gear"
-            )
+            gear = f"positions about {times} times as large as the joint's"
+            texts.append(f"{gear}{sense}, as at the motor of a gear")
         return " and ".join(dict.fromkeys(texts)) if self._open_fault else "positions in an unknown unit"
 
 

@@ -404,9 +404,8 @@ class ServoLogs:
             do = mapping_line(joint_keys(entries, self._names)) if entries else fault.do
             joints = f"joint {', '.join(repr(self._names[k]) for k in group)}"
             where = f"trajectory {names}, {joints}" if names else joints
-            summary.errors.append(
-                LogError(fault.got, element=where, expected=expected, do=OF_ONE if names else do)
-            )
+            error = LogError(fault.got, element=where, expected=expected, do=OF_ONE if names else do)
+            summary.errors.append(error)
         return {k for group in groups.values() for k in group}
 
 

@@ -183,7 +183,7 @@ class TorqueLogs:
 
         Recordings whose torques agree are tested together. If they have no errors, every other recording, which
         contradicts them or has another load, is tested by itself. Only its errors are returned; they name the
-        recording.
+        recording. If the agreeing recordings are at most half of all, errors that only they have name them, too.
 
         Args:
             samples: two sets of samples, first unfiltered, then low-pass filtered. The filtered samples are used; if
@@ -197,28 +197,35 @@ class TorqueLogs:
         if unfiltered is not None and not loads:
             deviating = deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
-        findings = list[LogError | Diagnostic]()
-        for numbers in (agreeing, *([k] for k in deviating)):
+        findings, errors = list[LogError | Diagnostic](), list[list[LogError]]()
+        groups = [agreeing, *([k] for k in deviating)]
+        for numbers in groups:
             chosen = [x.part(np.isin(x.recording, numbers)) if deviating else x for x in samples]
             problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
             problem = next((x for x in problems if x is not None), None)
-            if problem is None:
-                continue
             joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
             flat = FlatTops.joined([self._flat[k] for k in numbers])
-            results = list(self._findings(problem, flat, joints, accepted))
-            if numbers is agreeing:
-                findings += results
-                if any(isinstance(x, LogError) for x in results):
-                    break
-                continue
-            name, file = self._sources[numbers[0]]
-            for error in results:
-                if isinstance(error, LogError) and not str(error.element).startswith("trajectory"):
-                    where = f"trajectory {name}, {error.element}"
-                    error = replace(error, file=file, element=where, do=OF_ONE, codes=())
-                findings += [error] if isinstance(error, LogError) else []
-        return findings
+            results = list(self._findings(problem, flat, joints, accepted)) if problem else []
+            errors.append([x for x in results if isinstance(x, LogError)])
+            findings += results if numbers is agreeing else []
+            if errors[0] and 2 * len(agreeing) > len(self._sources):
+                return findings
+        # An error of all recordings is stated once, with the lines that correct it.
+        if errors[0] and all(errors):
+            return findings
+        named = [self._of_recordings(x, y) for found, y in zip(errors, groups, strict=True) for x in found]
+        change = (
+            self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
+        )
+        return [*(x for x in findings if not isinstance(x, LogError)), *named, *filter(None, [change])]
+
+    def _of_recordings(self, error: LogError, numbers: Sequence[int]) -> LogError:
+        """Return an error about some of the recordings, with their names. numbers: indices of these recordings."""
+        if len(numbers) == len(self._sources) or str(error.element).startswith("trajectory"):
+            return error
+        names = shortened([self._sources[k][0] for k in numbers], 5)
+        where = f"trajectory {names}, {error.element}"
+        return replace(error, file=self._sources[numbers[0]][1], element=where, do=OF_ONE, codes=())
 
     def _load_changes(self, motion: MotionSamples, moving: MotionSamples | None) -> list[LoadChange]:
         """Return the changes of the load (the arm's payload) between recordings; [] for a single recording.
@@ -239,9 +246,8 @@ class TorqueLogs:
         masses = []
         for change in loads:
             width = 2 * change.deviation
-            text = (
-                f"{change.mass:+.2g} +- {width:.1g} kg" if abs(change.mass) > width else "mass undetermined"
-            )
+            mass = f"{change.mass:+.2g} +- {width:.1g} kg"
+            text = mass if abs(change.mass) > width else "mass undetermined"
             masses.append(f"{self._sources[change.recording][0]} ({text})")
         if masses:
             message = (
@@ -315,9 +321,9 @@ class TorqueLogs:
             return
         # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit
         # contradict all torques.
-        wrong: Sequence[SpelgenError] = (
-            find_unsigned(problem) if not self._guessed and UNSIGNED not in accepted else []
-        )
+        wrong: Sequence[SpelgenError] = []
+        if not self._guessed and UNSIGNED not in accepted:
+            wrong = find_unsigned(problem)
         if not wrong and not self._guessed:
             limits = find_limits(problem, flat)
             yield from limits.notes
@@ -369,15 +375,19 @@ class TorqueLogs:
         if change is None:
             return None
         name, file = self._sources[change.recording]
-        joints, torque = ", all joints", f"{change.factor:.2g} times those before it"
-        if change.joint is not None:
-            joints = f", joint {problem.arm.joint_names[change.joint]!r}"
+        joints = (
+            ", all joints" if change.joint is None else f", joint {problem.arm.joint_names[change.joint]!r}"
+        )
+        since, others = f", from about {change.time:.2g} s after the start on,", "those before it"
+        do = "use the part before or after it"
+        if not change.time:
+            since, others, do = "", "those of the other recordings", "omit or correct the wrong recordings"
+        torque = f"{round(change.factor, 2) + 0.0:g} times {others}"
         if change.offset:
             torque = f"another zero than before it, by {change.offset:.2g}"
         return LogError(
-            f"torques that are, from about {change.time:.2g} s after the start on, {torque}", file=file,
-            element=f"trajectory {name}{joints}, tau", expected="one scale and zero of the torques in a recording",
-            do="use the part before or after it", codes=(CHANGED,),
+            f"torques that are{since} {torque}", file=file, element=f"trajectory {name}{joints}, tau",
+            expected="one scale and zero of the torques", do=do, codes=(CHANGED,),
         )  # fmt: skip
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
@@ -405,12 +415,8 @@ class TorqueLogs:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
         # two turns. If this is true of most joints, they may all be logged at their motors.
-        width = np.array(
-            [
-                min(high - low, 4 * np.pi) if high > low else np.inf
-                for low, high in (x.limits() for x in evidence)
-            ]
-        )
+        limits = np.diff([x.limits() for x in evidence], axis=1)[:, 0]
+        width = np.where(limits > 0, np.minimum(limits, 4 * np.pi), np.inf)
         is_wide = np.ptp(problem.unchanged.signals(problem.samples).motion[0], axis=0) > width
         wide = [[k] for k, name in enumerate(names) if is_wide[k] or name in self._guessed]
         turning = [k for k, x in enumerate(problem.arm.joint_types) if x == "revolute"]

@@ -88,7 +88,9 @@ def find_unexplained(
         wrong, remaining = _unexplained_joints(problem, unchanged)
     else:
         affected = np.abs(best.errors - unchanged.errors) + 1e-9
-        remaining = float(np.average(best.errors, weights=affected))
+        # A combination of faults is no explanation if a large residual remains in the mean of all joints.
+        is_combined = len(best.hypothesis.faults) > 1
+        remaining = float(max(np.average(best.errors, weights=affected), is_combined * best.errors.mean()))
         wrong = (best.errors > GEOMETRY.no_advice) & (remaining > GEOMETRY.no_advice)
     if not wrong.any():
         return None
@@ -113,9 +115,9 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     fit of the model to the log without corrections. The thresholds in `GEOMETRY` are `no_torque` = 0.6 and `no_advice`
     = 0.2.
 
-    1. If the mean residual of all joints is above 0.6, the mask contains the joints with a residual above 0.2, and the
-       second result is the mean. The mean is weighted with the variances of the torques, since the torque of a joint at
-       rest may be only noise.
+    1. If the mean residual is above 0.6, the mask contains the joints with a residual above 0.2, and the second result
+       is the mean. It is the mean of all joints, weighted with the variances of their torques, or the mean of the
+       moving joints, whichever is larger: the torque of a joint at rest may be only noise.
     2. Otherwise the mask contains the joints that move, have a residual above 0.6, and have a load: the standard
        deviation of the torque predicted with the URDF's parameters exceeds half of the logged torque's. The second
        result is the largest residual of these joints.
@@ -123,10 +125,11 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)
     of_urdf = signals.tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
-    mean = float(np.average(errors, weights=signals.tau.var(axis=0) + 1e-30))
+    is_moving = signals.motion[1].std(axis=0) > SAMPLES.moving
+    weights = np.stack([signals.tau.var(axis=0) + 1e-30, is_moving + 1e-30])
+    mean = float((weights @ errors / weights.sum(axis=1)).max())
     if mean > GEOMETRY.no_torque:
         return errors > GEOMETRY.no_advice, mean
-    is_moving = signals.motion[1].std(axis=0) > SAMPLES.moving
     is_loaded = of_urdf.std(axis=0) > 0.5 * signals.tau.std(axis=0)
     wrong = (errors > GEOMETRY.no_torque) & is_moving & is_loaded
     return wrong, float(errors[wrong].max(initial=0.0))

@@ -174,9 +174,8 @@ def find_limits(problem: GeometryProblem, flat: FlatTops) -> Findings:
                     f"q stays at {level:.4g} while its torque differs by {difference:.3g} from the model of the other "
                     "samples: contact with a stop; remove such motion"
                 )
-                findings.notes.append(
-                    Diagnostic("warning", AT_A_STOP, f"joint {coordinate.name!r}", None, message)
-                )
+                where = f"joint {coordinate.name!r}"
+                findings.notes.append(Diagnostic("warning", AT_A_STOP, where, None, message))
     return findings
 
 

@@ -121,9 +121,8 @@ class Findings:
         if is_partial:
             do = f"{do} if this is true of all recordings; else correct this one, or omit it"
         codes = (check.code,)
-        self.errors.append(
-            LogError(message, file=file, element=where, expected=check.expected, do=do, codes=codes)
-        )
+        error = LogError(message, file=file, element=where, expected=check.expected, do=do, codes=codes)
+        self.errors.append(error)
 
 
 def run_checks(

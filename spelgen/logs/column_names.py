@@ -88,9 +88,8 @@ def parse_column_name(
     """
     # Units in brackets are removed before the search of joints: "deg/s" is not the joint s. Other brackets may contain
     # a number or a joint.
-    fraction = (
-        r"[\W_](\d*\.\d+ ?[^\W\d_]+|(?:\d*\.\d+ ?)?[%‰])(?![^\W_])"  # a unit such as 0.1%, at any place
-    )
+    # `fraction`: a unit such as 0.1%, at any place
+    fraction = r"[\W_](\d*\.\d+ ?[^\W\d_]+|(?:\d*\.\d+ ?)?[%‰])(?![^\W_])"
     for bracket in re.finditer(rf"\s*[\[(]([^\])]+)[\])]|{fraction}", name):
         text = bracket[1] or bracket[2]
         is_other = re.search(r"[\d',]", text) or text in labels

@@ -150,11 +150,8 @@ def csv_table(file: Path, content: bytes = b"") -> tuple[pa.Table, int, tuple[st
     omitted = [*(row.text for row in wrong), *footer]
     if not omitted:
         return table, text.lines, ()
-    ending = (
-        "line is no complete row and was"
-        if len(omitted) == 1
-        else f"{len(omitted)} lines are no rows and were"
-    )
+    several = f"{len(omitted)} lines are no rows and were"
+    ending = several if len(omitted) > 1 else "line is no complete row and was"
     return table, text.lines, (f"the last {ending} left out: {omitted[0]:.30}",)
 
 

@@ -51,6 +51,9 @@ class NpzArrays:
                     raise self.error(name, "Python objects", "numbers", do) from error
                 except MemoryError:
                     raise ValueError(f"array {member.filename} is larger than the file says") from None
+            # Simulators of several arms at once store arrays such as (T, 1, n) if they simulate one.
+            if self._arrays[name].ndim > 2:
+                self._arrays[name] = self._arrays[name].squeeze()
             if fields := self._arrays[name].dtype.names:
                 do = "store its fields: numpy.savez(OTHER, **{x: array[x] for x in array.dtype.names})"
                 raise self.error(name, f"a structured array ({', '.join(fields)})", "numbers", do)

@@ -24,6 +24,8 @@ from spelgen.settings.yaml_document import YamlDocument, validated
 INFO = "meta/info.json"  # file in the folder of a LeRobot data set that describes its content
 STATE, ACTION, TIMESTAMP, EPISODE = "observation.state", "action", "timestamp", "episode_index"
 ENDING = ".pos"
+# {quantity: its feature in a data set of an arm with torques, and endings of names in `observation.state`}
+SIGNALS = {"qd": ("observation.velocity", (".vel",)), "tau": ("observation.effort", (".torque", ".effort"))}
 # Largest magnitude of positions that LeRobot has normalised to -100..100, with a tolerance for rounding to single
 # precision.
 LARGEST_NORMALISED = 100.001
@@ -149,10 +151,18 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
                 f"the motors {', '.join(names) or 'without names'}", file=folder / INFO,
                 expected=f"{', '.join(missing)} among them", do=do,
             )  # fmt: skip
-    mapping = mapping.with_joint_columns({
-        joint: {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
-        for joint, name in logged.items()
-    })  # fmt: skip
+    columns = {}
+    for joint, name in logged.items():
+        places = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        for quantity, (feature, endings) in SIGNALS.items():
+            if quantity in mapping.quantities and feature in info["features"]:
+                motors = _motor_names(folder, info, feature)
+                places[quantity] = f"{feature}[{(motors if name in motors else states).index(name)}]"
+            for named in {f"{name}{x}" for x in endings}.intersection(states):
+                places[quantity] = f"{STATE}[{states.index(named)}]"
+        stated = mapping.joint(joint).columns.model_dump(exclude_none=True)
+        columns[joint] = places | {x: column for x, column in stated.items() if x in SIGNALS}
+    mapping = mapping.with_joint_columns(columns)
     common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": EPISODE})
     mapping = mapping.model_copy(update={"columns": common})
     files = sorted((folder / "data").rglob("*.parquet"))

@@ -93,22 +93,17 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # Of rows with different lists of joint names, such as rows of two arms, only rows with the arm's list are used.
     for rows in list(rows_by_names(table, dict(zip(joints, joints, strict=True)), file).values())[:1]:
         table = table.filter(rows)
-    dates = {field.name for field in table.schema if pa.types.is_temporal(field.type)}
+    dates = {field.name: {"time"} for field in table.schema if pa.types.is_temporal(field.type)}
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
-    columns = [
-        parse_column_name(x, labels, stated.get(x, ""), {"time"} if x in dates else set()) for x in names
-    ]
+    columns = [parse_column_name(x, labels, stated.get(x, ""), dates.get(x, set())) for x in names]
     if not commands:
         columns = _with_letters(_with_states(columns, table, len(joints)), table)
     columns_of = columns_by_quantity(columns, commands, len(joints))
     # A column named "load" does not count as torque here, since servos have a register with this name.
     torques = [x for x in columns_of.get("tau", ()) if "load" not in x.words]
-    if (
-        not commands
-        and not torques
-        and len(columns_by_quantity(columns, True, len(joints))["u"]) >= len(joints)
-    ):
+    commanded = columns_by_quantity(columns, True, len(joints))["u"]
+    if not (commands or torques) and len(commanded) >= len(joints):
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
     moving = _changing(columns_of["q"], table)
@@ -151,9 +146,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
     columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
-    unused = {
-        x: abbreviated_names([y.name for y in named if y.name not in used]) for x, named in columns_of.items()
-    }
+    unused = {x: [y.name for y in named if y.name not in used] for x, named in columns_of.items()}
+    unused = {x: abbreviated_names(y) for x, y in unused.items()}
     lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
     unknown = _unknown_units({**by_joint, "t": {"": clock}})
     lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in unknown]
@@ -242,9 +236,8 @@ def _with_letters(columns: Sequence[ColumnName], table: pa.Table) -> list[Column
       standard deviations of the position; a smaller difference shows a commanded position, which gets no quantity here.
     """
     result = list(columns)
-    of_number = {
-        x.number: x for x in columns if x.quantity == "q" and x.number >= 0 and not x.words & COMMANDED
-    }
+    positions = [x for x in columns if x.quantity == "q" and not x.words & COMMANDED]
+    of_number = {x.number: x for x in positions if x.number >= 0}
     for letter in "tvu":
         named = [k for k, x in enumerate(result) if x.words == {letter} and x.number in of_number]
         slope, distance = _similarity([(of_number[result[k].number], result[k]) for k in named], table)

@@ -244,7 +244,8 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
         return None
     if np.isnan(correlation) or signals.is_at_rest or _is_below_resolution(signals):
         return None
-    if correlation >= SIGNALS.agreement and abs(factor - 1) <= tolerance:
+    # The factor is as exact as the correlation is high: noise and filters lower both.
+    if correlation >= SIGNALS.agreement and abs(factor - 1) <= min(tolerance, 0.03 + 2 * (1 - correlation)):
         lag = _velocity_lag(signals)
         if abs(lag) < SIGNALS.longest_lag:
             text = _velocity_sum(signals) if correlation < 0.99 else ""

@@ -14,7 +14,7 @@ from spelgen.logs.jumps import signed
 from spelgen.logs.row_names import RowsByNames, rows_by_names
 from spelgen.logs.tables import Layout, list_element, stored_names
 from spelgen.logs.tuning import TUNING
-from spelgen.settings.log_mapping import TIMES
+from spelgen.settings.log_mapping import TIMES, mapped_unit
 
 NUMBER = r"[+-]?\d+(?:[.,]\d*)?(?:[eE][+-]?\d+)?"
 DECIMAL_COMMA = NUMBER.replace("[.,]", ",")
@@ -159,10 +159,11 @@ def _nanoseconds(texts: Column) -> pa.Array | None:
     """
     texts = pa.compute.utf8_trim_whitespace(pa.compute.replace_substring(texts.cast(pa.string()), "µ", "u"))
     first = next((x for x in texts.slice(0, 1).to_pylist() if x), "")
-    if re.fullmatch(rf"{NUMBER} ?({'|'.join(TIMES)})", first):
-        groups = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[mun]?s)$")
+    match = re.fullmatch(rf"{NUMBER} ?([a-z]+)", first)
+    if match and mapped_unit("t", match[1]) in TIMES:
+        groups = pa.compute.extract_regex(texts, rf"^(?P<number>{NUMBER}) ?(?P<unit>[a-z]+)$")
         numbers, units = (pa.compute.struct_field(groups, name) for name in ("number", "unit"))
-        factors = [TIMES.get(unit, np.nan) for unit in units.to_pylist()]
+        factors = [TIMES.get(mapped_unit("t", unit or "") or "", np.nan) for unit in units.to_pylist()]
         return pa.array(_numbers(numbers) * factors / TIMES["ns"])
     zone = r"(?: ?Z| ?UTC| ?[+-]\d\d:?\d\d)?$"
     clock = r"^(?P<date>\d{4}-\d\d-\d\d[T ])?(?:(?P<h>\d+):)?(?P<m>\d+):(?P<s>\d+(?:[.,]\d*)?)" + zone
