@@ -36,7 +36,7 @@ class TorqueUnit(WrongScale):
     rarity = 2
     is_optimised = True
     needed = 0.0
-    evidence = "by the URDF's gravity"
+    evidence = "by the URDF's masses"
 
     def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
         """Define the candidates for factors that correct the unit of the torques.
@@ -71,7 +71,7 @@ class TorqueUnit(WrongScale):
             tau = base.hypothesis.signals(problem.samples).tau
             expected = problem.residual(base.hypothesis, problem.prior_mean) + tau
             size = float(np.linalg.norm(tau)) / max(float(np.linalg.norm(expected)), 1e-12)
-            if not (candidates or is_found) and expected.any() and not 0.01 < size < 100.0:
+            if not (candidates or is_found) and of_urdf.any() and not 0.01 < size < 100.0:
                 size = size if is_other_unit(size / 1e3) else 1e3
                 candidates.append(np.full(len(is_open), rounded_factor(1 / size)))
         for factor in candidates:
