@@ -8,7 +8,7 @@ are checked one at a time, so that only one of them need be in memory. The check
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -258,20 +258,11 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
-class AnyJoint(Protocol):
-    """A joint of an arm or of a model."""
+def joint_kinds(joints: Iterable[Any]) -> list[str]:
+    """Return the type of each joint for `check`: prismatic, revolute, or continuous if it has no position limits.
 
-    @property
-    def joint_type(self) -> str:
-        """Type of the joint: revolute or prismatic."""
-
-    @property
-    def upper(self) -> float | None:
-        """Upper position limit [rad, m]; None: unlimited."""
-
-
-def joint_kinds(joints: Iterable[AnyJoint]) -> list[str]:
-    """Return the type of each joint for `check`: prismatic, revolute, or continuous if it has no position limits."""
+    joints: joints of an arm or of a model, with the attributes `joint_type` and `upper` (position limit, or None).
+    """
     return ["continuous" if x.joint_type == "revolute" and x.upper is None else x.joint_type for x in joints]
 
 
