@@ -388,6 +388,16 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
         assert check_logs([replace(log, tau=tau)], arm, mapping).errors == ()
 
 
+def test_torques_of_opposite_sense_are_named_although_friction_dominates_one_of_them(robots):
+    """The reversal changes no residual: also not that of the first joint, which carries no load."""
+    arm = load_arm(robots / "ur10e.urdf")
+    log, rng = recorded(arm, 0), np.random.default_rng(0)
+    other = lfilter([0.2], [1, -0.98], rng.standard_normal(len(log)))
+    first = log.tau[:, 0] + 0.7 * log.tau[:, 0].std() * other / other.std()
+    error = told(arm, replace(log, tau=-np.column_stack([first, log.tau[:, 1:]])))
+    assert "all joints: got torques of the opposite sense" in error
+
+
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):
     """A log with too little motion is not tested for faults such as a reversed joint: a remark states the small motion.
 

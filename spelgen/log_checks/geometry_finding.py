@@ -87,7 +87,9 @@ def find_unexplained(
     if best is None:
         wrong, remaining = _unexplained_joints(problem, unchanged)
     else:
-        affected = np.abs(best.errors - unchanged.errors) + 1e-9
+        # Changes of much less than 2 % of the variance are noise. Example: the opposite sense of all torques changes no
+        # residual, and all joints then count equally.
+        affected = np.abs(best.errors - unchanged.errors) + 0.02
         remaining = float(np.average(best.errors, weights=affected))
         wrong = (best.errors > GEOMETRY.no_advice) & (remaining > GEOMETRY.no_advice)
     if not wrong.any():
