@@ -128,7 +128,7 @@ class TorqueUnit(WrongScale):
             # A factor closer to 1 must explain the torques less. If the cost is the same, the factor is not determined:
             # parameters that the URDF rules out then explain a torque that is mostly friction.
             nearer = factors * GEOMETRY.other_unit ** -np.sign(np.log(factors))
-            is_sure = all(fitted(np.where(x, nearer, factors)).cost > fit.cost + self.rarity for x in units)
+            is_sure = all(fitted(np.where(x, nearer, factors)).cost > fit.cost + self.rarity / 4 for x in units)
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
             if is_sure and is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
