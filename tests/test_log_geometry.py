@@ -288,14 +288,6 @@ def test_another_unit_is_offered_as_gain(arm):
     np.testing.assert_allclose(np.log(gains), np.log(0.003), atol=np.log(2))
 
 
-def test_the_torque_of_a_cable_at_the_last_joint_is_no_other_unit(robots):
-    """If torques are divided by any large factor, the last body's gravity explains it: the factor is not determined."""
-    arm = load_arm(robots / "ur10e.urdf")
-    log = recorded(arm, 1, pick_and_place)[:1000]
-    cable = 4.0 * np.cos(log.q[:, -1:] + 1.0) * (np.arange(6) == 5)
-    assert check_logs([replace(log, tau=log.tau + cable)], arm).errors == ()
-
-
 @pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
 def test_effort_limits_of_a_draft_are_no_evidence_of_another_unit(arm):
     """Torques that agree with the URDF's gravity are in Nm, although the URDF states an effort limit of 1 Nm."""

@@ -89,7 +89,7 @@ class TorqueUnit(WrongScale):
         The factors come from a fit with free gains: the dynamic coupling of the joints determines their ratios, and the
         masses of the URDF their common factor. Factors also correct errors of the masses, which lowers the cost a
         little. A fit is therefore yielded only if (1) its cost, plus a penalty for each factor, is significantly below
-        the cost of `lowest`, (2) each factor is determined, and (3) the relative residual of each joint is small.
+        the cost of `lowest`, (2) each factor lowers the cost, and (3) the relative residual of each joint is small.
 
         lowest: fit of lowest cost among `base` and the fits of the candidates. base: fit whose hypothesis gets the
         factors. has_gravity: True if the gravity in the logged torques gave at least one candidate. If it is False, and
@@ -125,10 +125,7 @@ class TorqueUnit(WrongScale):
                 for step in (GEOMETRY.other_unit**unit, GEOMETRY.other_unit**-unit):
                     while (rescaled := fitted(factors * step)).cost < fit.cost - self.rarity:
                         factors, fit = factors * step, rescaled
-            # A factor closer to 1 must explain the torques less. If the cost is the same, the factor is not determined:
-            # parameters that the URDF rules out then explain a torque that is mostly friction.
-            nearer = factors * GEOMETRY.other_unit ** -np.sign(np.log(factors))
-            is_sure = all(fitted(np.where(x, nearer, factors)).cost > fit.cost + self.rarity / 4 for x in units)
+            is_sure = all(fitted(np.where(x, 1.0, factors)).cost > fit.cost + self.rarity for x in units)
             is_lower = fit.cost < lowest.cost - GEOMETRY.needed - self.rarity * changed.sum()
             if is_sure and is_lower and fit.errors.max() <= GEOMETRY.unexplained:
                 lowest = fit
