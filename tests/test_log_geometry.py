@@ -389,7 +389,7 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
 
 
 def test_torques_of_opposite_sense_are_named_although_friction_dominates_one_of_them(robots):
-    """The reversal changes no residual: also not that of the first joint, which carries no load."""
+    """The reversal changes no residual: the one of the first joint, which carries no load, remains large."""
     arm = load_arm(robots / "ur10e.urdf")
     log, rng = recorded(arm, 0), np.random.default_rng(0)
     other = lfilter([0.2], [1, -0.98], rng.standard_normal(len(log)))
