@@ -29,6 +29,8 @@ from spelgen.evaluation.tables import table
 from spelgen.evaluation.torque import coarse_torques, torque_errors
 from spelgen.fitting.fitted import load_run
 from spelgen.fitting.train import train
+from spelgen.identification.identification import Identification
+from spelgen.identification.identify import identify
 from spelgen.labels import observed
 from spelgen.logs.dynamics_samples import DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
@@ -303,6 +305,19 @@ def test_a_urdf_run_is_compared_in_torque_and_at_the_tip(cart):
         assert horizon.errors["URDF"].tip_mm < min(1e-3, horizon.errors["model"].tip_mm)
     assert result.torque["URDF"].mean_nmse < result.torque["model"].mean_nmse
     assert not [x for x in result.diagnostics if x.code.startswith("no-")]
+
+
+def test_positions_beyond_two_turns_are_right_for_a_joint_without_limits(cart):
+    """`spelgen logs` accepts such a log, and so do `identify` and `evaluate`."""
+    arm = load_arm(cart)
+    t = torch.arange(400.0, dtype=torch.float64) / 100
+    q = torch.stack([0.3 * torch.sin(3 * t), 5 * t], dim=-1)
+    qd = torch.stack([0.9 * torch.cos(3 * t), torch.full_like(t, 5)], dim=-1)
+    qdd = torch.stack([-2.7 * torch.sin(3 * t), torch.zeros_like(t)], dim=-1)
+    log = Trajectory(t.numpy(), q.numpy(), qd.numpy(), cart_torque(q, qd, qdd).numpy(), "turning")
+    assert isinstance(identify(arm, log), Identification)
+    result = evaluate(build(arm, preset="closed-form"), [log], arm=arm, steps=(1,), seconds=())
+    assert result.torque["URDF"].mean_nmse < 1e-6
 
 
 def test_a_model_in_memory_is_judged_beside_any_dynamics(cart):

@@ -165,6 +165,16 @@ def test_two_reversed_joints_are_not_taken_for_a_third(shared):
     assert "torques of either sense" in error
 
 
+@pytest.mark.parametrize("reversed_joints", [[3, 4, 5, 6], [1, 2, 3, 5]])
+def test_four_reversed_torques_are_named_and_no_others(robots, reversed_joints):
+    """Correcting the three other joints of seven would make the torques consistent, too, but of the opposite sense."""
+    arm = load_arm(robots / "panda.urdf")
+    log, sign = recorded(arm, 0), np.ones(7)
+    sign[reversed_joints] = -1.0
+    lines = ", ".join(f"panda_joint{k + 1}: {{gain: -1}}" for k in reversed_joints)
+    assert f"write 'joints: {{{lines}}}' under" in told(arm, replace(log, tau=log.tau * sign))
+
+
 @pytest.mark.parametrize("arm", ["ur10e", "panda"], indirect=True)
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_torques_of_one_joint_that_are_half_or_twice_as_large_are_named(arm, factor):
@@ -386,6 +396,16 @@ def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
         assert "--accept torque-unexplained" in found[0]
         mapping = LogMapping.model_validate({"accept": ["torque-unexplained"]})
         assert check_logs([replace(log, tau=tau)], arm, mapping).errors == ()
+
+
+def test_torques_of_opposite_sense_are_named_although_friction_dominates_one_of_them(robots):
+    """The reversal changes no residual: the one of the first joint, which carries no load, remains large."""
+    arm = load_arm(robots / "ur10e.urdf")
+    log, rng = recorded(arm, 0), np.random.default_rng(0)
+    other = lfilter([0.2], [1, -0.98], rng.standard_normal(len(log)))
+    first = log.tau[:, 0] + 0.7 * log.tau[:, 0].std() * other / other.std()
+    error = told(arm, replace(log, tau=-np.column_stack([first, log.tau[:, 1:]])))
+    assert "all joints: got torques of the opposite sense" in error
 
 
 def test_the_geometry_of_a_log_with_too_little_motion_is_not_tested(arm):

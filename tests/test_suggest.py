@@ -163,6 +163,16 @@ def test_the_more_regular_of_two_clocks_and_ticks_of_100_ns(scara, tmp_path):
     assert '"0.1 us"' in text
 
 
+def test_a_column_that_counts_the_rows_is_not_the_clock_if_there_is_another(scara, tmp_path):
+    head = ["time", "robot_timestamp", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4))]
+    rows = [
+        [k + 1, 1550 + t, *x] for k, (t, x) in enumerate(zip(T, np.column_stack([Q, QD, TAU]), strict=True))
+    ]
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found)
+    assert "# not used for t: time" in text
+
+
 def test_times_that_fall_are_called_so(scara, tmp_path):
     """If times decrease from row to row, such as remaining times, the error states this and advises `sample_rate`.
 

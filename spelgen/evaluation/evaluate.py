@@ -34,7 +34,7 @@ from spelgen.fitting.fitted import Fit, load_run
 from spelgen.fitting.run_folder import RunFolder
 from spelgen.labels import MODEL
 from spelgen.logs.arm_mapping import GivenMapping
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.dynamics_samples import NEEDED, dynamics_samples
 from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.preprocessing import Preprocessing
@@ -179,7 +179,7 @@ def evaluate(
     # Model and logs are checked before the rollouts, because rollouts take minutes.
     tested = Subject(model, arm)
     logs = recordings(logs, tested.joints)
-    notes = check(logs, tested.joints, tested.model.joint_types)
+    notes = check(logs, tested.joints, joint_kinds(tested.model.joints))
     # Test logs that were also training logs are detected by fingerprints, because a run does not store the logs.
     seen = [x.name for x in logs if tested.trained_on.original(x.fingerprint)]
     if seen:

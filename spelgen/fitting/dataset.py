@@ -14,7 +14,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import Diagnostic
 from spelgen.fitting.rollout import LossScales, choose_substeps, loss_scales, rollout_loss
 from spelgen.fitting.tuning import TUNING
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, require_joints, require_torques
 from spelgen.logs.windows import Split, Windows, cut_windows, split_validation, thinned
@@ -132,7 +132,7 @@ def prepare_data(request: FitRequest, window: int, stride: int) -> TrainingData:
     for trajectory in recordings:
         require_joints(trajectory, model.joint_names)
     require_torques(recordings)
-    notes = check(recordings, model.joint_names, model.joint_types)
+    notes = check(recordings, model.joint_names, joint_kinds(model.joints))
     # The preprocessing is resolved once for all logs, so that training and validation have the same filter.
     resolved = request.preprocessing.resolved([x.sample_rate for x in recordings])
     decimation, reach = resolved.decimation or 1, bristle_reach(model)

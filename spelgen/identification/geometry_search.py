@@ -109,7 +109,7 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     finer = problem.thinned(GEOMETRY.confirming_samples)
     unchanged = finer.fit(problem.unchanged)
     # only three hypotheses are confirmed, since a message lists at most three
-    fits = [finer.fit(fit.hypothesis) for fit in likely[:3]]
+    fits = [_with_likely_senses(finer, finer.fit(fit.hypothesis)) for fit in likely[:3]]
     confirmed = _weighed(finer, finer.with_hysteresis(), fits, unchanged)
     return unchanged, *_likely(unchanged, confirmed)
 
@@ -206,6 +206,24 @@ def _weighed(
             change = max(other, change if is_late else min(change, other / 2))
         best[k] = replace(fit, cost=base.cost + change)
     return best
+
+
+def _with_likely_senses(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisFit:
+    """Return a fit in which the torques of other joints are reversed, if `fit` reverses several and this costs less.
+
+    The search makes at most three corrections. If the torques of four joints are reversed, it may end with all other
+    joints reversed, with too many or with too few: all torques are therefore reversed here, and single ones, too. The
+    reversal of another joint must lower the cost significantly.
+    """
+    n = len(fit.hypothesis.offset)
+    for torque in (-np.ones(n), *(1.0 - 2.0 * np.eye(n))):
+        factors = fit.hypothesis.scale / problem.unchanged.scale
+        is_reversed = (factors[1] < 0) & (factors[0] > 0)
+        if is_reversed.sum() > 1:
+            other = problem.fit(replace(fit.hypothesis, scale=fit.hypothesis.scale * [np.ones(n), torque]))
+            needed = 0.0 if is_reversed[torque < 0].any() else GEOMETRY.needed
+            fit = other if other.rank < fit.rank - needed else fit
+    return fit
 
 
 def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[HypothesisFit, ...]:

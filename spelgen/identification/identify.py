@@ -21,7 +21,7 @@ from spelgen.identification.intervals import BLOCKS, jackknife_covariance, stude
 from spelgen.identification.least_squares import Solution, deviations, solve
 from spelgen.identification.torque_delay import TorqueDelay, find_torque_delay
 from spelgen.identification.tuning import TUNING
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.dynamics_samples import NEEDED, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, recordings, require_torques
@@ -63,7 +63,7 @@ def identify_by(
     """
     joints, joint_types = arm.chain.joint_names, arm.chain.joint_types
     require_torques(logs)
-    notes = check(logs, joints, joint_types)
+    notes = check(logs, joints, joint_kinds(arm.chain.coordinates))
     drives = arm.actuation.drives()
     delay = TorqueDelay(preprocessing.torque_delay or 0.0)
     if preprocessing.torque_delay is None:

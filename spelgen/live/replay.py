@@ -14,7 +14,7 @@ from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
 from spelgen.live.tuning import TUNING
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.trajectory import Trajectory, require_torques
 
 LIMITS = "if limits of the URDF are wrong, correct them and train again"
@@ -153,7 +153,7 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     """
     require_torques(logs)
     joints, results = fit.model.joint_names, []
-    check(logs, joints, fit.model.joint_types)
+    check(logs, joints, joint_kinds(fit.model.joints))
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     for log in logs:
         estimator.reset()

@@ -19,7 +19,7 @@ from spelgen.log_checks.limits_in_logs import AT_A_STOP
 from spelgen.log_checks.report import LogReport, joint_report
 from spelgen.log_checks.robot_checks import CHECKS
 from spelgen.log_checks.statistics import Statistics, statistics
-from spelgen.logs.checks import LogChecks
+from spelgen.logs.checks import LogChecks, joint_kinds
 from spelgen.logs.trajectory import Trajectory, require_joints
 
 if TYPE_CHECKING:
@@ -54,11 +54,7 @@ def check_logs(
         from spelgen.log_checks.check_servo_logs import ServoLogs
 
         checked = ServoLogs(arm)
-    types = [
-        "continuous" if x.joint_type == "revolute" and x.limits is None else x.joint_type
-        for x in arm.chain.coordinates
-    ]
-    log_checks = LogChecks(joints, types)
+    log_checks = LogChecks(joints, joint_kinds(arm.chain.coordinates))
     measured: list[Statistics] = []
     examples: list[Trajectory] = []
     # logs are read one trajectory at a time: an iterator of logs may be larger than memory

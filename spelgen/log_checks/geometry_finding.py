@@ -87,7 +87,9 @@ def find_unexplained(
     if best is None:
         wrong, remaining = _unexplained_joints(problem, unchanged)
     else:
-        affected = np.abs(best.errors - unchanged.errors) + 1e-9
+        # Changes of much less than 2 % of the variance are noise. Example: the opposite sense of all torques changes no
+        # residual, and all joints then count equally.
+        affected = np.abs(best.errors - unchanged.errors) + 0.02
         # A combination of faults is no explanation if a large residual remains in the mean of all joints.
         is_combined = len(best.hypothesis.faults) > 1
         remaining = float(max(np.average(best.errors, weights=affected), is_combined * best.errors.mean()))

@@ -257,6 +257,14 @@ CHECKS: list[Check[JointSignals]] = [
 ]  # fmt: skip
 
 
+def joint_kinds(joints: Iterable[Any]) -> list[str]:
+    """Return the type of each joint for `check`: prismatic, revolute, or continuous if it has no position limits.
+
+    joints: joints of an arm or of a model, with the attributes `joint_type` and `upper` (position limit, or None).
+    """
+    return ["continuous" if x.joint_type == "revolute" and x.upper is None else x.joint_type for x in joints]
+
+
 class LogChecks:
     """Collector of the findings of all checks that need no robot, over the trajectories of n joints.
 

@@ -282,15 +282,17 @@ def _clock(clocks: Sequence[ColumnName], columns: Sequence[ColumnName], table: p
     and another of all ``columns`` contains the nanoseconds, the returned name is "SEC + NSEC".
     """
     # Of several columns of times, the best is searched in this order: (1) the stamp in a message header, since other
-    # times may be times of receipt and not of measurement, (2) the column whose name has the fewest words, (3) the
-    # column with the most regular time steps.
+    # times may be times of receipt and not of measurement, (2) a column that does not count the rows, (3) the column
+    # whose name has the fewest words, (4) the column with the most regular time steps.
     nanoseconds = [x for x in columns if re.search(r"n(?:anos|(?:ano)?sec(?:ond)?s?)$", x.name.lower())]
     seconds = [x for x in clocks if x not in nanoseconds]
     if not seconds:
         seconds = [x for x in columns if not (x.quantity or x.joint) and _is_rising(_numbers(table, x.name))]
-    absent = ColumnName("", set(), "s")
+    is_counter = {x.name: bool((np.diff(_numbers(table, x.name)) == 1).all()) for x in seconds}
     clock = min(
-        seconds, key=lambda x: ("header" not in x.words, len(x.words), _jitter(table, x)), default=absent
+        seconds,
+        key=lambda x: ("header" not in x.words, is_counter[x.name], len(x.words), _jitter(table, x)),
+        default=ColumnName("", set(), "s"),
     )
     times = _numbers(table, clock.name)
     # If times are whole numbers that repeat, they are the seconds of a stamp, and its nanoseconds are in another

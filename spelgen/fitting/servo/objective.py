@@ -33,7 +33,7 @@ from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.fitting.tuning import TUNING as DAMPING
-from spelgen.logs.checks import check
+from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.trajectory import require_commands, require_joints
 
 # Number of outer iterations of a servo fit: the first uses few windows and half the integration steps, the second few
@@ -63,7 +63,7 @@ class ServoObjective(Objective):
         for log in self._logs:
             require_joints(log, model.joint_names)
             require_commands(log)
-        notes = check(self._logs, model.joint_names, model.joint_types)
+        notes = check(self._logs, model.joint_names, joint_kinds(model.joints))
         self._windows = servo_windows(self._logs, request.preprocessing)
         return PreparedLogs(
             preprocessing=request.preprocessing,
