@@ -148,6 +148,13 @@ def test_a_run_to_resume_that_does_not_exist_is_named_as_it_was_given(spelgen):
     )
 
 
+def test_logs_without_the_option_are_to_be_named_by_it(spelgen, robots, tmp_path):
+    logs = tmp_path / "log.csv"
+    for given, told in (([str(logs)], "write it before the logs"), ([], "name at least one file or folder")):
+        result = spelgen("identify", str(robots / "rpr.urdf"), *given)
+        assert result.exit_code == 2 and f"'--data': {told}" in result.output
+
+
 def test_strict_fails_on_a_warning_only(spelgen, robots, tmp_path):
     assert spelgen("inspect", robots / "rpr.urdf", "--strict").exit_code == 0
     text = (robots / "rpr.urdf").read_text(encoding="utf-8")

@@ -163,7 +163,8 @@ def logs(data: list[Path] | None, extra_logs: list[Path] | None) -> list[Path]:
     """Return the paths of all logs on the command line. Raises a usage error if there is no option --data."""
     # Logs are given by an option and not by an argument, so that they cannot be confused with a module.
     if not data:
-        raise typer.BadParameter("name at least one file or folder", param_hint="'--data'")
+        wrong = "write it before the logs" if extra_logs else "name at least one file or folder"
+        raise typer.BadParameter(wrong, param_hint="'--data'")
     return [*data, *(extra_logs or [])]
 
 
