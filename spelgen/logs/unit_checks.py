@@ -311,7 +311,8 @@ def _velocity_sum(signals: JointSignals) -> str:
 def _velocity_lag(signals: JointSignals) -> float:
     """Return the least-squares delay [s] of the joint's qd relative to dq/dt; 0 if the log does not determine it.
 
-    The difference between q and the integral of a delayed qd is the delay times qd, plus a slow drift.
+    The difference between q and the integral of a delayed qd is the delay times qd, plus a slow drift, and a multiple of
+    q if the scale of qd is somewhat wrong.
     """
     from scipy.integrate import cumulative_trapezoid
 
@@ -321,7 +322,7 @@ def _velocity_lag(signals: JointSignals) -> float:
     t, q, qd = piece.t, piece.q[:, signals.number], piece.qd[:, signals.number]
     if len(t) < 100:
         return 0.0
-    drift = np.stack([np.ones_like(t), t, t**2], axis=1)
+    drift = np.stack([np.ones_like(t), t, t**2, q], axis=1)
     columns = np.stack([qd, q - cumulative_trapezoid(qd, t, initial=0)], axis=1)
     speed, difference = (columns - drift @ np.linalg.lstsq(drift, columns, rcond=None)[0]).T
     power = float(speed @ speed)
