@@ -311,8 +311,8 @@ def _velocity_sum(signals: JointSignals) -> str:
 def _velocity_lag(signals: JointSignals) -> float:
     """Return the least-squares delay [s] of the joint's qd relative to dq/dt; 0 if the log does not determine it.
 
-    The difference between q and the integral of a delayed qd is the delay times qd, plus a slow drift, and a multiple of
-    q if the scale of qd is somewhat wrong.
+    The difference between q and the integral of a delayed qd is the delay times qd, plus a slow drift, plus a multiple
+    of q if the scale of qd is somewhat wrong.
     """
     from scipy.integrate import cumulative_trapezoid
 
