@@ -220,9 +220,10 @@ def _with_likely_senses(problem: GeometryProblem, fit: HypothesisFit) -> Hypothe
         factors = fit.hypothesis.scale / problem.unchanged.scale
         is_reversed = (factors[1] < 0) & (factors[0] > 0)
         if is_reversed.sum() > 1:
-            other = problem.fit(replace(fit.hypothesis, scale=fit.hypothesis.scale * [np.ones(n), torque]))
+            scale = fit.hypothesis.scale * [np.ones(n), torque]
+            reversed_fit = problem.fit(replace(fit.hypothesis, scale=scale))
             needed = 0.0 if is_reversed[torque < 0].any() else GEOMETRY.needed
-            fit = other if other.rank < fit.rank - needed else fit
+            fit = reversed_fit if reversed_fit.rank < fit.rank - needed else fit
     return fit
 
 

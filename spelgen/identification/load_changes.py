@@ -132,20 +132,20 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     # The fit cannot predict a torque whose sign changes: both parts cancel each other. A torque with a large residual
     # is therefore predicted from the torques of the other joints.
     for k in np.flatnonzero(fit.errors > GEOMETRY.unexplained):
-        others = np.broadcast_to(np.arange(tau.shape[1]) != k, tau.shape)
-        torque[:, k] = rows[:, k] @ subset.on_torques(others).fit(subset.unchanged).parameters
+        counted = np.broadcast_to(np.arange(tau.shape[1]) != k, tau.shape)
+        torque[:, k] = rows[:, k] @ subset.on_torques(counted).fit(subset.unchanged).parameters
     residual = torque - tau
     number = subset.samples.recording
     candidates = list[Candidate]()
     for recording in np.unique(number).tolist():
         # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
         # enough samples before and after each time; and the start of the recording, for a change between recordings.
-        within, others = np.flatnonzero(number == recording), np.flatnonzero(number != recording)
+        within, outside = np.flatnonzero(number == recording), np.flatnonzero(number != recording)
         times = subset.samples.times[within]
         splits = len(times) * np.arange(2, 19) // 20
         cases = [(within, splits, times[splits])] if len(times) >= 4 * FEWEST and times.any() else []
-        if min(len(within), len(others)) >= FEWEST:
-            cases.append((np.append(others, within), np.array([len(others)]), np.zeros(1)))
+        if min(len(within), len(outside)) >= FEWEST:
+            cases.append((np.append(outside, within), np.array([len(outside)]), np.zeros(1)))
         for chosen, counts, starts in cases:
             falls = _falls(torque[chosen], residual[chosen], counts)
             falls = falls / np.maximum(tau.var(axis=0), 1e-30) / len(tau)

@@ -213,7 +213,8 @@ class TorqueLogs:
         # An error of all recordings is stated once, with the lines that correct it.
         if errors[0] and all(errors):
             return findings
-        named = [self._of_recordings(x, y) for found, y in zip(errors, groups, strict=True) for x in found]
+        pairs = zip(errors, groups, strict=True)
+        named = [self._of_recordings(error, numbers) for group, numbers in pairs for error in group]
         change = (
             self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
         )
@@ -378,11 +379,11 @@ class TorqueLogs:
         joints = (
             ", all joints" if change.joint is None else f", joint {problem.arm.joint_names[change.joint]!r}"
         )
-        since, others = f", from about {change.time:.2g} s after the start on,", "those before it"
+        since, reference = f", from about {change.time:.2g} s after the start on,", "those before it"
         do = "use the part before or after it"
         if not change.time:
-            since, others, do = "", "those of the other recordings", "omit or correct the wrong recordings"
-        torque = f"{round(change.factor, 2) + 0.0:g} times {others}"
+            since, reference, do = "", "those of the other recordings", "omit or correct the wrong recordings"
+        torque = f"{round(change.factor, 2) + 0.0:g} times {reference}"
         if change.offset:
             torque = f"another zero than before it, by {change.offset:.2g}"
         return LogError(

@@ -153,15 +153,15 @@ def read_dataset(folder: Path, joints: Sequence[str], mapping: LogMapping) -> li
             )  # fmt: skip
     columns = {}
     for joint, name in logged.items():
-        places = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
+        signals = {"q": f"{STATE}[{states.index(name)}]", "u": f"{ACTION}[{actions.index(name)}]"}
         for quantity, (feature, endings) in SIGNALS.items():
             if quantity in mapping.quantities and feature in info["features"]:
                 motors = _motor_names(folder, info, feature)
-                places[quantity] = f"{feature}[{(motors if name in motors else states).index(name)}]"
+                signals[quantity] = f"{feature}[{(motors if name in motors else states).index(name)}]"
             for named in {f"{name}{x}" for x in endings}.intersection(states):
-                places[quantity] = f"{STATE}[{states.index(named)}]"
+                signals[quantity] = f"{STATE}[{states.index(named)}]"
         stated = mapping.joint(joint).columns.model_dump(exclude_none=True)
-        columns[joint] = places | {x: column for x, column in stated.items() if x in SIGNALS}
+        columns[joint] = signals | {x: column for x, column in stated.items() if x in SIGNALS}
     mapping = mapping.with_joint_columns(columns)
     common = mapping.columns.model_copy(update={"t": TIMESTAMP, "trajectory": EPISODE})
     mapping = mapping.model_copy(update={"columns": common})
