@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from servo_arm import servo_logs, write_servo_arm
 from test_log_geometry import arm, recorded  # noqa: F401
+from typer.testing import CliRunner
 
 import spelgen
+from spelgen.cli.main import app
 from spelgen.log_checks.check_logs import check_logs
 
 OF_ONE = "the other recordings do not have this fault: correct this one, or omit it"
@@ -118,3 +120,12 @@ def test_a_unit_of_one_recording_is_no_advice_for_all(tmp_path):
     (error,) = map(str, check_logs(logs, servos).errors)
     assert "trajectory motion 1" in error
     assert "if this is true of all recordings; else correct this one, or omit it" in error
+
+
+def test_a_fault_of_both_recordings_is_sought_in_both_together(shared):
+    """Of two recordings with a mirrored joint, one alone would also show a false delay of another joint."""
+    case = shared / "cases" / "30-sign-of-joint"
+    given = ["--robot", str(case / "elfin15.urdf"), "--mapping", str(case / "elfin_map2.yaml")]
+    result = CliRunner().invoke(app, ["logs", str(case / "logs"), *given])
+    assert result.exit_code == 1
+    assert "write 'joints: {elfin_joint3: {sign: -1}}' under 'logs'" in result.output

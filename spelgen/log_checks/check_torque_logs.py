@@ -200,25 +200,43 @@ class TorqueLogs:
         findings, errors = list[LogError | Diagnostic](), list[list[LogError]]()
         groups = [agreeing, *([k] for k in deviating)]
         for numbers in groups:
-            chosen = [x.part(np.isin(x.recording, numbers)) if deviating else x for x in samples]
-            problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
-            problem = next((x for x in problems if x is not None), None)
-            joints = self._evidence([x.report for x in evidence], chosen[0]) if deviating else evidence
-            flat = FlatTops.joined([self._flat[k] for k in numbers])
-            results = list(self._findings(problem, flat, joints, accepted)) if problem else []
+            results = self._tested(numbers, samples, evidence, accepted)
             errors.append([x for x in results if isinstance(x, LogError)])
             findings += results if numbers is agreeing else []
             if errors[0] and 2 * len(agreeing) > len(self._sources):
                 return findings
-        # An error of all recordings is stated once, with the lines that correct it.
+        # If all recordings have errors, they may have the same fault, which is clearest in all recordings together.
         if errors[0] and all(errors):
-            return findings
+            together = self._tested(range(len(self._sources)), samples, evidence, accepted)
+            if any(isinstance(x, LogError) for x in together):
+                return together
         pairs = zip(errors, groups, strict=True)
         named = [self._of_recordings(error, numbers) for group, numbers in pairs for error in group]
         change = (
             self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
         )
         return [*(x for x in findings if not isinstance(x, LogError)), *named, *filter(None, [change])]
+
+    def _tested(
+        self,
+        numbers: Sequence[int],
+        samples: Sequence[MotionSamples],
+        evidence: Sequence[JointEvidence],
+        accepted: set[str],
+    ) -> list[LogError | Diagnostic]:
+        """Return the findings about some of the recordings; [] for too few samples.
+
+        numbers: indices of these recordings. samples, evidence, accepted: see `_geometry_findings`.
+        """
+        is_part = len(numbers) < len(self._sources)
+        chosen = [x.part(np.isin(x.recording, numbers)) if is_part else x for x in samples]
+        problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
+        problem = next((x for x in problems if x is not None), None)
+        if problem is None:
+            return []
+        joints = self._evidence([x.report for x in evidence], chosen[0]) if is_part else evidence
+        flat = FlatTops.joined([self._flat[k] for k in numbers])
+        return list(self._findings(problem, flat, joints, accepted))
 
     def _of_recordings(self, error: LogError, numbers: Sequence[int]) -> LogError:
         """Return an error about some of the recordings, with their names. numbers: indices of these recordings."""
