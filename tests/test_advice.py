@@ -17,6 +17,7 @@ from test_log_geometry import pick_and_place, recorded
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import SpelgenError
 from spelgen.log_checks.check_logs import check_logs
+from spelgen.logs.jumps import is_interrupted
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import SCALES
@@ -266,6 +267,35 @@ def test_values_that_stay_in_most_of_a_recording_are_not_dropped(arm):
     tau[: 3 * len(log) // 4, 1] = tau[0, 1]
     message = message_of(arm, logged(arm, replace(log, tau=tau)))
     assert "tau that stays at" in message and "dropouts" not in message
+
+
+@pytest.mark.parametrize("arm", ["rpr", "ur10e"], indirect=True)
+@pytest.mark.parametrize("quantity", ["q", "tau"])
+@pytest.mark.parametrize("last", [1200, 2001])
+def test_values_that_stay_are_found_without_velocities_and_until_the_end(arm, quantity, last):
+    """A position that stays shows no velocity; its motion before and after does. last: first sample after the stay."""
+    log = recorded(arm, 14)
+    values = getattr(log, quantity).copy()
+    start = 800 + int(np.argmax(np.abs(log.qd[800:1000, 1])))
+    values[start:last, 1] = values[start, 1]
+    wrong = replace(log, **{quantity: values})
+    path = logged(arm, wrong, lambda names: [x for x in names if not x.startswith("qd_")])
+    arm.robot.path.with_suffix(".yaml").write_text("logs: {velocity: differentiated}\n")
+    message = message_of(load_arm(arm.robot.path), path)
+    end = min(last, len(log))
+    assert f"{quantity} that stays at" in message and f"in {end - start - 1} samples" in message
+
+
+@pytest.mark.parametrize("ramp", [1, 3])
+def test_joints_that_rest_between_motions_and_at_the_end_are_not_interrupted(ramp):
+    """The speed changes within `ramp` samples: slowly sampled arms, and simulated ones, stop within a sample."""
+    speed = np.tile(np.repeat([1.0, 0.0, -0.5, 0.0], 60), 3)
+    speed = np.convolve(speed, np.ones(ramp) / ramp, mode="valid")
+    t = 0.1 * np.arange(len(speed))
+    assert not is_interrupted(t, 0.1 * np.cumsum(speed)).any()
+    # another recording follows, from another position
+    joined = np.append(0.1 * np.cumsum(speed), 0.1 * np.cumsum(speed) + 8.0)
+    assert not is_interrupted(0.1 * np.arange(len(joined)), joined).any()
 
 
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)

@@ -188,9 +188,9 @@ def find_frozen(signals: JointSignals) -> str | Advice | None:
     # If qd and dq/dt are proportional with a factor far from 1, a wrong unit explains their difference, and stale
     # values are not searched.
     is_other_unit = signals.correlation > SIGNALS.agreement and not 0.25 < signals.factor < 4
-    has_motion = "qd" in signals.measured and not is_other_unit
-    for name in signals.measured if has_motion or u.size else ():
-        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, qd, u))
+    logged = qd if "qd" in signals.measured else np.zeros(0)
+    for name in signals.measured if u.size or not is_other_unit else ():
+        rows = np.flatnonzero(stale_rows(name, signals.signal(name), t, q, logged, u))
         if rows.size:
             value, count = signals.signal(name)[rows[0]], counted(len(rows), "sample")
             message = f"{name} that stays at {value:.4g} while the joint moves, in {count} from t = {t[rows[0]]:.4g} s"

@@ -141,9 +141,7 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin:
     values: the signal (T,). changes: the reference signal (T,), for example the velocity of the joint for its torque.
     """
     stale = np.zeros(len(values), bool)
-    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
-    lengths = np.diff(np.append(starts, len(values)))
-    is_long = lengths > 20.0 * max(1.0, float(np.median(lengths)))
+    starts, lengths, is_long = _blocks(values)
     if not is_long.any():
         return stale
     steps = np.append(np.abs(np.diff(values[starts])), np.inf)
@@ -153,6 +151,41 @@ def is_stale(values: np.ndarray, changes: np.ndarray, min_change: float, margin:
         inside = changes[start + 1 + margin : start + length - margin]
         if inside.size and np.ptp(inside) > min_change:
             stale[start + 1 : start + length] = True
+    return stale
+
+
+def is_interrupted(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return a mask (T,) of the samples of a position q (T,) that repeat an old value, as the motion around them shows.
+
+    A block is a run of equal positions with more than 20 times as many samples as the median block. It is stale, except
+    for its first sample, if it meets two conditions:
+
+    1. It ends with a jump by more than 0.05 rad or m, at more than twice the largest speed of the motion; or it is the
+       last block.
+    2. The motion before it stops within one step. This change of speed is above 0.05 rad/s or m/s, and three times as
+       large as those away from blocks that meet the first condition.
+
+    t: (T,) times [s].
+    """
+    stale = np.zeros(len(q), bool)
+    starts, lengths, is_long = _blocks(q)
+    is_long[0] = False
+    if not is_long.any():
+        return stale
+    speeds = np.abs(np.diff(q)) / np.maximum(np.diff(t), np.median(np.diff(t)))
+    start = starts[is_long]
+    end = start + lengths[is_long]
+    last = np.minimum(end, len(q) - 1)
+    motion = np.delete(speeds, last - 1)
+    jumps_back = (np.abs(q[last] - q[start]) > 0.05) & (speeds[last - 1] > 2 * motion.max(initial=0.0))
+    is_open = jumps_back | (end == len(q))
+    start, end = start[is_open], end[is_open]
+    changes = np.abs(np.diff(speeds))
+    stops = changes[start - 1]
+    edges = np.concatenate([start - 1, end - 2, end - 1])
+    changes[edges[edges < len(changes)]] = 0.0
+    for first, stop, change in zip(start, end, stops, strict=True):
+        stale[first + 1 : stop] = change > max(3 * changes.max(initial=0.0), 0.05)
     return stale
 
 
@@ -306,6 +339,16 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
         if np.abs(numbers - np.round(numbers)).max() < 0.02:
             sizes += [step * 2.0**k for k in range(10, 18)]
     return sizes
+
+
+def _blocks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the starts and lengths of the runs of equal values of a signal (T,), and a mask of the long runs.
+
+    A run is long if it has more than 20 times as many samples as the median run.
+    """
+    starts = np.flatnonzero(np.diff(values, prepend=np.nan))
+    lengths = np.diff(np.append(starts, len(values)))
+    return starts, lengths, lengths > 20.0 * max(1.0, float(np.median(lengths)))
 
 
 def _typical_step(sizes: np.ndarray) -> float:

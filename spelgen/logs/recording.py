@@ -10,6 +10,7 @@ from spelgen.errors import LogError
 from spelgen.labels import counted
 from spelgen.logs.jumps import (
     centred,
+    is_interrupted,
     is_outlier,
     is_stale,
     jump_count,
@@ -173,9 +174,8 @@ def _leave_out_outliers(rows: Rows) -> None:
     dropped, columns = [], rows.columns
     for (quantity, joint), values in columns.items():
         faulty = outlier_rows(quantity, values, columns["q", joint])
-        if ("qd", joint) in columns or ("u", joint) in columns:
-            motion = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
-            faulty |= stale_rows(quantity, values, rows.t, *motion)
+        motion = (columns.get((x, joint), np.zeros(0)) for x in ("q", "qd", "u"))
+        faulty |= stale_rows(quantity, values, rows.t, *motion)
         if faulty.any():
             outliers |= faulty
             dropped.append(f"{quantity} of {joint!r} at t = {listed_times(rows.t[faulty])}")
@@ -225,8 +225,8 @@ def stale_rows(
     """Return a mask (T,) of the samples of a signal that repeat an old value although the joint moves.
 
     Two kinds of constant torque are not stale. A torque equal to the largest or smallest torque of the recording may be
-    limited by the drive. A torque equal to the torque of the last sample may be the torque of a motor that was switched
-    off while the joint moved.
+    limited by the drive. A torque equal to the torque of the last sample may be that of a motor that was switched off;
+    the joint is then at rest in the last half of these samples.
 
     Args:
         quantity: name of the signal, "q", "qd", "tau" or "u". Commands are never stale.
@@ -246,11 +246,16 @@ def stale_rows(
         margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3))
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
     if quantity == "tau":
-        stale = is_stale(values, qd, 0.2 * float(np.ptp(qd)))
-        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), values[-1]]))
+        speed = qd if qd.size else np.gradient(q, t)
+        change = 0.2 * float(np.ptp(speed))
+        last = np.flatnonzero(values == values[-1])
+        off = [values[-1]] if np.ptp(speed[last[len(last) // 2 :]]) < change else []
+        stale = is_stale(values, speed, change)
+        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), *off]))
+    stale = is_interrupted(t, q) & (quantity == "q")
     # If q or qd is frozen while the joint moves, the difference between q and the integral of qd changes. A block of
     # equal values is stale if this difference changes by more than 0.05 rad or m within the block.
-    return is_stale(values, travel(t, qd) - q, 0.05)
+    return stale | is_stale(values, travel(t, qd) - q, 0.05) if qd.size else stale
 
 
 def travel(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
