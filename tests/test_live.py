@@ -10,6 +10,7 @@ import torch
 from compiled_estimator import nominal_levels
 from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, saved_run
+from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize
 from typer.testing import CliRunner
@@ -21,6 +22,7 @@ from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
+from spelgen.labels import torque_units, torques_text
 from spelgen.live import levels as live_levels
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
@@ -29,7 +31,7 @@ from spelgen.live.levels import block_noise, held_out_tail
 from spelgen.live.momentum import balance, load_terms
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import find_payload
-from spelgen.live.replay import load_changes, replay
+from spelgen.live.replay import load_changes, payload_sentence, replay
 from spelgen.live.tuning import TUNING
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -164,6 +166,43 @@ def test_a_payload_is_found_with_its_intervals(arm, levels, run):
     assert inside.sum() >= 2
     # the estimated payload is physically consistent
     assert np.linalg.eigvalsh(pseudo_inertia(torch.from_numpy(payload.parameters)).numpy())[0] > 0
+
+
+def test_reports_for_users_describe_the_payload_in_the_frame_of_the_tip_link(arm, levels, run, tmp_path):
+    """The frame of the last body is not a frame of the URDF if the axis of the last joint is not z."""
+    model, log, qdd = arm
+    fit = load_run(run)
+    root = etree.parse(fit.urdf)
+    joint = next(joint for joint in root.iter("joint") if joint.get("name") == model.joint_names[-1])
+    # The tip link is turned against the link of the last joint, and 0.1 m from it.
+    etree.SubElement(root.getroot(), "link", name="tool")
+    mount = etree.SubElement(root.getroot(), "joint", name="mount", type="fixed")
+    etree.SubElement(mount, "parent", link=joint.find("child").get("link"))
+    etree.SubElement(mount, "child", link="tool")
+    etree.SubElement(mount, "origin", xyz="0 0 0.1", rpy="1.5707963267948966 0 0")
+    root.write(tmp_path / "tool.urdf")
+    fit = dataclasses.replace(fit, urdf=tmp_path / "tool.urdf")
+    (result,) = replay(fit, [dataclasses.replace(log, tau=loaded(model, log, qdd, PAYLOAD))])
+    here, there = result.states[-1].payload, result.payload
+    x, y, z = here.center
+    np.testing.assert_allclose(there.center, [x, z - 0.1, -y], atol=1e-9)
+    np.testing.assert_allclose(
+        there.center_interval[[0, 2], 0], [here.center_interval[0, 0], -here.center_interval[1, 1]]
+    )
+    xx, xy, xz, yy, yz, zz = here.inertia
+    np.testing.assert_allclose(there.inertia, [xx, xz, -xy, zz, -yz, yy], atol=1e-9)
+    assert there.mass_interval == pytest.approx(here.mass_interval)
+    assert " in the frame of tool" in payload_sentence(there)
+    assert result.to_dict()["payload"]["frame"] == "tool"
+
+
+def test_each_torque_of_a_text_has_its_unit():
+    """An arm with prismatic and revolute joints has forces and torques in one sentence."""
+    units = torque_units(["lift", "elbow", "wrist"], ["prismatic", "revolute", "revolute"])
+    assert (
+        torques_text({"lift": "14", "elbow": "0.2", "wrist": "0.1"}, units)
+        == "lift 14 N, elbow 0.2, wrist 0.1 Nm"
+    )
 
 
 def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):

@@ -128,7 +128,9 @@ def test_clang_compiles_the_estimator_without_warnings(memory, tmp_path):
     """The export makes warnings errors; on machines whose only compiler is clang, one warning prevents the export."""
     preset = (PACKAGE / "presets" / "closed-form.yaml").read_text()
     (tmp_path / "preset.yaml").write_text(preset.replace("memory: bristles", f"memory: {memory}"))
-    model = randomised(urdf := Path(__file__).parents[1] / "robots" / "six_dof.urdf", tmp_path / "preset.yaml")
+    model = randomised(
+        urdf := Path(__file__).parents[1] / "robots" / "six_dof.urdf", tmp_path / "preset.yaml"
+    )
     levels = levels_of(model, motion_of(model, 2.0))
     assert CompiledEstimator(model, load_arm(urdf), levels, PLAIN, program="clang").refused()
 

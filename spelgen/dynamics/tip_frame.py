@@ -37,6 +37,16 @@ def tip_frame(loaded: Arm) -> Tip:
     return Tip(link, *link_poses(loaded)[link], chain)
 
 
+def load_frame(loaded: Arm) -> tuple[str, np.ndarray]:
+    """Return the link whose frame describes a payload, and its pose in the frame of the last body, (4, 4).
+
+    It is the tip link, or the link of the last joint if another body carries the tip link.
+    """
+    tip, last = tip_frame(loaded), len(loaded.chain.bodies) - 1
+    link = tip.link if tip.carrier == last else loaded.chain.bodies[last].link
+    return link, link_poses(loaded)[link][1]
+
+
 def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:
     """Return {name of a link: (body, pose)}: the body that carries the link, and the pose of the link, (4, 4).
 

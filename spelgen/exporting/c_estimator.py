@@ -109,6 +109,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
+        # origin and axes of the tip link in the frame of the last body, if it is a part of this body
+        "tip": (np.round(model.tip.pose[:3, [3, 0, 1, 2]].T, 9) + 0.0).tolist(),
+        "tip_is_last": model.tip.carrier == len(model.arm.bodies) - 1,
     }
     # The generated C code contains a checksum of all constants. A saved state of the estimator has this checksum, too:
     # the code refuses a state that was saved with other constants.
