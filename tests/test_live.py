@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -751,7 +752,11 @@ def test_torques_at_their_limit_are_named(arm, levels, run):
     (result,) = replay(load_run(run), [dataclasses.replace(log, tau=tau)])
     text = " ".join(result.text().split())
     assert "200 torque at its limit" in text
-    assert "largest torques: joint3 140 (limit 100) Nm; if limits of the URDF are wrong" in text
+    named = "largest torques: joint3 140 (limit 100) Nm; if limits of the URDF are wrong"
+    assert named in text
+    tau[:, 2] = 140.0
+    with pytest.raises(LogError, match=re.escape(named)):
+        replay(load_run(run), [dataclasses.replace(log, tau=tau)])
 
 
 def test_a_contact_in_the_first_second_is_no_payload(arm, levels, run):

@@ -383,8 +383,5 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
         costs[k] = np.mean(np.log(noise[k] ** 2 * shape) + inner * (2 * normalised - inner), axis=0)
     best = costs.argmin(axis=0)
     observer, (speed, ratio) = noise[best, np.arange(len(best))], grid[best].T
-    return {
-        "observer": observer,
-        "resting": TUNING.outlier * ratio * observer,
-        "resting_speed": speed * levels.speed,
-    }
+    resting = TUNING.outlier * ratio * observer
+    return {"observer": observer, "resting": resting, "resting_speed": speed * levels.speed}

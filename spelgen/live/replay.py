@@ -165,27 +165,28 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     for log in logs:
         estimator.reset()
         states = estimator.replay(log)
-        unused = sum(estimator.refused.values())
+        unused, units = sum(estimator.refused.values()), torque_units(joints, fit.model.joint_types)
+        largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
+        pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
+        limits = {joint: f"{top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most}
         if unused > len(log) / 2:
             counts = ", ".join(f"{count} {reason}" for reason, count in estimator.refused.items())
+            do = "check that it is a log of this arm, and its units: torques in Nm, positions in rad"
+            do += f"; largest torques: {torques_text(limits, units)}; {LIMITS}" if limits else ""
             raise LogError(
                 f"{unused} of {len(log)} samples that the estimator cannot use ({counts})", element=log.name,
                 expected="torques below the limits and speeds as in the training logs, at least every 0.25 s",
-                do="check that it is a log of this arm, and its units: torques in Nm, positions in rad",
+                do=do,
             )  # fmt: skip
         times = log.t - log.t[0]
         reported = times[[state.payload.status == "payload" for state in states]].tolist()
         drift = np.round(100 * (states[-1].friction_scale - 1), 2).tolist()
         changes = tuple(times[load_changes(states)].tolist())
-        largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
-        pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
         results.append(LogEstimate(
-            log=log, units=torque_units(joints, fit.model.joint_types), states=states,
-            payload=at_tip(fit, states[-1].payload),
+            log=log, units=units, states=states, payload=at_tip(fit, states[-1].payload),
             since=reported[0] if reported else None, changes=changes,
             contacts=tuple(contact_events(states, joints, [*reported[:1], *changes])),
-            drift=dict(zip(joints, drift, strict=True)), refused=estimator.refused,
-            limits={joint: f"{top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most},
+            drift=dict(zip(joints, drift, strict=True)), refused=estimator.refused, limits=limits,
         ))  # fmt: skip
     return results
 
