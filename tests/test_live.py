@@ -1,5 +1,6 @@
 """The live estimator finds a payload, contacts and friction changes that were added to torques; its equations hold."""
 
+import copy
 import dataclasses
 import json
 import re
@@ -17,7 +18,9 @@ from scipy.optimize import minimize
 from typer.testing import CliRunner
 
 import spelgen
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.dynamics import tip_frame
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
@@ -29,7 +32,7 @@ from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.intake import Intake
 from spelgen.live.levels import block_noise, held_out_tail
-from spelgen.live.momentum import balance, load_terms
+from spelgen.live.momentum import balance, load_body, load_terms
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import find_payload
 from spelgen.live.replay import load_changes, payload_sentence, replay
@@ -122,7 +125,8 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
     passive = ~model.actuated.numpy().astype(bool)
     error = rate - (at.torque - at.friction)
     assert np.abs(error[:, ~passive]).max() < 1e-6 * np.abs(rate).max()
-    regressor = chain_regressor(model.chain, q, qd, qdd)[:, :, -10:]
+    columns = slice(10 * load_body(model.chain), 10 * load_body(model.chain) + 10)
+    regressor = chain_regressor(model.chain, q, qd, qdd)[:, :, columns]
     by_momentum = (after.load_momentum - before.load_momentum) / (2 * step) - at.load_torque
     np.testing.assert_allclose(by_momentum, regressor, atol=1e-6 * np.abs(regressor).max())
 
@@ -195,6 +199,35 @@ def test_reports_for_users_describe_the_payload_in_the_frame_of_the_tip_link(arm
     assert there.mass_interval == pytest.approx(here.mass_interval)
     assert " in the frame of tool" in payload_sentence(there)
     assert result.to_dict()["payload"]["frame"] == "tool"
+
+
+def test_a_payload_is_carried_by_the_last_joint_and_not_by_a_counterweight(tmp_path):
+    """Mimic joints on other branches, such as the cylinder of a counterweight, have bodies after the last joint's."""
+    root = etree.parse(ROBOTS / "six_dof.urdf")
+    link = copy.deepcopy(next(link for link in root.iter("link") if link.find("inertial") is not None))
+    link.set("name", "cylinder")
+    root.getroot().append(link)
+    joint = etree.SubElement(root.getroot(), "joint", name="cylinder_joint", type="revolute")
+    for tag, values in (
+        ("parent", {"link": "link1"}),
+        ("child", {"link": "cylinder"}),
+        ("axis", {"xyz": "0 1 0"}),
+        ("limit", {"lower": "-2", "upper": "2", "effort": "1", "velocity": "9"}),
+        ("mimic", {"joint": "joint2", "multiplier": "-1"}),
+    ):
+        etree.SubElement(joint, tag, values)
+    root.write(tmp_path / "arm.urdf")
+    robot = load_arm(tmp_path / "arm.urdf")
+    model = build(robot, "closed-form").double()
+    assert robot.chain.bodies[-1].name == "cylinder_joint"
+    assert (
+        load_body(model.chain) == tip_frame.load_body(robot.chain) == tip_frame.tip_frame(robot).carrier == 5
+    )
+    q, qd = numbers(*np.random.default_rng(0).standard_normal((2, 3, 6)))
+    weights = -load_terms(model.chain, q, 0 * qd, torch.zeros(3).double())[1][..., 0]
+    plain = build(ROBOTS / "six_dof.urdf", "closed-form").double()
+    expected = -load_terms(plain.chain, q, 0 * qd, torch.zeros(3).double())[1][..., 0]
+    np.testing.assert_allclose(weights, expected, atol=1e-9)
 
 
 def test_each_torque_of_a_text_has_its_unit():

@@ -42,8 +42,8 @@ class Payload:
         inertia_interval: Limits of 95 % intervals, (6, 2) [kg m^2].
         parameters: Mass m, first moments m c, and inertia about the origin of the frame, (10,).
         covariance: Covariance of the parameters, (10, 10).
-        frame: Name of the link in whose frame the payload is described; "" for the frame of the last body, whose z is
-            the axis of the last joint.
+        frame: Name of the link in whose frame the payload is described, or "the last body": the body of the last
+            joint, with z along the axis of this joint.
     """
 
     status: Status = "not yet"
@@ -57,7 +57,7 @@ class Payload:
     inertia_interval: np.ndarray = field(default_factory=lambda: np.zeros((6, 2)))
     parameters: np.ndarray = field(default_factory=lambda: np.zeros(10))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((10, 10)))
-    frame: str = ""
+    frame: str = "the last body"
 
     def at_link(self, link: str, pose: np.ndarray) -> "Payload":
         """Return a reported payload in the frame of a link, whose pose (4, 4) is in the frame of the last body."""
@@ -103,12 +103,10 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
         return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
-    return _payload(theta, spread, log_odds, limit)
+    return _payload(theta, spread, log_odds, limit, Payload.frame)
 
 
-def _payload(
-    theta: np.ndarray, spread: np.ndarray, log_odds: float, limit: float, frame: str = ""
-) -> Payload:
+def _payload(theta: np.ndarray, spread: np.ndarray, log_odds: float, limit: float, frame: str) -> Payload:
     """Return a reported payload with its intervals.
 
     theta: inertial parameters in the frame, (10,). spread: covariance of theta. log_odds, limit, frame: see `Payload`.

@@ -125,8 +125,9 @@ def payload_content(payload: Payload) -> dict[str, object]:
         content["mass_limit"] = payload.limit
     if payload.status == "payload":
         fields = [f"{name}{end}" for name in ("mass", "center", "inertia") for end in ("", "_interval")]
-        content |= {"frame": payload.frame or "last body"}
-        content |= {name: np.asarray(vars(payload)[name]).tolist() for name in (*fields, "parameters")}
+        content |= {
+            name: np.asarray(vars(payload)[name]).tolist() for name in (*fields, "parameters", "frame")
+        }
     return content
 
 
@@ -142,7 +143,7 @@ def payload_sentence(payload: Payload) -> str:
             for value, (first, last) in zip(payload.center, payload.center_interval, strict=True)
         )
         mass = f"payload of {payload.mass:.3f} kg ({low:.3f} to {high:.3f})"
-        return f"{mass}, centre of mass {center} m in the frame of {payload.frame or 'the last body'}"
+        return f"{mass}, centre of mass {center} m in the frame of {payload.frame}"
     limit = f"at most {payload.limit:.2g} kg" if np.isfinite(payload.limit) else "record motion of the joints"
     is_none = payload.status == "no payload"
     return f"{'no payload' if is_none else 'not determined yet whether there is a payload'} ({limit})"
