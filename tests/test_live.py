@@ -28,6 +28,7 @@ from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
 from spelgen.labels import torque_units, torques_text
 from spelgen.live import levels as live_levels
+from spelgen.live.contact import tip_force
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.intake import Intake
@@ -199,6 +200,11 @@ def test_reports_for_users_describe_the_payload_in_the_frame_of_the_tip_link(arm
     assert there.mass_interval == pytest.approx(here.mass_interval)
     assert " in the frame of tool" in payload_sentence(there)
     assert result.to_dict()["payload"]["frame"] == "tool"
+
+
+def test_a_tip_on_the_axis_of_the_only_joint_has_no_force():
+    """The tip link of an arm of one joint has its origin on the axis, so no force at the tip explains the torque."""
+    np.testing.assert_array_equal(tip_force(np.zeros((3, 1)), np.array([2.0]), np.array([0.5])), np.zeros(3))
 
 
 def test_a_payload_is_carried_by_the_last_joint_and_not_by_a_counterweight(tmp_path):
