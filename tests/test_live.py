@@ -557,6 +557,19 @@ def test_the_payload_is_the_map_estimate(offset):
     assert ours < best + 1e-4 * abs(best)
 
 
+@pytest.mark.parametrize(("moment", "status"), [(0.12, "payload"), (0.0, "not yet")])
+def test_a_mass_that_no_motion_determines_has_a_wide_interval(moment, status):
+    """An arm of one joint determines the first moments of its payload across the axis, but not the mass."""
+    covariance = np.diag(np.square(TUNING.load_prior))
+    covariance[[1, 2], [1, 2]] = 1e-6
+    payload = find_payload(np.array([0, moment, *(0.0,) * 8]), covariance, 1.0, 2.0)
+    assert payload.status == status
+    assert payload.limit > 10
+    if status == "payload":
+        low, high = payload.mass_interval
+        assert low < 0.2 and high > 10
+
+
 def test_an_indefinite_covariance_is_no_payload_and_no_error():
     covariance = np.diag(np.square(TUNING.load_prior))
     covariance[0, 0] = -1e-9

@@ -100,9 +100,14 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     # The posterior is a mixture over the prior masses. The covariance of a mixture is the mean of the covariances plus
     # the covariance of the means.
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
+    # If the variance of the mass is nearly the filter's prior variance, the measurements do not determine the mass, as
+    # for an arm of one joint, which determines only first moments. The Wishart prior then determines it in `theta`.
+    variance = TUNING.load_prior[0] ** 2
+    spread[0, 0] += variance * (covariance[0, 0] > 0.5 * variance)
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
-        return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
+        is_none = log_odds > TUNING.no_payload_odds and spread[0, 0] < variance
+        return Payload("no payload" if is_none else "not yet", log_odds, limit)
     return _payload(theta, spread, log_odds, limit, Payload.frame)
 
 
