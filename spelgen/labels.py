@@ -1,6 +1,6 @@
 """Names of joints, units, entries of M and predictors in charts, tables and sentences."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 
@@ -70,9 +70,18 @@ def named_joints(names: Sequence[str], joint_types: Sequence[str]) -> list[Named
     return [NamedJoint(name, UNITS[x]) for name, x in zip(names, joint_types, strict=True)]
 
 
-def torque_units(joint_types: Iterable[str]) -> str:
-    """Return the units of the torques of joints: "Nm", "N", or "Nm, N" for both types of joints."""
-    return ", ".join(dict.fromkeys(UNITS[joint_type].torque for joint_type in joint_types))
+def torque_units(names: Sequence[str], joint_types: Sequence[str]) -> dict[str, str]:
+    """Return {joint: unit of its torque, Nm or N}."""
+    return {name: UNITS[joint_type].torque for name, joint_type in zip(names, joint_types, strict=True)}
+
+
+def torques_text(torques: Mapping[str, str], units: Mapping[str, str]) -> str:
+    """Return torques of joints with units, such as "lift 14 N, elbow 0.2, wrist 0.1 Nm".
+
+    torques: {joint: number or numbers}. units: {joint: Nm or N}.
+    """
+    groups = groupby(torques, key=units.__getitem__)
+    return ", ".join(f"{', '.join(f'{x} {torques[x]}' for x in group)} {unit}" for unit, group in groups)
 
 
 def joint_ranges(joints: tuple[int, ...]) -> str:

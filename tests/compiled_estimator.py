@@ -161,7 +161,9 @@ def differences(found: Columns, states: Sequence[EstimatorState]) -> dict[str, f
 class CompiledEstimator:
     """The C estimator of a model, exported to a temporary folder, compiled and called by ctypes."""
 
-    def __init__(self, trained: ArmModel, arm: Arm, levels: NoiseLevels, *flags: str) -> None:
+    def __init__(
+        self, trained: ArmModel, arm: Arm, levels: NoiseLevels, *flags: str, program: str = "gcc"
+    ) -> None:
         model = describe(trained, arm)
         self.n, self.name = model.n, model.name
         self.dtype = np.float32 if any(flag.endswith("_FLOAT") for flag in flags) else np.float64
@@ -174,7 +176,7 @@ class CompiledEstimator:
         runner.write_text(_RUNNER.replace("NAME", model.name).replace("UPPER", model.name.upper()))
         sources = [source, source.with_name(f"{model.name}_estimator.c"), runner]
         flags = ("-std=gnu99", "-Wno-unused-parameter", *flags)
-        self.library = ctypes.CDLL(str(compile_library(sources, shutil.which("gcc") or "cc", *flags)))
+        self.library = ctypes.CDLL(str(compile_library(sources, shutil.which(program) or "cc", *flags)))
         self.library.size.restype = self.library.saved_size.restype = ctypes.c_size_t
         self.start()
 

@@ -76,6 +76,15 @@ def test_exported_friction_in_the_urdf(tmp_path):
         assert urdf.damping == pytest.approx(joint.viscous)
 
 
+@pytest.mark.parametrize("chosen", [{"tip": "link4"}, {"joints": ("joint1", "joint2", "joint3")}])
+def test_the_exported_urdf_has_the_joints_of_the_model(chosen, tmp_path):
+    """The chain was chosen on the command line; the default chain of the URDF is longer."""
+    model = build(load_arm(ROBOTS / "six_dof.urdf", **chosen), "closed-form")
+    loaded, _ = exported(saved_run(model, ROBOTS / "six_dof.urdf", tmp_path), tmp_path / "learned.urdf")
+    assert loaded.chain.joint_names == model.joint_names
+    assert loaded.tip == chosen.get("tip")
+
+
 def test_residual_terms_are_reported(tmp_path):
     """Bodies of a hybrid model are exported exactly, and the magnitude of the omitted residual terms is reported."""
     run, model = run_of("two_link", tmp_path, "hybrid", heavier)

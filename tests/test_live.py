@@ -1,7 +1,9 @@
 """The live estimator finds a payload, contacts and friction changes that were added to torques; its equations hold."""
 
+import copy
 import dataclasses
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,26 +12,31 @@ import torch
 from compiled_estimator import nominal_levels
 from emitted import ROBOTS
 from exported_runs import COUPLED, MOTORS, arm_of, moved_model, saved_run
+from lxml import etree
 from motions import smooth_motion
 from scipy.optimize import minimize
 from typer.testing import CliRunner
 
 import spelgen
+from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
+from spelgen.dynamics import tip_frame
 from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
+from spelgen.labels import torque_units, torques_text
 from spelgen.live import levels as live_levels
+from spelgen.live.contact import tip_force
 from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.intake import Intake
 from spelgen.live.levels import block_noise, held_out_tail
-from spelgen.live.momentum import balance, load_terms
+from spelgen.live.momentum import balance, load_body, load_terms
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import find_payload
-from spelgen.live.replay import load_changes, replay
+from spelgen.live.replay import load_changes, payload_sentence, replay
 from spelgen.live.tuning import TUNING
 from spelgen.logs.read import write_logs
 from spelgen.logs.trajectory import Trajectory
@@ -119,7 +126,8 @@ def test_momentum_balance_is_the_inverse_dynamics(robot, tmp_path):
     passive = ~model.actuated.numpy().astype(bool)
     error = rate - (at.torque - at.friction)
     assert np.abs(error[:, ~passive]).max() < 1e-6 * np.abs(rate).max()
-    regressor = chain_regressor(model.chain, q, qd, qdd)[:, :, -10:]
+    columns = slice(10 * load_body(model.chain), 10 * load_body(model.chain) + 10)
+    regressor = chain_regressor(model.chain, q, qd, qdd)[:, :, columns]
     by_momentum = (after.load_momentum - before.load_momentum) / (2 * step) - at.load_torque
     np.testing.assert_allclose(by_momentum, regressor, atol=1e-6 * np.abs(regressor).max())
 
@@ -164,6 +172,77 @@ def test_a_payload_is_found_with_its_intervals(arm, levels, run):
     assert inside.sum() >= 2
     # the estimated payload is physically consistent
     assert np.linalg.eigvalsh(pseudo_inertia(torch.from_numpy(payload.parameters)).numpy())[0] > 0
+
+
+def test_reports_for_users_describe_the_payload_in_the_frame_of_the_tip_link(arm, levels, run, tmp_path):
+    """The frame of the last body is not a frame of the URDF if the axis of the last joint is not z."""
+    model, log, qdd = arm
+    fit = load_run(run)
+    root = etree.parse(fit.urdf)
+    joint = next(joint for joint in root.iter("joint") if joint.get("name") == model.joint_names[-1])
+    # The tip link is turned against the link of the last joint, and 0.1 m from it.
+    etree.SubElement(root.getroot(), "link", name="tool")
+    mount = etree.SubElement(root.getroot(), "joint", name="mount", type="fixed")
+    etree.SubElement(mount, "parent", link=joint.find("child").get("link"))
+    etree.SubElement(mount, "child", link="tool")
+    etree.SubElement(mount, "origin", xyz="0 0 0.1", rpy="1.5707963267948966 0 0")
+    root.write(tmp_path / "tool.urdf")
+    fit = dataclasses.replace(fit, urdf=tmp_path / "tool.urdf")
+    (result,) = replay(fit, [dataclasses.replace(log, tau=loaded(model, log, qdd, PAYLOAD))])
+    here, there = result.states[-1].payload, result.payload
+    x, y, z = here.center
+    np.testing.assert_allclose(there.center, [x, z - 0.1, -y], atol=1e-9)
+    np.testing.assert_allclose(
+        there.center_interval[[0, 2], 0], [here.center_interval[0, 0], -here.center_interval[1, 1]]
+    )
+    xx, xy, xz, yy, yz, zz = here.inertia
+    np.testing.assert_allclose(there.inertia, [xx, xz, -xy, zz, -yz, yy], atol=1e-9)
+    assert there.mass_interval == pytest.approx(here.mass_interval)
+    assert " in the frame of tool" in payload_sentence(there)
+    assert result.to_dict()["payload"]["frame"] == "tool"
+
+
+def test_a_tip_on_the_axis_of_the_only_joint_has_no_force():
+    """The tip link of an arm of one joint has its origin on the axis, so no force at the tip explains the torque."""
+    np.testing.assert_array_equal(tip_force(np.zeros((3, 1)), np.array([2.0]), np.array([0.5])), np.zeros(3))
+
+
+def test_a_payload_is_carried_by_the_last_joint_and_not_by_a_counterweight(tmp_path):
+    """Mimic joints on other branches, such as the cylinder of a counterweight, have bodies after the last joint's."""
+    root = etree.parse(ROBOTS / "six_dof.urdf")
+    link = copy.deepcopy(next(link for link in root.iter("link") if link.find("inertial") is not None))
+    link.set("name", "cylinder")
+    root.getroot().append(link)
+    joint = etree.SubElement(root.getroot(), "joint", name="cylinder_joint", type="revolute")
+    for tag, values in (
+        ("parent", {"link": "link1"}),
+        ("child", {"link": "cylinder"}),
+        ("axis", {"xyz": "0 1 0"}),
+        ("limit", {"lower": "-2", "upper": "2", "effort": "1", "velocity": "9"}),
+        ("mimic", {"joint": "joint2", "multiplier": "-1"}),
+    ):
+        etree.SubElement(joint, tag, values)
+    root.write(tmp_path / "arm.urdf")
+    robot = load_arm(tmp_path / "arm.urdf")
+    model = build(robot, "closed-form").double()
+    assert robot.chain.bodies[-1].name == "cylinder_joint"
+    assert (
+        load_body(model.chain) == tip_frame.load_body(robot.chain) == tip_frame.tip_frame(robot).carrier == 5
+    )
+    q, qd = numbers(*np.random.default_rng(0).standard_normal((2, 3, 6)))
+    weights = -load_terms(model.chain, q, 0 * qd, torch.zeros(3).double())[1][..., 0]
+    plain = build(ROBOTS / "six_dof.urdf", "closed-form").double()
+    expected = -load_terms(plain.chain, q, 0 * qd, torch.zeros(3).double())[1][..., 0]
+    np.testing.assert_allclose(weights, expected, atol=1e-9)
+
+
+def test_each_torque_of_a_text_has_its_unit():
+    """An arm with prismatic and revolute joints has forces and torques in one sentence."""
+    units = torque_units(["lift", "elbow", "wrist"], ["prismatic", "revolute", "revolute"])
+    assert (
+        torques_text({"lift": "14", "elbow": "0.2", "wrist": "0.1"}, units)
+        == "lift 14 N, elbow 0.2, wrist 0.1 Nm"
+    )
 
 
 def test_the_torque_of_the_estimator_carries_the_payload(arm, levels, run):
@@ -478,6 +557,19 @@ def test_the_payload_is_the_map_estimate(offset):
     assert ours < best + 1e-4 * abs(best)
 
 
+@pytest.mark.parametrize(("moment", "status"), [(0.12, "payload"), (0.0, "not yet")])
+def test_a_mass_that_no_motion_determines_has_a_wide_interval(moment, status):
+    """An arm of one joint determines the first moments of its payload across the axis, but not the mass."""
+    covariance = np.diag(np.square(TUNING.load_prior))
+    covariance[[1, 2], [1, 2]] = 1e-6
+    payload = find_payload(np.array([0, moment, *(0.0,) * 8]), covariance, 1.0, 2.0)
+    assert payload.status == status
+    assert payload.limit > 10
+    if status == "payload":
+        low, high = payload.mass_interval
+        assert low < 0.2 and high > 10
+
+
 def test_an_indefinite_covariance_is_no_payload_and_no_error():
     covariance = np.diag(np.square(TUNING.load_prior))
     covariance[0, 0] = -1e-9
@@ -712,7 +804,11 @@ def test_torques_at_their_limit_are_named(arm, levels, run):
     (result,) = replay(load_run(run), [dataclasses.replace(log, tau=tau)])
     text = " ".join(result.text().split())
     assert "200 torque at its limit" in text
-    assert "largest torques: joint3 140 (limit 100) Nm; if limits of the URDF are wrong" in text
+    named = "largest torques: joint3 140 (limit 100) Nm; if limits of the URDF are wrong"
+    assert named in text
+    tau[:, 2] = 140.0
+    with pytest.raises(LogError, match=re.escape(named)):
+        replay(load_run(run), [dataclasses.replace(log, tau=tau)])
 
 
 def test_a_contact_in_the_first_second_is_no_payload(arm, levels, run):

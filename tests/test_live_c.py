@@ -122,6 +122,19 @@ def test_c_equals_python_for_friction_without_a_state(tmp_path):
     require_equal(found, estimator.replay(log), 1e-11)
 
 
+@pytest.mark.skipif(shutil.which("clang") is None, reason="no clang on this machine")
+@pytest.mark.parametrize("memory", ["bristles", "none"])
+def test_clang_compiles_the_estimator_without_warnings(memory, tmp_path):
+    """The export makes warnings errors; on machines whose only compiler is clang, one warning prevents the export."""
+    preset = (PACKAGE / "presets" / "closed-form.yaml").read_text()
+    (tmp_path / "preset.yaml").write_text(preset.replace("memory: bristles", f"memory: {memory}"))
+    model = randomised(
+        urdf := Path(__file__).parents[1] / "robots" / "six_dof.urdf", tmp_path / "preset.yaml"
+    )
+    levels = levels_of(model, motion_of(model, 2.0))
+    assert CompiledEstimator(model, load_arm(urdf), levels, PLAIN, program="clang").refused()
+
+
 def motion_of(model, seconds: float) -> Trajectory:
     """Return a log of a smooth motion with the torques of the model."""
     q, qd, qdd = smooth_motion(model.n, seconds, np.random.default_rng(3))

@@ -110,7 +110,7 @@ def estimate(
     """
     paths = options.logs(data, extra_logs)
     from spelgen.fitting.fitted import load_run
-    from spelgen.labels import torque_units
+    from spelgen.labels import torque_units, torques_text
     from spelgen.live.estimator import torque_model
     from spelgen.live.levels import noise_levels
     from spelgen.live.replay import replay
@@ -135,11 +135,12 @@ def estimate(
         "run": str(run), "page": str(page), "supported_alarms_per_minute": rate,
         "logs": [result.to_dict() for result in results], "contact_thresholds": thresholds,
     }  # fmt: skip
-    smallest = ", ".join(
-        f"{joint} {moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()
+    smallest = torques_text(
+        {joint: f"{moving:.3g}; {resting:.3g}" for joint, (moving, resting) in thresholds.items()},
+        torque_units(joints, fit.model.joint_types),
     )
     supported = (
-        f"contact thresholds in motion; at rest: {smallest} {torque_units(fit.model.joint_types)}, for a rate "
+        f"contact thresholds in motion; at rest: {smallest}, for a rate "
         f"of false alarms of {alarm_rate:g} per minute (training logs support >= {rate:.2g})"
     )
     if alarm_rate < rate:

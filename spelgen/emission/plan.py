@@ -27,13 +27,7 @@ from spelgen.spec import (
     Triple,
 )
 from spelgen.structure.basis import Weights
-from spelgen.structure.nominal import (
-    Nominal,
-    exact_inertias,
-    nominal,
-    parameters_of,
-    reference_factor,
-)
+from spelgen.structure.nominal import Nominal, exact_inertias, nominal, parameters_of, reference_factor
 from spelgen.structure.structure import Structure, derive
 
 

@@ -175,12 +175,11 @@ def _collisions(
         from spelgen.excitation.collisions import Collisions
 
         collisions = Collisions(arm, surroundings, limits)
+        return collisions, collisions.statement
     except ModuleNotFoundError as error:
         reason = f"pip install 'spelgen[simulate]' for the package {error.name}"
     except LookupError as error:
         reason = str(error.args[0])
-    else:
-        return collisions, collisions.statement
     return None, f"Not checked: collisions ({reason})."
 
 

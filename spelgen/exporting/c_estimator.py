@@ -12,6 +12,7 @@ from collections.abc import Iterable
 import casadi as ca
 import numpy as np
 
+from spelgen.dynamics.tip_frame import load_body
 from spelgen.exporting.c_source import CFunction, c_function
 from spelgen.exporting.describe import TrainedModel
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function, residual_symbols
@@ -53,7 +54,8 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     arm = RigidBodies(model.arm, q, model.inertias)
     # The payload is represented by a second set of bodies, in which only the last body has inertial parameters. The
     # momentum and the torque of this set are linear in these ten parameters.
-    payload = RigidBodies(model.arm, q, [ca.SX(10, 1)] * (len(bodies) - 1) + [load])
+    last = load_body(model.arm)
+    payload = RigidBodies(model.arm, q, [load if k == last else ca.SX(10, 1) for k in range(len(bodies))])
     momentum, kinetic_gradient = arm.momentum(qd)
     momentum += joint_mass(model, residuals) @ qd
     gravity = arm.torque(still, still)
@@ -65,7 +67,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     first, second = (drive_friction(model, residuals, qd, gravity, z) for z in (high, low))
     # Pose and Jacobian of the last body's frame relative to the root frame. The Jacobian has three rows of linear
     # velocity, then three rows of angular velocity.
-    pose, jacobian = frame_kinematics(bodies, len(bodies) - 1, np.eye(4), q)
+    pose, jacobian = frame_kinematics(bodies, last, np.eye(4), q)
     load_momentum, load_gradient = payload.momentum(qd)
     load_gradient -= payload.torque(still, still)
     at_point = jacobian[:3, :] - ca.skew(pose[:3, :3] @ levels.point) @ jacobian[3:, :]
@@ -109,6 +111,9 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "tables": {name: _numbers(row) for name, row in tables.items()},
         "motors": list(map(_numbers, model.motors)),
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
+        # origin and axes of the tip link in the frame of the last body, if it is a part of this body
+        "tip": (np.round(model.tip.pose[:3, [3, 0, 1, 2]].T, 9) + 0.0).tolist(),
+        "tip_is_last": model.tip.carrier == load_body(model.arm),
     }
     # The generated C code contains a checksum of all constants. A saved state of the estimator has this checksum, too:
     # the code refuses a state that was saved with other constants.

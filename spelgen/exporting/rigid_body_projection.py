@@ -81,10 +81,9 @@ class RigidBodyProjection:
             errors = f"M differs by {self.mass_error:.1%}, gravity by {self.gravity_error:.1%}"
             bodies = f"bodies are {source}; {errors}"
         worst = int(np.argmax(self.friction.error))
-        joint = self.arm.chain.coordinates[worst]
-        friction = "friction is written as viscous and Coulomb friction"
-        error = f"it differs from the model's by up to {self.friction.error[worst]:.0%} ({joint.name})"
-        return bodies, f"{friction}; {error}"
+        joint, largest = self.arm.chain.joint_names[worst], self.friction.error[worst]
+        error = f"it differs from the model's by up to {largest:.0%} ({joint})"
+        return bodies, f"friction is written as viscous and Coulomb friction; {error}"
 
 
 def rigid_body_projection(model: ArmModel, arm: Arm) -> RigidBodyProjection:

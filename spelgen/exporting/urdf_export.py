@@ -36,8 +36,7 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
     root = read_document(robot.path).root
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
-    chain = choose_chain(robot, arm.joint_names, None)
-    lumped = lump_links(robot, chain, projection.arm.angle_tolerance)
+    lumped = lump_links(robot, choose_chain(robot, arm.joint_names, None), projection.arm.angle_tolerance)
     for body, inertia in zip(lumped.moved, projection.bodies.inertial_parameters.numpy(), strict=True):
         for link in body.links:
             etree.strip_elements(links[link.name], "inertial")
@@ -59,17 +58,19 @@ def _urdf_text(projection: RigidBodyProjection) -> bytes:
 
 def _settings_text(projection: RigidBodyProjection) -> str:
     """Return the arm's settings as YAML with the rotor inertia and the friction of the model."""
-    path = projection.arm.robot.path.with_suffix(".yaml")
-    content: dict[str, dict[str, dict[str, object]]] = {}
+    arm, path = projection.arm, projection.arm.robot.path.with_suffix(".yaml")
     # The user's settings file of the arm is copied, with new rotor inertias and friction.
-    if path.exists():
-        content = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    content = yaml.safe_load(text) or {}
+    # The chain may have been chosen on the command line; settings may contain either of these keys, but not both.
+    content |= {"tip": arm.tip} if arm.tip else {"moving_joints": list(arm.chain.joint_names)}
+    content.pop("moving_joints" if arm.tip else "tip", None)
     joints = content.setdefault("joints", {})
     friction, armature = projection.friction, projection.bodies.armature.tolist()
-    for index, coordinate in enumerate(projection.arm.chain.coordinates):
+    for index, coordinate in enumerate(arm.chain.coordinates):
         # The settings specify the inertia at the rotor; the model has the inertia at the joint, gear^2 times
         # as large.
-        rotor = armature[index] / projection.arm.settings.joint(coordinate.name).gear ** 2
+        rotor = armature[index] / arm.settings.joint(coordinate.name).gear ** 2
         numbers = rotor, friction.viscous[index], friction.forward[index], friction.backward[index]
         rotor, viscous, *coulomb = (float(_number(number)) for number in numbers)
         values = {"rotor_inertia": rotor, "viscous": viscous, "coulomb": coulomb}

@@ -165,6 +165,7 @@ def tip_force(jacobian: np.ndarray, torque: np.ndarray, threshold: np.ndarray) -
     """
     weighted = jacobian / threshold**2
     matrix = weighted @ jacobian.T
-    # With the regularization of `matrix`, a force component that affects no joint torque is estimated as zero.
-    matrix += 1e-3 * np.trace(matrix) / 3 * np.eye(3)
+    # With the regularization of `matrix`, a force component that affects no joint torque is estimated as zero, also if
+    # no component does: the tip is on the axis of an arm of one joint.
+    matrix += (1e-3 * np.trace(matrix) / 3 + np.finfo(float).tiny) * np.eye(3)
     return np.linalg.solve(matrix, weighted @ torque)

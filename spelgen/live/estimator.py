@@ -19,7 +19,7 @@ from spelgen.live.contact import ContactObserver, ContactState
 from spelgen.live.filters import Block, Blocks, JointFilters, PayloadEstimate
 from spelgen.live.intake import Intake, Refusal, balance_along
 from spelgen.live.levels import noise_levels
-from spelgen.live.momentum import Balance
+from spelgen.live.momentum import Balance, load_body
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.payload import NO_REPORT, Payload, find_payload
 from spelgen.live.tuning import TUNING
@@ -209,10 +209,9 @@ class Estimator:
             cache = self.model.at(*at, prepared=self.prepared)
             torque = self.model.inverse_dynamics(cache, *at[1:], *past)
             friction = self.model.friction_torque(cache, at[1], *past)
-            # The payload is fixed to the last body: its regressor is the last ten columns of the arm's regressor, which
-            # belong to the last body.
-            parameters = torch.from_numpy(self.payload.parameters)
-            load = regressor_of(self.model.chain, *at)[..., -10:] @ parameters
+            # The regressor of the payload has the ten columns of the body that carries it.
+            first, parameters = 10 * load_body(self.model.chain), torch.from_numpy(self.payload.parameters)
+            load = regressor_of(self.model.chain, *at)[..., first : first + 10] @ parameters
             decay = np.exp(-ahead / self.levels.drift.time_constant) * (ahead <= TUNING.disturbance_ahead)
             a, d = self.drift.x.T
             if self.compensate_external:

@@ -13,7 +13,7 @@ import numpy as np
 from spelgen.dynamics.bristles import bristle_reach, encoder_step
 from spelgen.dynamics.parameters import without_idle_residuals, without_residuals
 from spelgen.dynamics.protocol import residual_terms
-from spelgen.dynamics.tip_frame import tip_frame
+from spelgen.dynamics.tip_frame import load_frame
 from spelgen.emission.assemble import assemble, spec_of
 from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError, RunError
@@ -72,11 +72,10 @@ def cross_validated_levels(fit: Fit) -> NoiseLevels:
     effort, point = np.full(fit.model.n, np.inf), np.zeros(3)
     if fit.urdf is not None and fit.urdf.exists():
         arm = arm_of_spec(spec_of(fit.model), fit.urdf)
-        effort, tip = np.array([joint.effort or np.inf for joint in arm.chain.coordinates]), tip_frame(arm)
+        effort = np.array([joint.effort or np.inf for joint in arm.chain.coordinates])
         # The contact force is estimated at a point of the last body: at the tip or, if the tip is fixed to another
         # body, at the origin of the last body.
-        if tip.carrier == len(arm.chain.bodies) - 1:
-            point = tip.pose[:3, 3]
+        point = load_frame(arm)[1][:3, 3]
     others = [list(itertools.chain(*folds[:k], *folds[k + 1 :])) for k in range(len(folds))]
     tested = [(fitted_to(fit, training), fold) for training, fold in zip(others, folds, strict=True)]
     levels = find_levels(tested, effort, point, fit.preprocessing.torque_delay or 0.0)
@@ -384,8 +383,5 @@ def _observer_noise(signal: np.ndarray, qd: np.ndarray, levels: NoiseLevels) -> 
         costs[k] = np.mean(np.log(noise[k] ** 2 * shape) + inner * (2 * normalised - inner), axis=0)
     best = costs.argmin(axis=0)
     observer, (speed, ratio) = noise[best, np.arange(len(best))], grid[best].T
-    return {
-        "observer": observer,
-        "resting": TUNING.outlier * ratio * observer,
-        "resting_speed": speed * levels.speed,
-    }
+    resting = TUNING.outlier * ratio * observer
+    return {"observer": observer, "resting": resting, "resting_speed": speed * levels.speed}

@@ -48,6 +48,11 @@ class Balance(NamedTuple):
     velocity: np.ndarray
 
 
+def load_body(chain: BodyChain) -> int:
+    """Return the index of the body that carries payloads, see `tip_frame.load_body`."""
+    return int(chain.ratios[:, -1].nonzero()[0])
+
+
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the terms of a payload in the momentum balance, and the Jacobian of a point of the last body.
 
@@ -64,13 +69,14 @@ def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[
     # result contains the whole homogeneous transform of each body.
     pose = chain.forward(q, torch.eye(4 * len(chain.parents)).to(q))
     velocities, _, turning = chain.motion(pose, qd)
+    last = load_body(chain)
     # `frame` is the homogeneous transform of the last body, (T, 1, 4, 4).
-    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., -1:, :].movedim(-2, -3)
-    velocity = velocities[..., -1, :]  # Time derivative of the frame of the last body, (T, 3, 4).
+    frame = torch.cat([pose.place, pose.mass], dim=-3)[..., [last], :].movedim(-2, -3)
+    velocity = velocities[..., last, :]  # Time derivative of the frame of the last body, (T, 3, 4).
     axes, turned = (torch.unflatten(x.mT @ chain.motions, -1, (3, 4)) for x in (pose.axes, turning))
     # `jacobian` is the derivative of the frame of the last body with respect to q, and `rate` its time derivative,
     # (T, n, 3, 4) each. Only joints between the root and the last body contribute.
-    ratios = chain.carriers[:, -1:] * chain.ratios
+    ratios = chain.carriers[:, [last]] * chain.ratios
     changes = axes @ frame, turned @ frame + axes[..., :3] @ velocity.unsqueeze(-3)
     jacobian, rate = (torch.einsum("bn,tbxa->tnxa", ratios, change) for change in changes)
     weight = torch.zeros_like(velocity)

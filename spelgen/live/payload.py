@@ -26,7 +26,7 @@ _UNITS = pseudo_inertia(torch.eye(10).double()).numpy()
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """Estimate of a payload that is fixed to the last body, in the frame of this body.
+    """Estimate of a payload that is fixed to the last body, in the frame of this body or of a link, see `at_link`.
 
     All attributes after `limit` are zero unless the status is "payload".
 
@@ -42,6 +42,8 @@ class Payload:
         inertia_interval: Limits of 95 % intervals, (6, 2) [kg m^2].
         parameters: Mass m, first moments m c, and inertia about the origin of the frame, (10,).
         covariance: Covariance of the parameters, (10, 10).
+        frame: Name of the link in whose frame the payload is described, or "the last body": the body of the last
+            joint, with z along the axis of this joint.
     """
 
     status: Status = "not yet"
@@ -55,6 +57,16 @@ class Payload:
     inertia_interval: np.ndarray = field(default_factory=lambda: np.zeros((6, 2)))
     parameters: np.ndarray = field(default_factory=lambda: np.zeros(10))
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((10, 10)))
+    frame: str = "the last body"
+
+    def at_link(self, link: str, pose: np.ndarray) -> "Payload":
+        """Return a reported payload in the frame of a link, whose pose (4, 4) is in the frame of the last body."""
+        # The pseudo-inertia J changes to P J P^T with the inverse pose P. It is linear in the parameters.
+        inverse = np.linalg.inv(pose)
+        changed = (inverse @ _UNITS @ inverse.T).reshape(10, 16)
+        matrix = np.linalg.lstsq(_UNITS.reshape(10, 16).T, changed.T, rcond=None)[0]
+        theta, spread = matrix @ self.parameters, matrix @ self.covariance @ matrix.T
+        return _payload(theta, spread, self.log_odds, self.limit, link)
 
 
 NO_REPORT = Payload()
@@ -88,9 +100,23 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     # The posterior is a mixture over the prior masses. The covariance of a mixture is the mean of the covariances plus
     # the covariance of the means.
     spread = np.tensordot(weights, inverses, 1) + np.cov(thetas.T, ddof=0, aweights=weights)
+    # If the variance of the mass is nearly the filter's prior variance, the measurements do not determine the mass, as
+    # for an arm of one joint, which determines only first moments. The Wishart prior then determines it in `theta`.
+    variance = TUNING.load_prior[0] ** 2
+    spread[0, 0] += variance * (covariance[0, 0] > 0.5 * variance)
     limit = theta[0] + quantile * math.sqrt(spread[0, 0])
     if log_odds > TUNING.payload_odds:
-        return Payload("no payload" if log_odds > TUNING.no_payload_odds else "not yet", log_odds, limit)
+        is_none = log_odds > TUNING.no_payload_odds and spread[0, 0] < variance
+        return Payload("no payload" if is_none else "not yet", log_odds, limit)
+    return _payload(theta, spread, log_odds, limit, Payload.frame)
+
+
+def _payload(theta: np.ndarray, spread: np.ndarray, log_odds: float, limit: float, frame: str) -> Payload:
+    """Return a reported payload with its intervals.
+
+    theta: inertial parameters in the frame, (10,). spread: covariance of theta. log_odds, limit, frame: see `Payload`.
+    """
+    quantile = (limit - theta[0]) / math.sqrt(spread[0, 0])
     # Intervals are computed from the derivatives of mass, centre of mass and inertia with respect to theta (delta
     # method). Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).
     values, tiny = _mass_center_inertia(theta), 1e-30
@@ -101,7 +127,7 @@ def find_payload(mean: np.ndarray, covariance: np.ndarray, factor: float, quanti
     low, high = intervals[0].tolist()
     return Payload(
         "payload", log_odds, limit, float(values[0]), (max(low, 0.0), high), values[1:4], intervals[1:4],
-        values[4:], intervals[4:], theta, spread,
+        values[4:], intervals[4:], theta, spread, frame,
     )  # fmt: skip
 
 

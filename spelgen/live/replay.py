@@ -7,9 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from spelgen.dynamics.tip_frame import load_frame
+from spelgen.emission.specify import arm_of_spec
 from spelgen.errors import LogError
-from spelgen.fitting.fitted import Fit
-from spelgen.labels import torque_units
+from spelgen.fitting.fitted import Fit, required_spec
+from spelgen.labels import torque_units, torques_text
 from spelgen.listing import WIDTH
 from spelgen.live.estimator import Estimator, EstimatorState
 from spelgen.live.payload import Payload
@@ -56,19 +58,19 @@ class LogEstimate:
 
     Attributes:
         log: The log.
-        unit: Unit of the joint torques.
         states: Estimates after each sample.
-        payload: Estimated payload at the end of the log.
+        units: {joint: unit of its torque, Nm or N}.
+        payload: Estimated payload at the end of the log, in the frame of a link, see `at_tip`.
         since: Time at which a payload was first reported [s]; None without a payload.
         changes: Times of changes of the payload [s], see `load_changes`.
         contacts: Contacts along the log.
         drift: {joint: relative difference of friction at the end of the log from friction of the model [%]}.
         refused: {reason: number of samples that were refused or only partly used}.
-        limits: For joints whose torque reaches its limit, a text with the largest torque and the limit [Nm, N].
+        limits: {joint whose torque reaches its limit: text with the largest torque and the limit [Nm, N]}.
     """
 
     log: Trajectory
-    unit: str
+    units: dict[str, str]
     states: list[EstimatorState]
     payload: Payload
     since: float | None
@@ -76,7 +78,7 @@ class LogEstimate:
     contacts: tuple[ContactEvent, ...]
     drift: dict[str, float]
     refused: dict[str, int]
-    limits: list[str]
+    limits: dict[str, str]
 
     def to_dict(self) -> dict[str, object]:
         """Return the estimates as content of a JSON file: times [s], payload, contacts, friction drift [%]."""
@@ -84,8 +86,13 @@ class LogEstimate:
             "log": self.log.name, "seconds": self.log.duration, "payload": payload_content(self.payload),
             "payload_since": self.since, "load_changes": list(self.changes),
             "contacts": [vars(contact) for contact in self.contacts], "friction_drift_percent": self.drift,
-            "refused": self.refused, "torques_at_limit": self.limits,
+            "refused": self.refused, "torques_at_limit": [f"{joint} {text}" for joint, text in self.limits.items()],
         }  # fmt: skip
+
+    def torques(self, event: ContactEvent) -> str:
+        """Return the joints of a contact with their largest external torques, as text with units."""
+        texts = {joint: f"{torque:+.3g}" for joint, torque in zip(event.joints, event.torques, strict=True)}
+        return torques_text(texts, self.units)
 
     def text(self) -> str:
         """Return the estimates as text for users, with a line per contact."""
@@ -95,10 +102,8 @@ class LogEstimate:
         lines += [f"  another load at {at:.1f} s" for at in self.changes]
         for event in self.contacts:
             name = "load before its report" if event.is_load else "contact"
-            pairs = zip(event.joints, event.torques, strict=True)
-            torques = ", ".join(f"{joint} {torque:+.3g}" for joint, torque in pairs)
             span = f"{event.begin:.2f} to {event.end:.2f} s"
-            lines.append(f"  {name} at {span}: {torques} {self.unit}; {event.force:.3g} N at the tip")
+            lines.append(f"  {name} at {span}: {self.torques(event)}; {event.force:.3g} N at the tip")
         if not self.contacts:
             lines.append("  no contact")
         if np.mean([state.contact.touched.any() for state in self.states]) > 0.5:
@@ -109,7 +114,7 @@ class LogEstimate:
             refused = "; ".join(f"{count} {REASONS.get(name, name)}" for name, count in self.refused.items())
             lines.append(f"  samples that were not used, or only in part: {refused}")
         if self.limits:
-            lines.append(f"  largest torques: {', '.join(self.limits)} {self.unit}; {LIMITS}")
+            lines.append(f"  largest torques: {torques_text(self.limits, self.units)}; {LIMITS}")
         return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="    ") for line in lines)
 
 
@@ -120,7 +125,9 @@ def payload_content(payload: Payload) -> dict[str, object]:
         content["mass_limit"] = payload.limit
     if payload.status == "payload":
         fields = [f"{name}{end}" for name in ("mass", "center", "inertia") for end in ("", "_interval")]
-        content |= {name: np.asarray(vars(payload)[name]).tolist() for name in (*fields, "parameters")}
+        content |= {
+            name: np.asarray(vars(payload)[name]).tolist() for name in (*fields, "parameters", "frame")
+        }
     return content
 
 
@@ -135,7 +142,8 @@ def payload_sentence(payload: Payload) -> str:
             f"{value:.3f} ({first:.3f} to {last:.3f})"
             for value, (first, last) in zip(payload.center, payload.center_interval, strict=True)
         )
-        return f"payload of {payload.mass:.3f} kg ({low:.3f} to {high:.3f}), centre of mass {center} m"
+        mass = f"payload of {payload.mass:.3f} kg ({low:.3f} to {high:.3f})"
+        return f"{mass}, centre of mass {center} m in the frame of {payload.frame}"
     limit = f"at most {payload.limit:.2g} kg" if np.isfinite(payload.limit) else "record motion of the joints"
     is_none = payload.status == "no payload"
     return f"{'no payload' if is_none else 'not determined yet whether there is a payload'} ({limit})"
@@ -158,26 +166,28 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     for log in logs:
         estimator.reset()
         states = estimator.replay(log)
-        unused = sum(estimator.refused.values())
+        unused, units = sum(estimator.refused.values()), torque_units(joints, fit.model.joint_types)
+        largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
+        pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
+        limits = {joint: f"{top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most}
         if unused > len(log) / 2:
             counts = ", ".join(f"{count} {reason}" for reason, count in estimator.refused.items())
+            do = "check that it is a log of this arm, and its units: torques in Nm, positions in rad"
+            do += f"; largest torques: {torques_text(limits, units)}; {LIMITS}" if limits else ""
             raise LogError(
                 f"{unused} of {len(log)} samples that the estimator cannot use ({counts})", element=log.name,
                 expected="torques below the limits and speeds as in the training logs, at least every 0.25 s",
-                do="check that it is a log of this arm, and its units: torques in Nm, positions in rad",
+                do=do,
             )  # fmt: skip
         times = log.t - log.t[0]
         reported = times[[state.payload.status == "payload" for state in states]].tolist()
         drift = np.round(100 * (states[-1].friction_scale - 1), 2).tolist()
         changes = tuple(times[load_changes(states)].tolist())
-        largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
-        pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
         results.append(LogEstimate(
-            log=log, unit=torque_units(fit.model.joint_types), states=states, payload=states[-1].payload,
+            log=log, units=units, states=states, payload=at_tip(fit, states[-1].payload),
             since=reported[0] if reported else None, changes=changes,
             contacts=tuple(contact_events(states, joints, [*reported[:1], *changes])),
-            drift=dict(zip(joints, drift, strict=True)), refused=estimator.refused,
-            limits=[f"{joint} {top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most],
+            drift=dict(zip(joints, drift, strict=True)), refused=estimator.refused, limits=limits,
         ))  # fmt: skip
     return results
 
@@ -192,7 +202,14 @@ def carried_payload(fit: Fit, logs: Sequence[Trajectory]) -> tuple[Payload, list
         begin = float(t[-1]) + 2 * TUNING.gap
         if load_changes(estimator.replay(replace(log, t=t))):
             changed.append(log.name)
-    return estimator.report(), changed
+    return at_tip(fit, estimator.report()), changed
+
+
+def at_tip(fit: Fit, payload: Payload) -> Payload:
+    """Return a payload in the frame of the tip link (see `load_frame`), or unchanged for a fit without a URDF."""
+    if payload.status != "payload" or fit.urdf is None or not fit.urdf.exists():
+        return payload
+    return payload.at_link(*load_frame(arm_of_spec(required_spec(fit.model), fit.urdf)))
 
 
 def load_changes(states: Sequence[EstimatorState]) -> list[int]:

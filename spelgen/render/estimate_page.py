@@ -41,7 +41,7 @@ def mass_chart(result: LogEstimate) -> Chart | None:
     if not mass.any():
         return None
     low, high = np.array([state.payload.mass_interval for state in result.states]).T
-    t = _times(result)
+    t = result.log.t - result.log.t[0]
     # The estimated mass is piecewise constant, so the band has points only before and after each change.
     corners = np.flatnonzero(np.diff(mass, prepend=np.nan) != 0)
     rows = np.unique(np.concatenate([corners, np.maximum(corners - 1, 0), [len(t) - 1]]))
@@ -71,8 +71,6 @@ def joint_panels(fit: Fit, result: LogEstimate) -> list[Panel]:
         JointRow("external torque", "external torque", "torque", torque),
         JointRow("friction relative to the model", "friction [%]", "", friction, 100),
     ]
-    return stacks(_times(result), rows, named_joints(tuple(result.drift), fit.model.joint_types))
-
-
-def _times(result: LogEstimate) -> np.ndarray:
-    return np.array([state.t for state in result.states]) - result.states[0].t
+    return stacks(
+        result.log.t - result.log.t[0], rows, named_joints(tuple(result.drift), fit.model.joint_types)
+    )

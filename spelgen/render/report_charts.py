@@ -11,18 +11,7 @@ from spelgen.evaluation.verdict import Limits
 from spelgen.fitting.run_record import Content
 from spelgen.labels import LEAST_SQUARES, MODEL, UNITS, NamedJoint, entry_name, named_joints, thousandths
 from spelgen.listing import number
-from spelgen.render.charts import (
-    TUNING,
-    Band,
-    Chart,
-    Dots,
-    JointRow,
-    Line,
-    Mark,
-    Panel,
-    line_chart,
-    stacks,
-)
+from spelgen.render.charts import TUNING, Band, Chart, Dots, JointRow, Line, Mark, Panel, line_chart, stacks
 from spelgen.spec import ModelSpec
 
 

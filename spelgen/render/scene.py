@@ -103,25 +103,14 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
         return SceneLink(name, -1, np.eye(3), root, np.array([0.0, 0.0, 1.0]), False, -1, 0.0, 0.0, shape)
     driver, ratio, offset = -1, 0.0, 0.0
     if joint.moves:
-        # A mimic joint moves with its driving joint; a locked joint does not move.
+        # A mimic joint moves with its driving joint; a locked joint does not move, and all its ratios are zero.
         row = constraint.names.index(joint.name)
         offset = float(constraint.offset[row])
-        drivers = np.flatnonzero(constraint.jacobian[row])
-        if len(drivers):
-            driver = int(drivers[0])
-            ratio = float(constraint.jacobian[row, driver])
-    return SceneLink(
-        name=name,
-        parent=names.index(joint.parent) if joint.parent in names else -1,
-        rotation=_rotation(joint),
-        position=np.array(joint.xyz, dtype=float),
-        axis=_axis(joint),
-        slides=joint.type == "prismatic",
-        joint=driver,
-        ratio=ratio,
-        offset=offset,
-        shape=shape,
-    )
+        driver = next(iter(np.flatnonzero(constraint.jacobian[row]).tolist()), -1)
+        ratio = float(constraint.jacobian[row, driver])
+    parent = names.index(joint.parent) if joint.parent in names else -1
+    frame = _rotation(joint), np.array(joint.xyz, dtype=float), _axis(joint)
+    return SceneLink(name, parent, *frame, joint.type == "prismatic", driver, ratio, offset, shape)
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:

@@ -132,11 +132,8 @@ def _drives(arm: Arm, bodies: Arm, rng: np.random.Generator) -> dict[str, dict[s
         unchanged = drive.model_dump(
             mode="json", include={"gear", "actuated", "kp", "inputs"}, exclude_none=True
         )
-        drives[joint.name] = unchanged | {
-            "rotor_inertia": rotor,
-            "viscous": damping,
-            "coulomb": [forward, -backward],
-        }
+        changed = {"rotor_inertia": rotor, "viscous": damping, "coulomb": [forward, -backward]}
+        drives[joint.name] = unchanged | changed
     return drives
 
 

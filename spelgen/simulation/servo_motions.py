@@ -6,13 +6,7 @@ from spelgen.arm.arm import Chain
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.settings import Settings
-from spelgen.simulation.protocol import (
-    Progress,
-    SimulatedLogs,
-    initial_range,
-    make_friction,
-    sample_times,
-)
+from spelgen.simulation.protocol import Progress, SimulatedLogs, initial_range, make_friction, sample_times
 from spelgen.simulation.tuning import TUNING
 
 
