@@ -21,11 +21,12 @@ import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.cli.main import app
 from spelgen.dynamics import tip_frame
-from spelgen.dynamics.body_regressor import chain_regressor, pseudo_inertia
+from spelgen.dynamics.body_regressor import chain_regressor, load_body, pseudo_inertia
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.build import build
 from spelgen.errors import LogError, RunError
 from spelgen.fitting.fitted import load_run
+from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.labels import torque_units, torques_text
 from spelgen.live import levels as live_levels
 from spelgen.live.contact import tip_force
@@ -33,7 +34,7 @@ from spelgen.live.estimator import Estimator
 from spelgen.live.filters import Block, LoadFilter
 from spelgen.live.intake import Intake
 from spelgen.live.levels import block_noise, held_out_tail
-from spelgen.live.momentum import balance, load_body, load_terms
+from spelgen.live.momentum import balance, load_terms
 from spelgen.live.noise import BlockNoise, NoiseLevels
 from spelgen.live.payload import find_payload
 from spelgen.live.replay import load_changes, payload_sentence, replay
@@ -226,9 +227,11 @@ def test_a_payload_is_carried_by_the_last_joint_and_not_by_a_counterweight(tmp_p
     robot = load_arm(tmp_path / "arm.urdf")
     model = build(robot, "closed-form").double()
     assert robot.chain.bodies[-1].name == "cylinder_joint"
-    assert (
-        load_body(model.chain) == tip_frame.load_body(robot.chain) == tip_frame.tip_frame(robot).carrier == 5
-    )
+    assert load_body(model.chain) == robot.chain.load_body == tip_frame.tip_frame(robot).carrier == 5
+    # a fit that adapts the model to a load changes the parameters of this body alone
+    parameters = ParameterVector(model)
+    free = parameters.unflatten(parameters.free_mask("load", torch.zeros(6)))[parameters.bodies]
+    assert free.flatten(1).any(dim=1).nonzero().tolist() == [[5]]
     q, qd = numbers(*np.random.default_rng(0).standard_normal((2, 3, 6)))
     weights = -load_terms(model.chain, q, 0 * qd, torch.zeros(3).double())[1][..., 0]
     plain = build(ROBOTS / "six_dof.urdf", "closed-form").double()

@@ -110,6 +110,14 @@ class Chain:
         return tuple(coordinate.joint_type for coordinate in self.coordinates)
 
     @property
+    def load_body(self) -> int:
+        """Index of the body of the last joint, which carries payloads.
+
+        Bodies of mimic joints on other branches, such as the cylinder of a counterweight, may have higher indices.
+        """
+        return next(k for k, body in enumerate(self.bodies) if body.coordinate == len(self.coordinates) - 1)
+
+    @property
     def inertials_complete(self) -> bool:
         """Whether every body has an inertial with mass."""
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)

@@ -87,6 +87,11 @@ def regressor_of(chain: BodyChain, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor
     return rows.transpose(-3, -2).flatten(-2)
 
 
+def load_body(chain: BodyChain) -> int:
+    """Return the index of the body of the last joint, which carries payloads, as `Chain.load_body` does."""
+    return int(chain.ratios[:, -1].nonzero()[0])
+
+
 def chain_regressor(chain: BodyChain, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> np.ndarray:
     """Return ``regressor_of`` for NumPy arrays q, qd, qdd (T, n): the regressor Y of B bodies, (T, n, 10 B)."""
     # The arrays are copied, since filters return arrays with negative strides, which torch does not accept.

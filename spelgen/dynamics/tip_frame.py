@@ -38,21 +38,13 @@ def tip_frame(loaded: Arm) -> Tip:
 
 
 def load_frame(loaded: Arm) -> tuple[str, np.ndarray]:
-    """Return the link whose frame describes a payload, and its pose in the frame of the `load_body`, (4, 4).
+    """Return the link whose frame describes a payload, and its pose in the frame of the `Chain.load_body`, (4, 4).
 
     It is the tip link, or the link of the last joint if another body carries the tip link.
     """
-    tip, body = tip_frame(loaded), load_body(loaded.chain)
+    tip, body = tip_frame(loaded), loaded.chain.load_body
     link = tip.link if tip.carrier == body else loaded.chain.bodies[body].link
     return link, link_poses(loaded)[link][1]
-
-
-def load_body(chain: Chain) -> int:
-    """Return the index of the body of the last joint, which carries payloads.
-
-    Bodies of mimic joints on other branches, such as the cylinder of a counterweight, may have higher indices.
-    """
-    return next(k for k, body in enumerate(chain.bodies) if body.coordinate == len(chain.coordinates) - 1)
 
 
 def link_poses(loaded: Arm, angle_tolerance: float = 0.0) -> dict[str, tuple[int, np.ndarray]]:

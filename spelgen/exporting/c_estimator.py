@@ -12,7 +12,6 @@ from collections.abc import Iterable
 import casadi as ca
 import numpy as np
 
-from spelgen.dynamics.tip_frame import load_body
 from spelgen.exporting.c_source import CFunction, c_function
 from spelgen.exporting.describe import TrainedModel
 from spelgen.exporting.model_expressions import drive_friction, joint_mass, named_function, residual_symbols
@@ -54,7 +53,7 @@ def estimator_c_functions(model: TrainedModel, levels: NoiseLevels) -> list[CFun
     arm = RigidBodies(model.arm, q, model.inertias)
     # The payload is represented by a second set of bodies, in which only the last body has inertial parameters. The
     # momentum and the torque of this set are linear in these ten parameters.
-    last = load_body(model.arm)
+    last = model.arm.load_body
     payload = RigidBodies(model.arm, q, [load if k == last else ca.SX(10, 1) for k in range(len(bodies))])
     momentum, kinetic_gradient = arm.momentum(qd)
     momentum += joint_mass(model, residuals) @ qd
@@ -113,7 +112,7 @@ def estimator_texts(model: TrainedModel, levels: NoiseLevels) -> dict[str, str]:
         "inverse_inputs": list(map(_numbers, model.input_inverse)),
         # origin and axes of the tip link in the frame of the last body, if it is a part of this body
         "tip": (np.round(model.tip.pose[:3, [3, 0, 1, 2]].T, 9) + 0.0).tolist(),
-        "tip_is_last": model.tip.carrier == load_body(model.arm),
+        "tip_is_last": model.tip.carrier == model.arm.load_body,
     }
     # The generated C code contains a checksum of all constants. A saved state of the estimator has this checksum, too:
     # the code refuses a state that was saved with other constants.

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from spelgen.dynamics.tip_frame import load_body
 from spelgen.exporting.c_export import c_files
 from spelgen.exporting.describe import Trained
 from spelgen.exporting.exported import Exported, with_readme
@@ -72,7 +71,7 @@ def _missing_part(trained: Trained) -> tuple[str, str] | None:
         return "estimator", "its noise levels are found from the training logs of a fit"
     # The estimator computes the payload in the frame of the last body, and the controller publishes it in the frame
     # of the tip link: both frames must belong to the same body.
-    if model.tip.carrier != load_body(model.arm):
+    if model.tip.carrier != model.arm.load_body:
         return "estimator", "the tip link is not part of the last body"
     return None
 

@@ -45,10 +45,11 @@ def load_changes(problem: GeometryProblem) -> list[LoadChange]:
     """Return the changes of the load between recordings that the torques show; [] if there are none.
 
     The torques of all recordings are fitted by one set of parameters, plus one load per recording: a mass and a first
-    moment that are added to the last body. The loads must lower the negative log likelihood significantly. Two other
-    models must lower it less: one torque offset per joint and recording, and own viscous and Coulomb friction of each
-    recording. A change is then returned for each recording that meets two conditions: its load differs significantly
-    from the load of the reference recording, and its own load at least halves the squared residual of some joint.
+    moment that are added to the body of the last joint. The loads must lower the negative log likelihood significantly.
+    Two other models must lower it less: one torque offset per joint and recording, and own viscous and Coulomb friction
+    of each recording. A change is then returned for each recording that meets two conditions: its load differs
+    significantly from the load of the reference recording, and its own load at least halves the squared residual of
+    some joint.
 
     problem: least-squares problem of the samples of all recordings.
     """
@@ -69,13 +70,13 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     subset = problem.selected(np.isin(problem.samples.recording, recordings)).thinned(SAMPLES)
     fit = subset.fit(subset.unchanged)
     rows, _ = subset.equations(subset.unchanged)
-    last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
+    first, inertials, n = 10 * problem.arm.load_body, 10 * len(problem.arm.bodies), rows.shape[1]
     offsets = np.broadcast_to(np.eye(n), (len(rows), n, n))
     # The first effects of `FRICTION` are the armature, viscous and Coulomb friction.
-    friction = rows[..., last + 10 + n : last + 10 + 3 * n]
+    friction = rows[..., inertials + n : inertials + 3 * n]
     common, offset, other_friction, load = (
         _refit(subset, fit, columns, [subset.samples.recording == x for x in recordings])
-        for columns in (rows[..., :0], offsets, friction, rows[..., last : last + 4])
+        for columns in (rows[..., :0], offsets, friction, rows[..., first : first + 4])
     )
     if load.misfit > min(offset.misfit, other_friction.misfit, common.misfit - GEOMETRY.needed):
         return []
@@ -90,7 +91,7 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
         odds = 0.5 * change @ np.linalg.pinv(covariance, hermitian=True) @ change
         samples = subset.samples.recording == recording
         residual = load.residual[samples]
-        unchanged = residual - rows[samples, :, last : last + 4] @ change
+        unchanged = residual - rows[samples, :, first : first + 4] @ change
         is_needed = np.square(unchanged).sum(axis=0) > 2 * np.square(residual).sum(axis=0)
         if odds > GEOMETRY.needed and is_needed.any():
             deviation = float(np.sqrt(covariance[0, 0]))
@@ -200,7 +201,7 @@ def _change(
     recording, time, joint: see `Candidate`.
     """
     rows, _ = problem.equations(problem.unchanged)
-    last, n = 10 * (len(problem.arm.bodies) - 1), rows.shape[1]
+    first, inertials, n = 10 * problem.arm.load_body, 10 * len(problem.arm.bodies), rows.shape[1]
     chosen = np.arange(n) if joint == n else np.array([joint])
     in_recording = (problem.samples.recording == recording)[:, None, None]
     late = in_recording * (problem.samples.times[:, None, None] >= time)
@@ -227,9 +228,9 @@ def _change(
     drift = (
         offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
     )
-    viscous = last + 10 + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
+    viscous = inertials + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
-    alternatives = rows[..., last : last + 4] * late, np.concatenate([friction, drift], axis=2)
+    alternatives = rows[..., first : first + 4] * late, np.concatenate([friction, drift], axis=2)
     return min(_refit(problem, fit, x, all_samples).misfit for x in alternatives) - best.misfit, change
 
 
@@ -264,7 +265,7 @@ def _refit(
         problem: problem with the S samples.
         fit: fit of `problem` without additional quantities.
         columns: (S, n, D) derivatives of the torques with respect to the quantities of the sample's part. Examples:
-            regressor columns of the last body for a load, identity matrices for torque offsets.
+            regressor columns of the body of the last joint for a load, identity matrices for torque offsets.
         parts: mask (S,) of each part.
     """
     count, size = len(fit.parameters), columns.shape[2]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from spelgen.dynamics.body_regressor import regressor_of
+from spelgen.dynamics.body_regressor import load_body, regressor_of
 from spelgen.dynamics.bristles import bristle_reach
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.errors import RunError
@@ -19,7 +19,7 @@ from spelgen.live.contact import ContactObserver, ContactState
 from spelgen.live.filters import Block, Blocks, JointFilters, PayloadEstimate
 from spelgen.live.intake import Intake, Refusal, balance_along
 from spelgen.live.levels import noise_levels
-from spelgen.live.momentum import Balance, load_body
+from spelgen.live.momentum import Balance
 from spelgen.live.noise import NoiseLevels
 from spelgen.live.payload import NO_REPORT, Payload, find_payload
 from spelgen.live.tuning import TUNING

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from spelgen.dynamics.body_regressor import pseudo_inertia
+from spelgen.dynamics.body_regressor import load_body, pseudo_inertia
 from spelgen.dynamics.protocol import is_stateful
 from spelgen.runtime.body_chain import BodyChain
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics, RigidParameters
@@ -46,11 +46,6 @@ class Balance(NamedTuple):
     load_torque: np.ndarray
     jacobian: np.ndarray
     velocity: np.ndarray
-
-
-def load_body(chain: BodyChain) -> int:
-    """Return the index of the body that carries payloads, see `tip_frame.load_body`."""
-    return int(chain.ratios[:, -1].nonzero()[0])
 
 
 def load_terms(chain: BodyChain, q: Tensor, qd: Tensor, point: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from spelgen.dynamics.body_regressor import load_body
 from spelgen.dynamics.parameters import NamedTensors, parameter_table
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
@@ -60,6 +61,7 @@ class ParameterVector:
                 self.initial[name] = tensors[name].detach().clone()
         (self.bodies,) = self.names("bodies")
         (self.compensation,) = self.names("friction_compensation")
+        self._load_body = load_body(model.chain)
         self._lengths = [tensor.numel() for tensor in self.initial.values()]
 
     def names(self, *groups: str) -> list[str]:
@@ -92,13 +94,14 @@ class ParameterVector:
         """Return a mask (K,), True for the parameters that a fit estimates.
 
         Args:
-            adapt: "load": only the last body is free; "friction": only friction parameters and torque offsets, which
-                vary from day to day (`DAY_GROUPS`); None or "unit" (another arm of the same type): all groups.
+            adapt: "load": only the body of the last joint is free; "friction": only friction parameters and torque
+                offsets, which vary from day to day (`DAY_GROUPS`); None or "unit" (another arm of the same type): all
+                groups.
             compensated: (n,) joints whose friction compensation is free; it is fixed at all other joints.
         """
         if adapt == "load":
             free = self.mask()
-            self.unflatten(free)[self.bodies][-1] = True
+            self.unflatten(free)[self.bodies][self._load_body] = True
             return free
         free = self.mask(*(DAY_GROUPS if adapt == "friction" else RIGID_GROUPS))
         self.unflatten(free)[self.compensation].copy_(compensated)
