@@ -23,6 +23,7 @@ from spelgen.excitation.criterion import Criterion
 from spelgen.excitation.excitation import Excitation
 from spelgen.excitation.trajectory import ExcitationTrajectory, approach
 from spelgen.excitation.tuning import TUNING
+from spelgen.labels import counted
 
 if TYPE_CHECKING:
     from spelgen.excitation.collisions import Collisions
@@ -93,7 +94,7 @@ def excite(
         do = "use less of the ranges (--reach), begin elsewhere (--from), or lower the clearance"
         raise ArmError(f"no motion without a contact: {'; '.join(contacts)}", element="excite", do=do)
     if attempt:
-        earlier = f"Designs with seeds {seed} to {seed + attempt - 1} had contacts"
+        earlier = f"{counted(attempt, 'design')} from seed {seed} on had contacts"
         statement += f" {earlier}; this one has seed {seed + attempt}, {reach * fraction:.0%} of the ranges."
     random, states = criterion.states(starts[0]), np.stack([motion.q, motion.qd, motion.qdd])
     return Excitation(
@@ -175,11 +176,12 @@ def _collisions(
         from spelgen.excitation.collisions import Collisions
 
         collisions = Collisions(arm, surroundings, limits)
-        return collisions, collisions.statement
     except ModuleNotFoundError as error:
         reason = f"pip install 'spelgen[simulate]' for the package {error.name}"
     except LookupError as error:
         reason = str(error.args[0])
+    else:
+        return collisions, collisions.statement
     return None, f"Not checked: collisions ({reason})."
 
 

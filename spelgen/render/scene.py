@@ -108,9 +108,18 @@ def _link(robot: Robot, name: str, names: Sequence[str], constraint: Constraint,
         offset = float(constraint.offset[row])
         driver = next(iter(np.flatnonzero(constraint.jacobian[row]).tolist()), -1)
         ratio = float(constraint.jacobian[row, driver])
-    parent = names.index(joint.parent) if joint.parent in names else -1
-    frame = _rotation(joint), np.array(joint.xyz, dtype=float), _axis(joint)
-    return SceneLink(name, parent, *frame, joint.type == "prismatic", driver, ratio, offset, shape)
+    return SceneLink(
+        name=name,
+        parent=names.index(joint.parent) if joint.parent in names else -1,
+        rotation=_rotation(joint),
+        position=np.array(joint.xyz, dtype=float),
+        axis=_axis(joint),
+        slides=joint.type == "prismatic",
+        joint=driver,
+        ratio=ratio,
+        offset=offset,
+        shape=shape,
+    )
 
 
 def _links(robot: Robot, joints: Sequence[str]) -> list[str]:
