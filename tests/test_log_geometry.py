@@ -374,6 +374,14 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
     assert found == [("urdf-inertials", link)]
 
 
+def test_unexplained_torques_of_an_arm_with_one_joint_are_reported(robots):
+    arm = load_arm(robots / "two_link.urdf", joints=["joint2"])
+    log = recorded(arm, 18)
+    noise = log.tau.std() * np.random.default_rng(18).standard_normal(log.tau.shape)
+    report = check_logs([replace(log, tau=noise)], arm)
+    assert "no hypothesis" in " ".join(map(str, (*report.errors, *report.findings)))
+
+
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):
