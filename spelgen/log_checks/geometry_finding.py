@@ -80,7 +80,7 @@ def find_unexplained(
     The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a large
     residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without such
     a hypothesis, the finding is a warning: torques that are mostly noise or friction are unexplained even in a log
-    without faults. It is also a warning if these joints are at rest: dry friction carries an unknown part of their load.
+    without faults. It is also a warning if these joints are at rest: dry friction carries a part of their load.
 
     best: fit of the best hypothesis; None if no hypothesis is significantly better.
     """
