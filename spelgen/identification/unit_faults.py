@@ -246,7 +246,7 @@ class PositionUnit(WrongScale):
         # of the torques of a log of motor positions; but these factors must halve the residual.
         lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
-        # All factors that `_free` could try leave less than 0.05 rad or m of a motion below 0.1.
+        # Every factor that `_free` could try reduces a motion below 0.1 to less than 0.05 rad or m.
         is_moving = np.ptp(base.hypothesis.signals(problem.samples).motion[0], axis=0) > 0.1
         for joints in self._groups:
             is_open = is_moving[joints].any() and not is_changed[joints].any()
