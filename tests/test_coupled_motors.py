@@ -351,6 +351,22 @@ def test_logs_of_plain_drives_suggest_nothing(uncoupled):
     assert not codes & {"coupled-motors", "torque-delay"}
 
 
+def test_the_torque_of_a_joint_at_rest_shows_no_coupling(uncoupled):
+    """The motion of joint 5 shakes joint 6, which is at rest, so that its dry friction acts."""
+    log, rng = recorded(uncoupled, "joints", 0.0), np.random.default_rng(1)
+    q, qd = log.q.copy(), log.qd.copy()
+    q[:, 5] = 0.2 + 1e-5 * rng.standard_normal(len(q))
+    qd[:, 5] = 1e-4 * rng.standard_normal(len(q))
+    friction = np.tanh(qd / 0.01) + 0.3 * qd
+    friction[:, 5] = friction[:, 4]
+    rigid = regressor(uncoupled.chain, q, qd, np.gradient(qd, log.t, axis=0)) @ urdf_parameters(
+        uncoupled.chain
+    )
+    tau = rigid + friction * np.array([5.0, 5.0, 4.0, 3.0, 2.0, 1.0]) + 0.05 * rng.standard_normal(q.shape)
+    report = check_logs([replace(log, q=q, qd=qd, tau=tau)], uncoupled)
+    assert not told(report, "coupled-motors")
+
+
 def trained_gains(tmp_path, names, gear=1):
     """Return a closed-form model of six_dof.urdf; the motors of the joints ``names`` have trained gains.
 

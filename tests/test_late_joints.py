@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from test_log_geometry import arm, excitation, mended, recorded, told  # noqa: F401  (a fixture)
 
 from spelgen.arm.configured_arm import load_arm
+from spelgen.identification.time_faults import _delayed_signals
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.settings.log_mapping import LogMapping
@@ -43,6 +44,12 @@ def test_the_delay_of_one_joint_is_named_and_mended(arm, motion, torque, tmp_pat
         bound = 0.015 * np.abs(np.gradient(expected, read.t, axis=0)).max(axis=0) + 1e-6
         assert (np.abs(getattr(read, name) - expected)[inner].max(axis=0) <= bound).all()
     assert check_logs([read], again).errors == ()
+
+
+def test_motion_and_torque_of_an_only_joint_have_no_common_delay():
+    """A common delay of all signals is no fault. In the log of a pendulum, 0.227 s of it were advised."""
+    assert [mask.tolist() for mask in _delayed_signals(1)] == [[[0.0], [1.0]]]
+    assert len(_delayed_signals(2)) == 7
 
 
 def test_torques_of_all_joints_that_are_late_have_one_line(arm):  # noqa: F811

@@ -374,6 +374,36 @@ def test_a_last_link_that_is_too_light_is_wrong_or_carries_a_tool(arm):
     assert found == [("urdf-inertials", link)]
 
 
+@pytest.mark.parametrize(("name", "seed"), [("six_dof", 18), ("rpr", 19)])
+def test_the_torque_of_a_joint_at_rest_refuses_no_log(robots, name, seed):
+    """Dry friction carries the load of the first joint, except for a part of the peaks.
+
+    The torque of this joint then differs from the rigid-body torque, which is reported, but is no error. The prismatic
+    joint of "rpr" moves beyond its limits, so its unit is tested, also in the columns of the joint at rest.
+    """
+
+    def held(arm, rng):
+        t, q = excitation(arm, rng)
+        q[:, 0] = 0.3 + 1e-4 * np.sin(5 * t) * np.sin(t)
+        return t, q
+
+    arm = load_arm(robots / f"{name}.urdf")
+    log, rng = recorded(arm, seed, held), np.random.default_rng(0)
+    load = log.tau[:, 0] - log.tau[:, 0].mean()
+    peaks = np.sign(load) * np.maximum(np.abs(load) - 0.8 * load.std(), 0.0)
+    log.tau[:, 0] = 0.1 * peaks + 0.02 * load.std() * rng.standard_normal(len(load))
+    report = check_logs([log], arm)
+    assert "torque-unexplained" not in [code for error in report.errors for code in error.codes]
+
+
+def test_unexplained_torques_of_an_arm_with_one_joint_are_reported(robots):
+    arm = load_arm(robots / "two_link.urdf", joints=["joint2"])
+    log = recorded(arm, 18)
+    noise = log.tau.std() * np.random.default_rng(18).standard_normal(log.tau.shape)
+    report = check_logs([replace(log, tau=noise)], arm)
+    assert "no hypothesis" in " ".join(map(str, (*report.errors, *report.findings)))
+
+
 @pytest.mark.parametrize("arm", ["rpr"], indirect=True)
 @pytest.mark.parametrize("form", ["noise", "one joint", "late", "load register"])
 def test_torques_that_no_hypothesis_explains_are_asked_for(arm, form):

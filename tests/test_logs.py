@@ -412,6 +412,22 @@ def test_a_joint_at_rest_whose_drive_has_no_word_for_zero_velocity_is_not_frozen
         assert "joint-at-rest" in [note.code for note in notes]
 
 
+def test_noise_of_a_coarse_velocity_at_rest_is_not_motion():
+    """The velocity has steps of 0.066 rad/s, no word for 0, and noise of 1.5 steps; its position is constant for 9 s.
+
+    The integral of the velocities of a joint at rest then changes by 0.1 rad.
+    """
+    t = 0.001 * np.arange(18000)
+    q = np.maximum(np.sin(t), np.sin(9.0))
+    rows = t > 9.0
+    q[rows] = q[rows][0]
+    noise = np.random.default_rng(0).standard_normal(len(t))
+    qd = 0.066 * np.round((np.gradient(q, t) + 0.1 * noise) / 0.066) - 0.011
+    tau = np.column_stack([np.sin(t) + 0.01 * noise, np.cos(t) + 0.01 * noise])
+    log = Trajectory(t, np.column_stack([q, q]), np.column_stack([qd, qd]), tau, name="x")
+    check([log], JOINTS, ("revolute", "revolute"))  # raises LogError if the position is reported as frozen
+
+
 def test_what_never_changes_in_any_trajectory_is_said():
     resting = changed(q={1: 0.5}, qd={1: 0.0}, tau={1: 0.0})
     notes = check([resting], JOINTS, ("revolute", "revolute"))

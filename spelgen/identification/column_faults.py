@@ -75,7 +75,7 @@ class WrongOrder(Fault):
             source[list(self._rows)] = start
             fit = fitted(unchanged.hypothesis.changed(self, source=source))
             while True:
-                best = min(map(fitted, self._swapped(fit.hypothesis)), key=lambda x: x.rank)
+                best = min(map(fitted, self._swapped(fit.hypothesis)), key=lambda x: x.rank, default=fit)
                 if best.cost > fit.cost - 1.0:
                     break
                 fit = best

@@ -125,9 +125,14 @@ class DriveProblem:
 
     @property
     def free(self) -> list[int]:
-        """Indices of the joints for which a coupling is searched: no coupling declared, and a torque that varies."""
-        joins = self.speeds != 0
-        return np.flatnonzero(varying(self.rows[..., -1]) & ((joins | joins.T).sum(axis=0) == 1)).tolist()
+        """Indices of the joints for which a coupling is searched: none declared, motion, and a torque that varies.
+
+        A joint at rest is omitted: dry friction carries a part of its load, and its neighbours shake it.
+        """
+        joins, is_moving = self.speeds != 0, self.samples.motion[1].std(axis=0) > SAMPLES.moving
+        return np.flatnonzero(
+            varying(self.rows[..., -1]) & is_moving & ((joins | joins.T).sum(axis=0) == 1)
+        ).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
         """Return the least-squares problem with other joint torques, tau (S, n) [Nm, N], e.g. without a delay."""

@@ -259,10 +259,11 @@ def _explains_more(problem: GeometryProblem, base: HypothesisFit, fit: Hypothesi
 def _delayed_signals(n: int) -> list[np.ndarray]:
     """Return masks (2, n) of motion and torque, one per set of signals that may have a common delay.
 
-    The sets: the torques of all n joints; then, for each joint, its motion, its torque, and both.
+    The sets: the torques of all n joints; then, for each of several joints, its motion, its torque, and both. A common
+    delay of both at the only joint would shift the times of the whole log.
     """
     masks = [np.stack([np.zeros(n), np.ones(n)])]
-    for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]):
+    for rows in ([1.0, 0.0], [0.0, 1.0], [1.0, 1.0]) if n > 1 else ():
         masks += [np.outer(rows, unit) for unit in np.eye(n)]
     return masks
 

@@ -246,8 +246,11 @@ class PositionUnit(WrongScale):
         # of the torques of a log of motor positions; but these factors must halve the residual.
         lowest = min((base, *units), key=lambda fit: fit.cost).errors
         is_changed = np.abs(base.hypothesis.scale[0]) != np.abs(problem.unchanged.scale[0])
+        # Every factor that `_free` could try reduces a motion below 0.1 to less than 0.05 rad or m.
+        is_moving = np.ptp(base.hypothesis.signals(problem.samples).motion[0], axis=0) > 0.1
         for joints in self._groups:
-            if not is_changed[joints].any() and (lowest.max() > GEOMETRY.explained or len(joints) > 1):
+            is_open = is_moving[joints].any() and not is_changed[joints].any()
+            if is_open and (lowest.max() > GEOMETRY.explained or len(joints) > 1):
                 fit = self._free(problem, base, joints)
                 yield from [fit] if len(joints) == 1 or 2 * fit.errors.mean() < lowest.mean() else []
 

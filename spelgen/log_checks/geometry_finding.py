@@ -80,7 +80,7 @@ def find_unexplained(
     The finding is an error if a hypothesis is significantly better than the unchanged log, but has nevertheless a large
     residual at the joints that it affects: the log has a fault, but the hypothesis is not an explanation. Without such
     a hypothesis, the finding is a warning: torques that are mostly noise or friction are unexplained even in a log
-    without faults.
+    without faults. It is also a warning if these joints are at rest: dry friction carries a part of their load.
 
     best: fit of the best hypothesis; None if no hypothesis is significantly better.
     """
@@ -104,7 +104,7 @@ def find_unexplained(
     do = "check each recording by itself, and " * bool(np.ptp(problem.samples.recording)) + (
         "check that the columns are the torques of these joints, with their sign and at the times of the positions"
     )
-    if best is None:
+    if best is None or not (wrong & _moving_joints(problem)).any():
         return Diagnostic("warning", UNEXPLAINED, where, None, f"{got}; {do}")
     expected = "joint torques of a rigid arm with friction"
     return LogError(got, element=where, expected=expected, do=do, codes=(UNEXPLAINED,))
@@ -127,7 +127,7 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)
     of_urdf = signals.tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
-    is_moving = signals.motion[1].std(axis=0) > SAMPLES.moving
+    is_moving = _moving_joints(problem)
     weights = np.stack([signals.tau.var(axis=0) + 1e-30, is_moving + 1e-30])
     mean = float((weights @ errors / weights.sum(axis=1)).max())
     if mean > GEOMETRY.no_torque:
@@ -135,6 +135,12 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     is_loaded = of_urdf.std(axis=0) > 0.5 * signals.tau.std(axis=0)
     wrong = (errors > GEOMETRY.no_torque) & is_moving & is_loaded
     return wrong, float(errors[wrong].max(initial=0.0))
+
+
+def _moving_joints(problem: GeometryProblem) -> np.ndarray:
+    """Return the mask (n,) of the joints that are not at rest: their velocity varies."""
+    velocities = problem.unchanged.signals(problem.samples).motion[1]
+    return np.asarray(velocities.std(axis=0) > SAMPLES.moving)
 
 
 def _place(correction: Correction, fault: Fault) -> str:

@@ -261,13 +261,16 @@ def stale_rows(
 def travel(t: np.ndarray, qd: np.ndarray) -> np.ndarray:
     """Return the integral of velocities qd (T,) [rad/s, m/s] over the times t (T,) [s], as positions (T,) [rad, m].
 
-    Velocities of at most three quantisation steps, and at most 0.05 rad/s or m/s, count as zero: the registers of some
-    drives have no word for zero, so a joint at rest has velocities around half a step, whose integral grows with time.
+    Velocities whose mean over 0.1 s is at most three quantisation steps, and at most 0.05 rad/s or m/s, count as zero:
+    the registers of some drives have no word for zero, so a joint at rest has noise around half a step, whose integral
+    grows with time.
     """
     from scipy.integrate import cumulative_trapezoid  # SciPy is slow to import, so it is imported only here
+    from scipy.ndimage import uniform_filter1d
 
     step = np.diff(np.unique(qd)).min(initial=np.inf)
-    at_rest = np.abs(qd) <= min(3 * step, 0.05)
+    window = max(1, round(0.1 / max(float(np.median(np.diff(t))), 1e-4))) if len(t) > 1 else 1
+    at_rest = np.abs(uniform_filter1d(qd, window)) <= min(3 * step, 0.05)
     return np.asarray(cumulative_trapezoid(np.where(at_rest, 0.0, qd), t, initial=0))
 
 
