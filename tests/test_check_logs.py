@@ -121,6 +121,24 @@ def test_torques_without_gravity_or_of_another_scale_are_found(loaded, loaded_jo
     assert found == [("warning", code, f"joint {arm.coordinates[joint].name!r}")]
 
 
+@pytest.mark.parametrize("noise", [0.02, 0.05])
+def test_the_small_torque_of_a_free_swing_has_gravity(loaded, arm, noise):
+    """Joint 3 swings nearly at its natural frequency of 9.8 rad/s: its inertial torque balances gravity.
+
+    noise: standard deviation of the torques [Nm, N].
+    """
+    t = np.arange(0.0, 20.0, 0.01)
+    swing = -1.5734 + 0.4 * (1 + 0.3 * np.sin(0.3 * t)) * np.sin(9.51 * t)
+    q = np.stack([np.zeros_like(t), np.full_like(t, 0.15), swing], axis=1)
+    qd = np.gradient(q, t, axis=0)
+    tau = regressor(arm, q, qd, np.gradient(qd, t, axis=0)) @ urdf_parameters(arm) + 0.02 * np.sign(qd)
+    tau += noise * np.random.default_rng(0).standard_normal(tau.shape)
+    report = check_logs([Trajectory(t, q, qd, tau, "swing")], loaded)
+    assert report.errors == ()
+    assert report.joints[2].gravity.relative_deviation > 3 and abs(report.joints[2].gravity.correlation) < 0.3
+    assert "torque-without-gravity" not in [x.code for x in report.findings]
+
+
 IMPOSSIBLE = {
     "sign": (-1.0, "torques of the opposite sense", "{gain: -1}"),
     "unit": (1e-3, "torques of another unit, 0.001 times as large", "{gain: 1000}"),

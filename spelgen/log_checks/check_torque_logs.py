@@ -472,12 +472,13 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     problem = problem.thinned(GEOMETRY.confirming_samples)
     fit = problem.fit(problem.unchanged)
     for k, name, deviation, correlation in suspicious:
-        # The torque of a joint is reported to have no gravity in two cases: (1) the model with gravity does not fit its
-        # torque, with a residual above 10 % of the torque's variance, or (2) the cost without gravity at this joint is
-        # lower by more than `rarity`, the penalty of a rare fault. The penalty is needed since a wrong centre of mass
-        # of the last link also lowers the gravity torque.
+        # The torque of a joint is reported to have no gravity if the cost without gravity at this joint is lower. It
+        # must be lower by more than `rarity`, the penalty of a rare fault, if the model with gravity fits the torque
+        # (residual of at most 10 % of its variance): a wrong centre of mass of the last link also lowers the gravity
+        # torque. In a free swing the inertial torque balances gravity, so that the torque does not vary with gravity.
+        needed = 0.0 if fit.errors[k] > 0.1 else TorqueUnit.rarity
         without = problem.without_gravity(k).fit(problem.unchanged).cost
-        if fit.errors[k] > 0.1 or without < fit.cost - TorqueUnit.rarity:
+        if without < fit.cost - needed:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
                 f"torque varies {deviation:.2g} times as much as tau"
@@ -518,7 +519,9 @@ def _link_notes(problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFi
             # difference of two standard deviations may occur by chance.
             if 1 / 2.5 < ratio < 2.5 or abs(ratio - 1) <= 4.0 * deviation:
                 continue
-            other = _reversed_torque(problem, mapping) if ratio < 0 else ""
+            # A reversed torque reverses the fitted value, whose magnitude is then as plausible as above.
+            is_reversed = 1 / 2.5 < -ratio < 2.5 and ratio < -4.0 * deviation
+            other = _reversed_torque(problem, mapping) if is_reversed else ""
             message = (
                 f"its {name} is {ratio:.2f} +- {deviation:.2f} times the URDF's by least squares: {other}check its "
                 "mass and centre of mass in the URDF"
