@@ -168,3 +168,18 @@ def test_a_model_in_memory_is_exported_with_its_arm(tmp_path):
         found.write(tmp_path / "arm.urdf")
     with pytest.raises(RunError, match=r"no robot\.urdf"):
         export(model)
+
+
+def test_a_bias_of_rounding_errors_equals_zero(tmp_path):
+    """An arm of one joint with a vertical axis has no Coriolis or gravity torque, only rounding errors of zero."""
+    (tmp_path / "arm.urdf").write_text(
+        """<robot name="turntable"><link name="base"/><link name="table"><inertial><origin xyz="0.3 0.02 0"/>
+        <mass value="1.2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        <joint name="turn" type="revolute"><parent link="base"/><child link="table"/><origin xyz="0 0 1"/>
+        <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="20" velocity="6"/></joint></robot>"""
+    )
+    model = build(tmp_path / "arm.urdf", "hybrid").double()
+    with torch.no_grad():
+        heavier(model)
+    found = export(model.requires_grad_(False), "casadi", arm=load_arm(tmp_path / "arm.urdf"))
+    assert "200 random states" in repr(found)

@@ -245,7 +245,9 @@ def relative(values: np.ndarray, expected: np.ndarray) -> float:
     """Return max |values - expected| / max |expected| of two arrays (...,); NaN if a value is NaN."""
     if not expected.size:
         return 0.0
-    # The difference is absolute if all expected values are zero.
-    size = np.abs(expected).max() or 1.0
+    # The difference is absolute if all expected values are zero, or rounding errors of zero, such as the gravity torque
+    # of a joint with a vertical axis.
+    size = np.abs(expected).max()
+    size = 1.0 if size < 1e-12 else size
     with np.errstate(invalid="ignore"):
         return float(np.abs(values - expected).max() / size)
