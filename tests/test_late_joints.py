@@ -294,6 +294,16 @@ def test_degrees_of_a_mirrored_joint_are_no_gears(arm, seed):  # noqa: F811
     assert "sign: -1, units: {q: deg, qd: deg/s}" in error and "counts" not in error
 
 
+@pytest.mark.parametrize("arm", ["scara"], indirect=True)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_millimetres_of_a_lift_are_named_and_no_other_fault(arm, seed):  # noqa: F811
+    """Torques of a vertical prismatic joint do not show its unit: its gravity is constant, its mass uncertain."""
+    log = recorded(arm, seed)
+    factors = np.where(np.array(arm.chain.joint_types) == "prismatic", 1000.0, 1.0)
+    error = told(arm, replace(log, q=factors * log.q, qd=factors * log.qd))
+    assert "units: {q: mm, qd: mm/s}" in error and "clock" not in error
+
+
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)
 @pytest.mark.parametrize("seed", [31, 32, 38])
 def test_torques_in_mnm_are_named_although_another_zero_hides_their_gravity(arm, seed):  # noqa: F811

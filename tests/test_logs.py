@@ -282,6 +282,14 @@ def test_degrees_are_refused(case):
     )
 
 
+def test_millimetres_of_prismatic_joints_are_refused():
+    with pytest.raises(
+        LogError, match=r"more than 30 m: q in mm and qd in mm/s.* write 'units: {q: mm, qd: mm/s}'"
+    ):
+        check([scaled(swing(), q=1000.0, qd=1000.0)], JOINTS, ("prismatic", "prismatic"))
+    check([scaled(swing(), q=10.0, qd=10.0)], JOINTS, ("prismatic", "prismatic"))
+
+
 def test_registers_get_no_unit_by_chance_but_the_lines_that_read_them(tmp_path):
     """Encoder counts and speeds in units of 0.229 rpm (0.024 rad/s) are reported as numbers of an unknown unit.
 

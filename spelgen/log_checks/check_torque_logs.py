@@ -371,10 +371,12 @@ class TorqueLogs:
         if unexplained is not None:
             yield unexplained
             return
-        # if no hypothesis lowers the torque error, the torques do not show the unit of positions
-        if self._guessed and better and better[0].errors.mean() > GEOMETRY.lower * unchanged.errors.mean():
-            return
         faults = better[0].hypothesis.faults if better else ()
+        # The torques do not show the unit of positions if no hypothesis about it lowers the torque error.
+        if self._guessed and better:
+            is_lower = better[0].errors.mean() < GEOMETRY.lower * unchanged.errors.mean()
+            if not is_lower or not any(isinstance(fault, PositionUnit) for fault in faults):
+                return
         if not better or {fault.code for fault in faults} <= accepted:
             yield from () if better else _link_notes(problem, self._mapping, unchanged)
             if WITHOUT_GRAVITY not in accepted:

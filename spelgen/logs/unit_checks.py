@@ -19,6 +19,7 @@ from spelgen.logs.tuning import SIGNALS, TUNING, shows_accelerations
 from spelgen.settings.log_mapping import SCALES, TIMES
 
 TURNS = 4 * np.pi  # [rad] largest range of a joint with limits; a q with a larger range is not in rad
+LONGEST = 30.0  # [m] largest range of a prismatic joint; a q with a larger range is not in m
 # Units of positions and of velocities that loggers use, per joint type. The SI unit is first.
 UNITS = {
     "revolute": (("rad", "deg", "turns", "mrad"), ("rad/s", "deg/s", "rpm", "turns/s", "mrad/s")),
@@ -61,19 +62,20 @@ def velocity_agreement(products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_units(signals: JointSignals) -> str | Advice | None:
-    """Return a finding if q or qd has a wrong unit: the range of q exceeds two turns, or dq/dt is a multiple of qd.
+    """Return a finding if q or qd has a wrong unit: q has too large a range, or dq/dt is a multiple of qd.
 
-    The finding is `Advice` with the settings that correct it; if they are unknown, only a message. None: no fault.
+    The largest range is two turns, or 30 m for prismatic joints. The finding is `Advice` with the settings that
+    correct it; if they are unknown, only a message. None: no fault.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
     if signals.step > SIGNALS.slowest_step:
         return None
-    is_far = np.ptp(signals.q) > TURNS and signals.kind != "prismatic" and not signals.turns
-    is_far &= mapping.unit("q", joint) is None
+    limit, range_text = (LONGEST, f"{LONGEST:g} m") if signals.kind == "prismatic" else (TURNS, "two turns")
+    is_far = np.ptp(signals.q) > limit and not signals.turns and mapping.unit("q", joint) is None
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
-        message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than two turns"
+        message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than {range_text}"
         if signals.is_whole:
             message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
             # Whole numbers may be counts of an encoder or degrees. Without velocities this is unknown: no unit is
@@ -122,8 +124,8 @@ def _unit_readings(signals: JointSignals, is_far: bool) -> Iterator[tuple[float,
     The smaller the distance, the more plausible are the settings. The distance is |log r|, with r the ratio of dq/dt to
     qd in these units, plus a penalty for units other than SI.
 
-    is_far: True if q of a revolute joint has no stated unit and spans more than two turns if read in rad. Units in
-    which |q| exceeds two turns are then omitted.
+    is_far: True if q has no stated unit, and its range is too large for rad or m (see `find_units`). Units in which |q|
+    exceeds two turns, or 12.6 m, are then omitted.
     """
     mapping, joint = signals.trajectory.mapping, signals.joint
     # The ratio r of dq/dt to qd is known only if velocities were logged and are proportional to dq/dt. If it is
