@@ -570,7 +570,7 @@ def test_seconds_of_recorded_logs_show_a_coupling(shared):
     assert [x.where for x in notes if x.code == "coupled-motors"] == ["joint 'joint_6'"]
 
 
-@pytest.mark.parametrize("name", ["ga_N12T25", "ga_N12T25_again", "opt"])
+@pytest.mark.parametrize("name", ["ga_N12T25", "opt"])
 def test_degrees_of_a_recorded_arm_with_coarse_encoders_are_one_error(shared, name):
     """If angles of coarse encoders are logged in degrees, the only error is the unit: no signal is reported as frozen.
 
