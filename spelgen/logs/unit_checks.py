@@ -71,13 +71,15 @@ def find_units(signals: JointSignals) -> str | Advice | None:
     # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
     if signals.step > SIGNALS.slowest_step:
         return None
-    limit, range_text = (LONGEST, f"{LONGEST:g} m") if signals.kind == "prismatic" else (TURNS, "two turns")
+    limit, range_text, key = TURNS, "two turns", "counts_per_turn"
+    if signals.kind == "prismatic":
+        limit, range_text, key = LONGEST, f"{LONGEST:g} m", "counts_per_metre"
     is_far = np.ptp(signals.q) > limit and not signals.turns and mapping.unit("q", joint) is None
     message = f"q that changes {signals.factor:.3g} times as fast as qd"
     if is_far:
         message = f"q from {signals.q.min():.3g} to {signals.q.max():.3g}, more than {range_text}"
         if signals.is_whole:
-            message += " (whole numbers: counts of an encoder need 'counts_per_turn')"
+            message += f" (whole numbers: counts of an encoder need '{key}')"
             # Whole numbers may be counts of an encoder or degrees. Without velocities this is unknown: no unit is
             # advised.
             if not _knows_ratio(signals):
