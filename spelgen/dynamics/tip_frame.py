@@ -43,7 +43,9 @@ def load_frame(loaded: Arm) -> tuple[str, np.ndarray]:
     It is the tip link, or the link of the last joint if another body carries the tip link.
     """
     tip, body = tip_frame(loaded), loaded.chain.load_body
-    link = tip.link if tip.carrier == body else loaded.chain.bodies[body].link
+    if tip.carrier == body:
+        return tip.link, tip.pose
+    link = loaded.chain.bodies[body].link
     return link, link_poses(loaded)[link][1]
 
 

@@ -129,10 +129,9 @@ class DriveProblem:
 
         A joint at rest is omitted: dry friction carries a part of its load, and its neighbours shake it.
         """
-        joins, is_moving = self.speeds != 0, self.samples.motion[1].std(axis=0) > SAMPLES.moving
-        return np.flatnonzero(
-            varying(self.rows[..., -1]) & is_moving & ((joins | joins.T).sum(axis=0) == 1)
-        ).tolist()
+        joins = self.speeds != 0
+        is_single = (joins | joins.T).sum(axis=0) == 1
+        return np.flatnonzero(varying(self.rows[..., -1]) & self.samples.moving_joints & is_single).tolist()
 
     def of_torques(self, tau: np.ndarray) -> DriveProblem:
         """Return the least-squares problem with other joint torques, tau (S, n) [Nm, N], e.g. without a delay."""

@@ -76,7 +76,6 @@ class Hypothesis:
         samples: logged samples, with signals at E times around each sample if delays are tested. Delayed signals are
         interpolated between these times. The result has signals only at the time of each sample: its `values` are (S,
         n, 4, 1).
-        sample: the last axis of `values` has the length 1.
         """
         delays = _per_signal(self.delay)
         if self.drift.any():

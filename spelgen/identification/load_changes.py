@@ -70,13 +70,13 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
     subset = problem.selected(np.isin(problem.samples.recording, recordings)).thinned(SAMPLES)
     fit = subset.fit(subset.unchanged)
     rows, _ = subset.equations(subset.unchanged)
-    first, inertials, n = 10 * problem.arm.load_body, 10 * len(problem.arm.bodies), rows.shape[1]
+    of_load, inertials, n = _load_columns(problem), 10 * len(problem.arm.bodies), rows.shape[1]
     offsets = np.broadcast_to(np.eye(n), (len(rows), n, n))
     # The first effects of `FRICTION` are the armature, viscous and Coulomb friction.
     friction = rows[..., inertials + n : inertials + 3 * n]
     common, offset, other_friction, load = (
         _refit(subset, fit, columns, [subset.samples.recording == x for x in recordings])
-        for columns in (rows[..., :0], offsets, friction, rows[..., first : first + 4])
+        for columns in (rows[..., :0], offsets, friction, rows[..., of_load])
     )
     if load.misfit > min(offset.misfit, other_friction.misfit, common.misfit - GEOMETRY.needed):
         return []
@@ -91,12 +91,18 @@ def _changes(problem: GeometryProblem, recordings: Sequence[int]) -> list[LoadCh
         odds = 0.5 * change @ np.linalg.pinv(covariance, hermitian=True) @ change
         samples = subset.samples.recording == recording
         residual = load.residual[samples]
-        unchanged = residual - rows[samples, :, first : first + 4] @ change
+        unchanged = residual - rows[samples, :, of_load] @ change
         is_needed = np.square(unchanged).sum(axis=0) > 2 * np.square(residual).sum(axis=0)
         if odds > GEOMETRY.needed and is_needed.any():
             deviation = float(np.sqrt(covariance[0, 0]))
             changes.append(LoadChange(recording, recordings[reference], float(change[0]), deviation))
     return changes
+
+
+def _load_columns(problem: GeometryProblem) -> slice:
+    """Return the columns of the regressor that belong to the mass and the first moment of a load."""
+    first = 10 * problem.arm.load_body
+    return slice(first, first + 4)
 
 
 class TorqueChange(NamedTuple):
@@ -201,7 +207,7 @@ def _change(
     recording, time, joint: see `Candidate`.
     """
     rows, _ = problem.equations(problem.unchanged)
-    first, inertials, n = 10 * problem.arm.load_body, 10 * len(problem.arm.bodies), rows.shape[1]
+    inertials, n = 10 * len(problem.arm.bodies), rows.shape[1]
     chosen = np.arange(n) if joint == n else np.array([joint])
     in_recording = (problem.samples.recording == recording)[:, None, None]
     late = in_recording * (problem.samples.times[:, None, None] >= time)
@@ -230,7 +236,7 @@ def _change(
     )
     viscous = inertials + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
     friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
-    alternatives = rows[..., first : first + 4] * late, np.concatenate([friction, drift], axis=2)
+    alternatives = rows[..., _load_columns(problem)] * late, np.concatenate([friction, drift], axis=2)
     return min(_refit(problem, fit, x, all_samples).misfit for x in alternatives) - best.misfit, change
 
 

@@ -25,6 +25,7 @@ from spelgen.logs.dynamics_samples import (
 )
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory
+from spelgen.logs.tuning import SAMPLES
 
 # [samples at 100 Hz] To test delays, each sample stores its signals also at these times before and after it, every
 # 20 ms. Values between these times can be interpolated, because the signals are low-pass filtered.
@@ -76,6 +77,11 @@ class MotionSamples(NamedTuple):
     def tau(self) -> np.ndarray:
         """Joint torques at the samples, (S, n) [Nm, N]."""
         return self.central[..., 3]
+
+    @property
+    def moving_joints(self) -> np.ndarray:
+        """Mask (n,) of the joints that are not at rest: their velocity varies."""
+        return np.asarray(self.motion[1].std(axis=0) > SAMPLES.moving)
 
     @property
     def central(self) -> np.ndarray:

@@ -116,6 +116,7 @@ def _payload(theta: np.ndarray, spread: np.ndarray, log_odds: float, limit: floa
 
     theta: inertial parameters in the frame, (10,). spread: covariance of theta. log_odds, limit, frame: see `Payload`.
     """
+    # `limit` is the mass plus the quantile times its standard deviation, in any frame.
     quantile = (limit - theta[0]) / math.sqrt(spread[0, 0])
     # Intervals are computed from the derivatives of mass, centre of mass and inertia with respect to theta (delta
     # method). Complex-step derivatives have no cancellation errors (Squire and Trapp, SIAM Review 40:110, 1998).

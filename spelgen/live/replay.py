@@ -161,12 +161,13 @@ def replay(fit: Fit, logs: Sequence[Trajectory], alarms_per_minute: float | None
     """
     require_torques(logs)
     joints, results = fit.model.joint_names, []
+    units = torque_units(joints, fit.model.joint_types)
     check(logs, joints, joint_kinds(fit.model.joints))
     estimator = Estimator(fit, alarms_per_minute=alarms_per_minute or TUNING.alarms_per_minute)
     for log in logs:
         estimator.reset()
         states = estimator.replay(log)
-        unused, units = sum(estimator.refused.values()), torque_units(joints, fit.model.joint_types)
+        unused = sum(estimator.refused.values())
         largest, limit = np.abs(log.tau).max(axis=0), estimator.levels.effort * estimator.levels.saturation
         pairs = zip(joints, largest.tolist(), limit.tolist(), strict=True)
         limits = {joint: f"{top:.3g} (limit {most:.3g})" for joint, top, most in pairs if top >= most}

@@ -14,7 +14,6 @@ from spelgen.identification.continuous_faults import Gravity, ZeroOffset
 from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
-from spelgen.logs.tuning import SAMPLES
 from spelgen.settings.log_mapping import LogMapping
 
 UNEXPLAINED = "torque-unexplained"
@@ -104,7 +103,7 @@ def find_unexplained(
     do = "check each recording by itself, and " * bool(np.ptp(problem.samples.recording)) + (
         "check that the columns are the torques of these joints, with their sign and at the times of the positions"
     )
-    if best is None or not (wrong & _moving_joints(problem)).any():
+    if best is None or not (wrong & problem.unchanged.signals(problem.samples).moving_joints).any():
         return Diagnostic("warning", UNEXPLAINED, where, None, f"{got}; {do}")
     expected = "joint torques of a rigid arm with friction"
     return LogError(got, element=where, expected=expected, do=do, codes=(UNEXPLAINED,))
@@ -127,7 +126,7 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)
     of_urdf = signals.tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
-    is_moving = _moving_joints(problem)
+    is_moving = problem.unchanged.signals(problem.samples).moving_joints
     weights = np.stack([signals.tau.var(axis=0) + 1e-30, is_moving + 1e-30])
     mean = float((weights @ errors / weights.sum(axis=1)).max())
     if mean > GEOMETRY.no_torque:
@@ -135,12 +134,6 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     is_loaded = of_urdf.std(axis=0) > 0.5 * signals.tau.std(axis=0)
     wrong = (errors > GEOMETRY.no_torque) & is_moving & is_loaded
     return wrong, float(errors[wrong].max(initial=0.0))
-
-
-def _moving_joints(problem: GeometryProblem) -> np.ndarray:
-    """Return the mask (n,) of the joints that are not at rest: their velocity varies."""
-    velocities = problem.unchanged.signals(problem.samples).motion[1]
-    return np.asarray(velocities.std(axis=0) > SAMPLES.moving)
 
 
 def _place(correction: Correction, fault: Fault) -> str:
