@@ -187,6 +187,10 @@ def _weighed(
     For a hypothesis with another delay than `base`, the decrease is min(a, b): hysteresis resembles a delay, so such a
     hypothesis must lower both costs.
 
+    If the model with hysteresis explains the torques of moving joints under `base` (`GEOMETRY.exact`), a lower torque
+    residual may be due to errors of the friction model. The decrease of a hypothesis without other delays is then 0
+    unless `_is_certain`.
+
     Args:
         problem: problem without hysteresis.
         stateful: the same problem with hysteresis.
@@ -197,15 +201,46 @@ def _weighed(
     """
     best = sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)
-    plain, least = problem.fit(present).cost, stateful.fit(present).cost
+    plain, least = problem.fit(present), stateful.fit(present)
+    # The torque of a joint at rest may vary less than its noise, and is then not explained by any model.
+    moving = present.signals(problem.samples).moving_joints
+    is_exact = least.errors[moving].max(initial=0.0) < GEOMETRY.exact
     for k, fit in enumerate(best):
-        change, hypothesis = fit.cost - plain, fit.hypothesis
+        change, hypothesis = fit.cost - plain.cost, fit.hypothesis
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:
-            other = stateful.fit(hypothesis).cost - least
+            other_fit = stateful.fit(hypothesis)
+            other = other_fit.cost - least.cost
             is_late = (np.append(hypothesis.delay, hypothesis.drift) != times).any()
             change = max(other, change if is_late else min(change, other / 2))
+            moved = moving | hypothesis.signals(problem.samples).moving_joints
+            if is_exact and not is_late and not _is_certain((plain, fit), (least, other_fit), moved):
+                change = 0.0
         best[k] = replace(fit, cost=base.cost + change)
     return best
+
+
+def _is_certain(
+    plain: tuple[HypothesisFit, HypothesisFit],
+    stateful: tuple[HypothesisFit, HypothesisFit],
+    moving: np.ndarray,
+) -> bool:
+    """Return True if a hypothesis is better than another one by more than errors of the friction model explain.
+
+    It must concern joints that move. If it does not exchange joints, it must also have more plausible parameters in
+    both models, by `GEOMETRY.ambiguous`, or lower the squared residual of a joint to a tenth.
+
+    plain, stateful: fits of the other hypothesis and of this one, without and with hysteresis. moving: (n,) mask.
+    """
+    old, new = (fit.hypothesis for fit in plain)
+    exchanged = (old.source != new.source).any(axis=0)
+    if exchanged.any():
+        return bool(moving[exchanged].all())
+    changed = (old.scale != new.scale).any(axis=0) | (old.offset != new.offset)
+    if changed.any() and not moving[changed].any():
+        return False
+    gain = min(before.penalties - after.penalties for before, after in (plain, stateful))
+    is_lower = stateful[1].errors < 0.1 * stateful[0].errors
+    return gain > GEOMETRY.ambiguous or bool(is_lower[moving].any())
 
 
 def _with_likely_senses(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisFit:

@@ -132,6 +132,11 @@ class HypothesisFit:
     errors: np.ndarray
 
     @property
+    def penalties(self) -> float:
+        """Contribution of implausible parameters to the cost, for example of negative rotor inertias."""
+        return self.cost - self.misfit
+
+    @property
     def rank(self) -> float:
         """Cost plus penalties for rare faults; the hypothesis of lowest rank is preferred."""
         return self.cost + sum(fault.rarity for fault in self.hypothesis.faults)

@@ -14,6 +14,7 @@ import numpy as np
 from spelgen.identification.hypotheses import HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.tuning import GEOMETRY
+from spelgen.logs.tuning import SAMPLES as MOTION
 
 TOGETHER = 20
 """Number of recordings that are compared at a time. It bounds the number of columns of the least-squares problem."""
@@ -127,10 +128,12 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
 
     A change is another factor on the torque of one joint, a common factor on the torques of all joints, or another
-    offset of the torque of one joint, from a time on; or another factor in a whole recording. Two other hypotheses are
-    fitted: another load from this time on (the arm picks it up), and other friction from this time on together with
-    offsets that drift (warm drives, drifting sensors). A change is returned only if its negative log likelihood is
-    lower by `GEOMETRY.needed` than without a change and than under both other hypotheses.
+    offset of the torque of one joint, from a time on; or another factor in a whole recording. A single joint must move
+    before and after the change, since dry friction or a brake may carry any part of the load of a joint at rest.
+
+    Two other hypotheses are fitted: another load from this time on (the arm picks it up), and other friction from this
+    time on together with offsets that drift (warm drives, drifting sensors). A change is returned only if its negative
+    log likelihood is lower by `GEOMETRY.needed` than without a change and than under both other hypotheses.
     """
     subset = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
     fit = subset.fit(subset.unchanged)
@@ -142,7 +145,7 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
         counted = np.broadcast_to(np.arange(tau.shape[1]) != k, tau.shape)
         torque[:, k] = rows[:, k] @ subset.on_torques(counted).fit(subset.unchanged).parameters
     residual = torque - tau
-    number = subset.samples.recording
+    number, velocities = subset.samples.recording, subset.samples.motion[1]
     candidates = list[Candidate]()
     for recording in np.unique(number).tolist():
         # Possible times of the change: after 10 %, 15 %, ..., 90 % of the samples of the recording, so that there are
@@ -154,11 +157,12 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
         if min(len(within), len(outside)) >= FEWEST:
             cases.append((np.append(outside, within), np.array([len(outside)]), np.zeros(1)))
         for chosen, counts, starts in cases:
+            is_moving = _moves_on_both_sides(velocities[chosen], counts)
             falls = _falls(torque[chosen], residual[chosen], counts)
             falls = falls / np.maximum(tau.var(axis=0), 1e-30) / len(tau)
             errors = np.maximum(fit.errors - falls, 0.0) + GEOMETRY.error_floor
             misfits = subset.count / 2 * np.log(errors / (fit.errors + GEOMETRY.error_floor))
-            misfits = np.column_stack([misfits, misfits.sum(axis=1)])
+            misfits = np.column_stack([np.where(is_moving, misfits, 0.0), misfits.sum(axis=1)])
             for joint, split in enumerate(misfits.argmin(axis=0).tolist()):
                 candidates.append((float(misfits[split, joint]), recording, float(starts[split]), joint))
     # The exact comparison takes time: it is made for six changes, and omitted if the residual shows hardly any change.
@@ -166,6 +170,16 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     changes = [_change(subset, fit, *candidate) for candidate in likely]
     fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
     return change if fall > GEOMETRY.needed else None
+
+
+def _moves_on_both_sides(velocities: np.ndarray, splits: np.ndarray) -> np.ndarray:
+    """Return the mask (C, n) of the joints that move both before and after each of C times.
+
+    velocities: (S, n) [rad/s, m/s]. splits: (C,) numbers of samples before each time.
+    """
+    parts = [(velocities[:count], velocities[count:]) for count in splits]
+    speeds = np.array([[part.std(axis=0) for part in pair] for pair in parts])
+    return np.asarray((speeds > MOTION.moving).all(axis=1))
 
 
 def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
@@ -234,8 +248,10 @@ def _change(
     drift = (
         offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
     )
-    viscous = inertials + n  # the first effects of `FRICTION` are the armature, viscous and Coulomb friction
-    friction = rows[..., np.concatenate([viscous + chosen, viscous + n + chosen])] * late
+    # All columns after those of the inertial parameters and of the armature belong to friction, the columns of viscous
+    # and Coulomb friction first. Bristles are omitted if the zero changes, since they could imitate an offset.
+    friction = rows[..., inertials + n : inertials + 3 * n if offset else None]
+    friction = friction[..., friction[:, chosen].any(axis=(0, 1))] * late
     alternatives = rows[..., _load_columns(problem)] * late, np.concatenate([friction, drift], axis=2)
     return min(_refit(problem, fit, x, all_samples).misfit for x in alternatives) - best.misfit, change
 

@@ -56,13 +56,18 @@ class TorqueUnit(WrongScale):
         its own factor (see `_separate`). The other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
-        candidates = [] if is_found else [x.copy() for x in self._torque_factors]
+        fitted, of_urdf = problem.gravity_torques(base)
+        ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
+        # The candidates are ratios of gravity torques that were fitted without hysteresis, which resembles gravity in
+        # small motions. They are omitted if the fit with hysteresis has masses near the URDF's.
+        moving = base.hypothesis.signals(problem.samples).moving_joints
+        is_right = ratio > 0 and not is_other_unit(ratio)
+        is_right &= base.errors[moving].max(initial=0.0) < GEOMETRY.exact
+        candidates = [] if is_found or is_right else [x.copy() for x in self._torque_factors]
         if is_open.all():
             # The ratio of the fitted gravity torque to the URDF's depends on the other corrections of `base`, such as
             # reversed or exchanged joints. The factor 1 / ratio is therefore computed for each `base`. If `base` has a
             # torque factor already, a negative ratio shows that the sign of this factor is wrong.
-            fitted, of_urdf = problem.gravity_torques(base)
-            ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
             if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
                 candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
             # If the log has another fault, such as another zero, its torques may not show the gravity of the URDF.

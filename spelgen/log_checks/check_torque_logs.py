@@ -472,15 +472,16 @@ def _without_gravity(problem: GeometryProblem, joints: Sequence[JointReport]) ->
     if not suspicious:
         return
     problem = problem.thinned(GEOMETRY.confirming_samples)
-    fit = problem.fit(problem.unchanged)
+    problems = [(x, x.fit(x.unchanged)) for x in (problem, problem.with_hysteresis())]
     for k, name, deviation, correlation in suspicious:
         # The torque of a joint is reported to have no gravity if the cost without gravity at this joint is lower. It
         # must be lower by more than `rarity`, the penalty of a rare fault, if the model with gravity fits the torque
         # (residual of at most 10 % of its variance): a wrong centre of mass of the last link also lowers the gravity
         # torque. In a free swing the inertial torque balances gravity, so that the torque does not vary with gravity.
-        needed = 0.0 if fit.errors[k] > 0.1 else TorqueUnit.rarity
-        without = problem.without_gravity(k).fit(problem.unchanged).cost
-        if without < fit.cost - needed:
+        # Friction with hysteresis resembles gravity in small motions, so both must hold with it, too.
+        gains = [fit.cost - x.without_gravity(k).fit(x.unchanged).cost for x, fit in problems]
+        needed = 0.0 if problems[0][1].errors[k] > 0.1 else TorqueUnit.rarity
+        if min(gains) > needed:
             message = (
                 f"tau does not move with gravity: their correlation is {correlation:.2g}, while the URDF's gravity "
                 f"torque varies {deviation:.2g} times as much as tau"
@@ -494,9 +495,11 @@ def _link_notes(problem: GeometryProblem, mapping: LogMapping, fit: HypothesisFi
     The first moment is the mass times the centre of mass. The ratio is the least-squares ratio of the torque due to the
     fitted value to the torque due to the URDF's value. The difference of both torques must also be significant at a
     joint (more than half the standard deviation of its torque), and the ratio must differ from 1 by four of its
-    standard deviations.
+    standard deviations. The model has friction with hysteresis, which resembles gravity in small motions.
     """
-    rows, _ = problem.equations(fit.hypothesis)
+    stateful = problem.thinned(GEOMETRY.confirming_samples).with_hysteresis()
+    fit = stateful.fit(fit.hypothesis)
+    rows, _ = stateful.equations(fit.hypothesis)
     torque = problem.unchanged.signals(problem.samples).tau.std(axis=0)
     for k, body in enumerate(problem.arm.bodies):
         quantities = {

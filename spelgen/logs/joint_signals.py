@@ -382,9 +382,9 @@ def find_elastic(signals: JointSignals) -> str | None:
     ones = np.ones_like(frequency)
     rigid, _ = _relative_error([ones, frequency**-2.0], inertia)
     candidates = []
-    # Candidates for the resonance range up to 1.5 times the highest excited frequency. A higher resonance does not
-    # change the apparent inertia noticeably.
-    for resonance in np.geomspace(frequency[0], 1.5 * frequency[-1], 120):
+    # Candidates for the resonance range from 3 Hz, below which friction with hysteresis acts as a spring, up to 1.5
+    # times the highest excited frequency. A higher resonance does not change the apparent inertia noticeably.
+    for resonance in np.geomspace(3.0, max(3.0, 1.5 * frequency[-1]), 120):
         # The apparent inertia H(f) is fitted after multiplication by 1 - (f / f_0)^2: the pole of H at the resonance
         # f_0 would otherwise give a frequency band close to f_0 too much weight.
         factor = 1 - (frequency / resonance) ** 2
