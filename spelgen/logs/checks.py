@@ -12,7 +12,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
+from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.labels import counted
 from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.joint_signals import (
@@ -87,10 +87,10 @@ class Findings:
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
-    errors: list[SpelgenError] = field(default_factory=list)
+    errors: list[LogError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
 
-    def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
+    def extend(self, findings: Iterable[Diagnostic | LogError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
         for finding in findings:
             if isinstance(finding, Diagnostic):
