@@ -1,6 +1,6 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
-The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.covariance`) is propagated
+The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.posterior`) is propagated
 to first order: the variance of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted
 torque also includes the squared residual of held-out samples.
 """
