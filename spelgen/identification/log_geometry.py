@@ -474,13 +474,13 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
 
 def _variance(tau: np.ndarray) -> np.ndarray:
     """Return the variance (n,) of torques (S, n); infinity for a constant torque, which then has the weight zero."""
-    return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
+    return np.where(varying(tau), tau.var(axis=0), np.inf)
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric positive definite matrix (K, K), which is first scaled to a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
-    return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
+    return np.linalg.inv(scaled) / np.outer(scale, scale)
 
 
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
