@@ -6,7 +6,6 @@ torque also includes the squared residual of held-out samples.
 """
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +20,7 @@ from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.drive_quantities import DriveQuantity, torque_drive_quantities
+from spelgen.fitting.drive_quantities import DriveQuantity, ModelFunction, torque_drive_quantities
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.identification.intervals import PRECISE, Interval, base_unit, interval_listing
@@ -67,7 +66,7 @@ class Posterior:
     torque_std: np.ndarray | None
     delay: Interval | None = None
 
-    def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
+    def uncertain(self, function: ModelFunction) -> Uncertain:
         """Return the value (...) of a function of the model, and its standard deviations.
 
         Example of a function: ``lambda model: model.armature``.
@@ -75,7 +74,7 @@ class Posterior:
         value, root = self.propagate(function)
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
-    def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
+    def propagate(self, function: ModelFunction) -> Propagated:
         """Return the value (...) of a function of the model, and a square root J R of its covariance, (..., k).
 
         J is the Jacobian of the function with respect to the fitted parameters, computed by central differences. R has
@@ -271,7 +270,7 @@ class Posterior:
         """Values of the r base parameters, (r,), with a square root (r, k) of their covariance, see `Propagated`."""
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
-    def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+    def _drive_quantities(self) -> tuple[list[DriveQuantity], ModelFunction]:
         """Return the constants of drives that have 95 % intervals, and the function that computes their values.
 
         The constants are armature, friction, torque offset and motor gain (see `torque_drive_quantities`). The function

@@ -3,7 +3,6 @@
 Damping, friction and other quantities are determined only relative to kp.
 """
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from spelgen.emission.assemble import ArmModel
-from spelgen.fitting.drive_quantities import DriveQuantity, friction_line
+from spelgen.fitting.drive_quantities import DriveQuantity, ModelFunction, friction_line
 from spelgen.fitting.posterior import Posterior, Propagated
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.parameters import DELAY
@@ -150,7 +149,7 @@ class ServoPosterior(Posterior):
         common = [] if self._scale_index is None else ["a common factor of kp and all masses"]
         return (*super().unidentifiable, *pairs, *common)
 
-    def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+    def _drive_quantities(self) -> tuple[list[DriveQuantity], ModelFunction]:
         """Return the quantities of the servos that have intervals, and the function that returns their values.
 
         The quantities are kp, kd/kp, lag (kd/kp plus the delay), armature/kp, coulomb/kp, dead zone (half its width),
