@@ -75,7 +75,7 @@ class GeometryProblem:
         return self._with(samples=self.samples.part(rows), _equations={})
 
     def _with(self, **changes: object) -> GeometryProblem:
-        """Return a copy with other attributes. It shares the cached equations, unless these are changed, too."""
+        """Return a copy with other attributes; the cached equations are shared, unless they are changed, too."""
         other = copy(self)
         vars(other).update(changes)
         return other
