@@ -76,9 +76,9 @@ class GeometryProblem:
 
     def _with(self, **changes: object) -> GeometryProblem:
         """Return a copy with other attributes; the cached equations are shared, unless they are changed, too."""
-        other = copy(self)
-        vars(other).update(changes)
-        return other
+        changed = copy(self)
+        vars(changed).update(changes)
+        return changed
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem in which only some of the torques are fitted.

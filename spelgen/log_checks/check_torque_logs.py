@@ -192,14 +192,14 @@ class TorqueLogs:
         findings = self._tested(agreeing, samples, evidence, accepted)
         if findings.errors and 2 * len(agreeing) > len(self._sources):
             return findings
-        others = [self._tested([k], samples, evidence, accepted) for k in deviating]
+        of_deviating = [self._tested([k], samples, evidence, accepted) for k in deviating]
         # If all recordings have errors, they may have the same fault, which is clearest in all recordings together.
-        if findings.errors and all(x.errors for x in others):
+        if findings.errors and all(x.errors for x in of_deviating):
             together = self._tested(range(len(self._sources)), samples, evidence, accepted)
             if together.errors:
                 return together
         errors = [self._of_recordings(error, agreeing) for error in findings.errors]
-        for k, tested in zip(deviating, others, strict=True):
+        for k, tested in zip(deviating, of_deviating, strict=True):
             errors += [self._of_recordings(error, [k]) for error in tested.errors]
         if unfiltered and deviating and not (errors or loads):
             errors = self._torque_changes(unfiltered)
@@ -311,7 +311,7 @@ class TorqueLogs:
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
         """
-        found, motion = Findings(), problem.unchanged.signals(problem.samples).motion[0]
+        findings, motion = Findings(), problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
         # A motion may only seem small because the mapping states a wrong unit of positions. Logs with a stated unit are
         # therefore tested even if their motion is small.
@@ -323,22 +323,22 @@ class TorqueLogs:
             small = "most joints move one way only"
         if small:
             message = f"{small}: too little motion to test senses, order, zeros, units and gravity"
-            found.notes.append(Diagnostic("warning", SMALL_MOTION, "logs", None, message))
-            return found
+            findings.notes.append(Diagnostic("warning", SMALL_MOTION, "logs", None, message))
+            return findings
         # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit
         # contradict all torques.
         if not self._guessed and UNSIGNED not in accepted:
-            found.errors += find_unsigned(problem)
-        if not found.errors and not self._guessed:
+            findings.errors += find_unsigned(problem)
+        if not findings.errors and not self._guessed:
             limits = find_limits(problem, flat)
-            found.notes += limits.notes
+            findings.notes += limits.notes
             if CLIPPED not in accepted:
-                found.errors += limits.errors
-        if not found.errors and CHANGED not in accepted:
-            found.errors += self._torque_changes(problem)
-        if not found.errors:
-            found.extend(self._compared(problem, evidence, accepted))
-        return found
+                findings.errors += limits.errors
+        if not findings.errors and CHANGED not in accepted:
+            findings.errors += self._torque_changes(problem)
+        if not findings.errors:
+            findings.extend(self._compared(problem, evidence, accepted))
+        return findings
 
     def _compared(
         self, problem: GeometryProblem, evidence: Sequence[JointEvidence], accepted: set[str]
