@@ -92,7 +92,7 @@ class Excitation:
         start = ", ".join(f"{x:.3g}" for x in self.approach.q[0])
         moved = f"Approach of {self.approach.t[-1]:.3g} s from {start}."
         note = f"{moved} The motion starts and ends at rest. {self.collisions} {ADVICE}"
-        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), note)
+        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, rows, note)
 
     def csv(self) -> str:
         """Return the motion as CSV with the columns t, q_<joint>, qd_<joint> and qdd_<joint>, with nine decimals."""

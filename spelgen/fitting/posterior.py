@@ -216,11 +216,10 @@ class Posterior:
         note += f"Unidentifiable on their own: {', '.join(self.unidentifiable) or 'none'}."
         title = f"Base parameters [{self.base_units}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
-        drives = tuple(zip(*columns.values(), strict=True))
         note_delay = "" if self.delay is None else f"{self.delay.name.capitalize()}: {self.delay.text} s."
         return (
             interval_listing(title, determined, note),
-            Listing("Drives, with half 95 % intervals", tuple(columns), drives, note_delay),
+            Listing.of_columns("Drives, with half 95 % intervals", columns, note_delay),
         )
 
     def to_dict(self) -> Content:

@@ -540,4 +540,4 @@ def _following_table(joints: Sequence[JointReport]) -> Listing:
         "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
         "kp (u - q) beyond the effort limit, if kp is set."
     )
-    return Listing("Following", head, tuple(rows), note)
+    return Listing("Following", head, rows, note)

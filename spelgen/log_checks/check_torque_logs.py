@@ -582,4 +582,4 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
         "variance that gravity explains, in addition to friction and acceleration; x URDF: ratio to the URDF's gravity "
         "torque."
     )
-    return Listing("Physics", head, tuple(rows), note)
+    return Listing("Physics", head, rows, note)
