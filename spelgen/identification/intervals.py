@@ -126,7 +126,7 @@ def jackknife_covariance(curvature: Tensor, descent: Tensor, prior: Tensor) -> t
     """
     count, hessian = len(curvature), curvature.sum(dim=0) + prior
     # the total gradient is zero at the estimate, so that the gradient without a block is minus the block's gradient
-    steps = torch.linalg.solve(hessian - curvature, -descent)
+    steps = torch.linalg.solve(hessian - curvature, -descent.unsqueeze(-1)).squeeze(-1)
     centred, inverse = steps - steps.mean(dim=0), torch.linalg.inv(hessian)
     return steps, (count - 1) / count * centred.mT @ centred + inverse @ prior @ inverse
 
