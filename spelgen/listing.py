@@ -3,11 +3,11 @@
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import zip_longest
-from typing import Literal
+from typing import Literal, Self
 
 WIDTH = 80
 MIN_NAME = 8
@@ -30,9 +30,14 @@ class Listing:
 
     title: str
     head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Sequence[tuple[str, ...]]
     note: str = ""
     left: tuple[int, ...] = (0,)
+
+    @classmethod
+    def of_columns(cls, title: str, columns: Mapping[str, Iterable[str]], note: str) -> Self:
+        """Return a table of columns: {head: cells}; the first column has the names of the rows."""
+        return cls(title, tuple(columns), list(zip(*columns.values(), strict=True)), note)
 
     def text(self) -> str:
         """Return the table as text for a terminal or a file, without a final line end."""

@@ -114,7 +114,7 @@ def motor_speeds(inputs: np.ndarray) -> np.ndarray:
     # the speed on the joint side of the gear.
     largest = np.take_along_axis(inputs, np.abs(inputs).argmax(axis=0)[None], axis=0)
     passive = largest == 0
-    return np.asarray((inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float)))
+    return (inputs / np.where(passive, 1.0, largest)).T + np.diag(passive[0].astype(float))
 
 
 def derive_actuation(robot: Robot, settings: Settings, joints: Sequence[str]) -> Actuation:

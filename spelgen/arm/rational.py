@@ -84,7 +84,7 @@ def rotation_from_rpy(rpy: Sequence[float]) -> np.ndarray:
 def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation (3, 3), float64, by ``angle`` [rad] about the unit vector ``axis`` (3,) (Rodrigues)."""
     cross = np.cross(np.eye(3), axis)
-    return np.asarray(np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross))
+    return np.eye(3) + sin(angle) * cross + (1.0 - cos(angle)) * (cross @ cross)
 
 
 def alignment(axis: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from spelgen.dynamics.equations import MotionEquations, equations_of
 from spelgen.dynamics.protocol import RigidDynamics, is_stateful, memory_after, sliding_memory
 from spelgen.logs.trajectory import LogRows
 from spelgen.logs.windows import Windows, thinned
+from spelgen.runtime.parts import applied
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 GAMMA = 1 - 0.5**0.5  # The Rosenbrock method is L-stable with this parameter.
@@ -88,7 +89,7 @@ def _stepper(
         A disturbance that is an acceleration is multiplied by M. pose: mass matrix and forces at the positions q. qd:
         velocities, (W, n). tau: joint torques, (W, n). z: friction state.
         """
-        added = disturbance if is_force else (pose.mass @ disturbance.unsqueeze(-1)).squeeze(-1)
+        added = disturbance if is_force else applied(pose.mass, disturbance)
         return pose.force(qd, tau, z) + added
 
     def step(state: State, tau: Tensor, step: Tensor) -> State:
@@ -130,7 +131,7 @@ def _stepper(
         force = forces(second, qd2, tau, memory_after(dynamics, z, q2 - q))
         # solve_ex raises no error, so that a singular matrix in one window does not stop the other windows.
         a2 = torch.linalg.solve_ex(second.mass, force)[0] - 2 * a1
-        v2, a2 = solve(qd2 - 2 * v1, (pose.mass @ a2.unsqueeze(-1)).squeeze(-1))
+        v2, a2 = solve(qd2 - 2 * v1, applied(pose.mass, a2))
         end = q + step * (1.5 * v1 + 0.5 * v2)
         speed = qd + step * (1.5 * a1 + 0.5 * a2)
         return end, speed, memory_after(dynamics, z, end - q)

@@ -155,7 +155,7 @@ class Formulas:
         rows = []
         for row in self.rows:
             rows.append((row.name, row.omission if row.expression is None else text(row.expression)))
-        return Listing(f"{self.arm.name}: closed forms", ("", ""), tuple(rows), left=(0, 1)).html()
+        return Listing(f"{self.arm.name}: closed forms", ("", ""), rows, left=(0, 1)).html()
 
 
 def formulas(

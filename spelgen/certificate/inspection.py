@@ -118,7 +118,7 @@ class Inspection:
         title = f"{self.arm.name}: mass matrix; joints each entry depends on, C constant, 0 always zero"
         head = ("", *map(str, range(1, n + 1)))
         note = "; ".join(f"{name}: {need}" for name, need in self.needs().items())
-        return Listing(title, head, tuple(rows), note).html()
+        return Listing(title, head, rows, note).html()
 
     def _names(self, joints: Iterable[int]) -> list[str]:
         return [self.structure.joints[joint] for joint in joints]

@@ -78,7 +78,7 @@ class Verification:
     def _repr_html_(self) -> str:
         rows = [(check.fact, check.derived, check.found, check.verdict) for check in self.checks]
         head = ("fact", "derived", "found", "")
-        return Listing(f"Verified by {self.means}", head, tuple(rows), left=(0, 1, 2, 3)).html()
+        return Listing(f"Verified by {self.means}", head, rows, left=(0, 1, 2, 3)).html()
 
     def to_dict(self) -> dict[str, object]:
         """Return the verification as a JSON object."""

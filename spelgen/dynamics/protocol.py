@@ -4,18 +4,14 @@ Functions such as `memory_after` return the friction state z after a motion. The
 friction state, for which z is empty.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import torch
+from torch import Tensor
 
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.runtime.residual_terms import ResidualDynamics, ResidualTerms
 from spelgen.runtime.rigid_body_dynamics import RigidBodyDynamics
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class RigidDynamics(Protocol):

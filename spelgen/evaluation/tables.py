@@ -88,7 +88,7 @@ def summary(results: Results) -> Listing | None:
         # The row of the mass matrix M is shown only if the true M is known.
         if values:
             lines.append((label, *("-" if value is None else share(value) for value in numbers)))
-    return Listing(f"{results.robot} on the test logs", ("", *names), tuple(lines))
+    return Listing(f"{results.robot} on the test logs", ("", *names), lines)
 
 
 def _horizon_tables(results: Results) -> list[Listing]:

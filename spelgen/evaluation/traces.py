@@ -24,6 +24,7 @@ from spelgen.labels import MODEL, is_drawn
 from spelgen.logs.dynamics_samples import DynamicsSamples
 from spelgen.logs.trajectory import Trajectory, coverage, joined_column
 from spelgen.logs.windows import Windows
+from spelgen.runtime.parts import applied
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 
 
@@ -359,7 +360,7 @@ def _torque_trace(dynamics: Mapping[str, RigidDynamics], samples: DynamicsSample
             inputs = model.input_matrix(q).numpy()
         gravity = model.gravity(q)
         curves = {
-            "inertia": (model.mass_matrix(q) @ qdd.unsqueeze(-1)).squeeze(-1).numpy(),
+            "inertia": applied(model.mass_matrix(q), qdd).numpy(),
             "Coriolis": (model.nonlinear_effects(q, qd) - gravity).numpy(),
             "gravity": gravity.numpy(),
             "friction": model.friction_torque(q, qd, *friction_past(model, samples)).numpy(),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spelgen.arm.arm import Chain
-from spelgen.excitation.trajectory import Motion
+from spelgen.excitation.trajectory import Motion, motion_columns
 from spelgen.listing import WIDTH, Listing
 
 ADVICE = "View the motion, then run it slowly: a load, cables and anything else around the arm are unknown."
@@ -92,14 +92,12 @@ class Excitation:
         start = ", ".join(f"{x:.3g}" for x in self.approach.q[0])
         moved = f"Approach of {self.approach.t[-1]:.3g} s from {start}."
         note = f"{moved} The motion starts and ends at rest. {self.collisions} {ADVICE}"
-        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, tuple(rows), note)
+        return Listing("Ranges [rad or m, s]; effort by the URDF's inertials", head, rows, note)
 
     def csv(self) -> str:
         """Return the motion as CSV with the columns t, q_<joint>, qd_<joint> and qdd_<joint>, with nine decimals."""
-        names = self.arm.joint_names
-        head = ["t", *(f"{quantity}_{name}" for quantity in ("q", "qd", "qdd") for name in names)]
         motion, file = self.motion, io.StringIO()
-        csv.writer(file, lineterminator="\n").writerow(head)
+        csv.writer(file, lineterminator="\n").writerow(motion_columns(self.arm.joint_names))
         rows = np.concatenate([motion.t[:, None], motion.q, motion.qd, motion.qdd], axis=1)
         np.savetxt(file, np.round(rows, 9) + 0.0, "%.9f", ",")  # The zero that is added turns -0 into 0.
         return file.getvalue()

@@ -5,6 +5,7 @@ Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13:730 (1
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, cos, pi, sqrt
 
@@ -19,6 +20,11 @@ from spelgen.excitation.tuning import TUNING
 # [1] Lower bound of the ratio of two maxima of a Fourier series: at the grid points, and at all times. The grid has
 # `TUNING.grid` points per period of the highest harmonic. Source: Ehlich and Zeller, Math. Z. 86:41, 1964.
 GRID_RATIO = cos(pi / TUNING.grid)
+
+
+def motion_columns(joints: Sequence[str]) -> list[str]:
+    """Return the columns of a file with a motion of the joints: t, and for each joint its q, qd and qdd."""
+    return ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Drive constants with 95 % intervals: armature, friction (a straight line over velocity), torque offset, gain."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -11,6 +11,9 @@ from spelgen.dynamics.parameters import friction_factor
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.runtime.motors import MotorInputs
+
+ModelFunction: TypeAlias = Callable[[ArmModel], Tensor]
+"""A function that computes values from the parameters of a model."""
 
 
 class DriveQuantity(NamedTuple):
@@ -36,7 +39,7 @@ TORQUE_UNITS = {
 """Unit of each constant of drives whose input is a torque, as a format string for `UNITS`."""
 
 
-def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], ModelFunction]:
     """Return the constants of drives whose input is a torque, and the function that returns their values.
 
     The constants are armature, viscous friction, Coulomb friction, torque offset and, if motor gains are trained, gain.
@@ -63,7 +66,7 @@ def torque_drive_quantities(model: ArmModel) -> tuple[list[DriveQuantity], Calla
     return quantities, constants
 
 
-def friction_line(model: ArmModel) -> Callable[[ArmModel], Tensor]:
+def friction_line(model: ArmModel) -> ModelFunction:
     """Return a function: model -> its viscous and Coulomb friction coefficients, (2, n) [Nm s/rad, N s/m; Nm, N].
 
     The coefficients are the slope and the intercept of a straight line, fitted by least squares to the friction torque

@@ -225,7 +225,7 @@ class Fit:
             ("result", self.result),
             *((name.replace("_", " "), f"{value}") for name, value in self.record.options.items()),
         ]
-        return Listing("Fit", ("", ""), tuple(rows), left=(0, 1)).html()
+        return Listing("Fit", ("", ""), rows, left=(0, 1)).html()
 
 
 def required_spec(model: PortHamiltonian) -> ModelSpec:

@@ -1,12 +1,11 @@
 """Posterior of a fitted model: 95 % intervals of its parameters, of M(q), g(q) and of predicted torques.
 
-The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.covariance`) is propagated
+The covariance R R^T of the fitted parameters x (`fitting.torque.covariance`, `fitting.servo.posterior`) is propagated
 to first order: the variance of a function f(x) is |J R|^2, with the Jacobian J = df/dx. The variance of a predicted
 torque also includes the squared residual of held-out samples.
 """
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +20,7 @@ from spelgen.dynamics.parameters import evaluate_with
 from spelgen.dynamics.protocol import motors_of
 from spelgen.emission.assemble import ArmModel
 from spelgen.errors import RunError
-from spelgen.fitting.drive_quantities import DriveQuantity, torque_drive_quantities
+from spelgen.fitting.drive_quantities import DriveQuantity, ModelFunction, torque_drive_quantities
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.torque.parameters import ParameterVector
 from spelgen.identification.intervals import PRECISE, Interval, base_unit, interval_listing
@@ -67,7 +66,7 @@ class Posterior:
     torque_std: np.ndarray | None
     delay: Interval | None = None
 
-    def uncertain(self, function: Callable[[ArmModel], Tensor]) -> Uncertain:
+    def uncertain(self, function: ModelFunction) -> Uncertain:
         """Return the value (...) of a function of the model, and its standard deviations.
 
         Example of a function: ``lambda model: model.armature``.
@@ -75,7 +74,7 @@ class Posterior:
         value, root = self.propagate(function)
         return Uncertain(value.numpy(), root.norm(dim=-1).numpy())
 
-    def propagate(self, function: Callable[[ArmModel], Tensor]) -> Propagated:
+    def propagate(self, function: ModelFunction) -> Propagated:
         """Return the value (...) of a function of the model, and a square root J R of its covariance, (..., k).
 
         J is the Jacobian of the function with respect to the fitted parameters, computed by central differences. R has
@@ -217,11 +216,10 @@ class Posterior:
         note += f"Unidentifiable on their own: {', '.join(self.unidentifiable) or 'none'}."
         title = f"Base parameters [{self.base_units}], with half 95 % intervals; numbers after names: joint"
         columns = {"joint": list(self.model.joint_names), **self.drive_columns}
-        drives = tuple(zip(*columns.values(), strict=True))
         note_delay = "" if self.delay is None else f"{self.delay.name.capitalize()}: {self.delay.text} s."
         return (
             interval_listing(title, determined, note),
-            Listing("Drives, with half 95 % intervals", tuple(columns), drives, note_delay),
+            Listing.of_columns("Drives, with half 95 % intervals", columns, note_delay),
         )
 
     def to_dict(self) -> Content:
@@ -271,7 +269,7 @@ class Posterior:
         """Values of the r base parameters, (r,), with a square root (r, k) of their covariance, see `Propagated`."""
         return Propagated(*(self._base[1] @ factor for factor in self._constants))
 
-    def _drive_quantities(self) -> tuple[list[DriveQuantity], Callable[[ArmModel], Tensor]]:
+    def _drive_quantities(self) -> tuple[list[DriveQuantity], ModelFunction]:
         """Return the constants of drives that have 95 % intervals, and the function that computes their values.
 
         The constants are armature, friction, torque offset and motor gain (see `torque_drive_quantities`). The function

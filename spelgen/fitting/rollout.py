@@ -18,6 +18,7 @@ from spelgen.emission.assemble import ArmModel
 from spelgen.errors import LogError
 from spelgen.fitting.tuning import TUNING
 from spelgen.logs.windows import Windows
+from spelgen.runtime.parts import applied
 from spelgen.runtime.port_hamiltonian import PortHamiltonian
 from spelgen.settings.fits import Solver
 
@@ -208,7 +209,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
     # constraint, gradient descent would stop at the boundary of the positive definite matrices.
     with mass_as_learned(model):
         configuration = model.configuration(q, model.prepare())
-    p = (configuration.mass @ qd.unsqueeze(-1)).squeeze(-1)
+    p = applied(configuration.mass, qd)
     past = known_past(model, memory_along(model, q, qd, windows.z))
     force = model.lagrangian_gradient(configuration, qd) - model.friction_torque(configuration, qd, *past)
     # The input is constant in each interval and jumps at the samples. Each sample therefore has two input forces: one
@@ -221,8 +222,7 @@ def momentum_loss(model: ArmModel, windows: Windows, scales: LossScales) -> Tens
         inputs = model.input_matrix(q).abs()
     # The scales of motor torques are converted to joint torques, since there may be gears between motors and joints.
     unit = (inputs @ scales.tau).mean(dim=(0, 1))
-    result: Tensor = (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
-    return result
+    return (residual / torch.maximum(unit, 1e-2 * unit.amax())).square().mean()
 
 
 def probed(model: ArmModel, windows: Windows, scales: LossScales, substeps: int) -> Tensor:

@@ -198,7 +198,7 @@ class JointSense(WrongScale):
 
         motion, torque: (n,) correction factors of the joints' motion and torques; the torques may be reversed or not.
         """
-        return np.asarray(motion < 0)
+        return motion < 0
 
     def text(self, correction: Correction) -> str:
         """Return the text about joints whose positive direction of motion is opposite to the URDF's.
@@ -227,7 +227,7 @@ class TorqueSense(WrongScale):
 
         motion, torque: (n,) correction factors. For joints in the mask, `motion` is positive and `torque` negative.
         """
-        return np.asarray((torque < 0) & (motion > 0))
+        return (torque < 0) & (motion > 0)
 
 
 class TorqueGain(WrongScale):

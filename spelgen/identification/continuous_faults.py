@@ -164,7 +164,7 @@ class Gravity(Compensation):
 
         def normalised(gravity: np.ndarray) -> np.ndarray:
             """Return the vector (3,) [m/s^2] in the direction of `gravity`, scaled to the magnitude `standard`."""
-            return np.asarray(gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9))
+            return gravity * standard / max(float(np.linalg.norm(gravity)), 1e-9)
 
         # Gravity along -z is the first start, so it is preferred if the log does not determine the sign of gravity.
         # Example: only a vertical prismatic joint carries a gravity load. This load is constant, so the torque offset

@@ -175,7 +175,7 @@ class Identification:
         title = "Base parameters [kg, m, s], with half 95 % intervals; numbers after names: joint"
         head = ("joint", "RMS", "", "nMSE")
         return (
-            Listing("Torque residual: RMSE and nMSE", head, tuple(joints), left=(0, 2)),
+            Listing("Torque residual: RMSE and nMSE", head, joints, left=(0, 2)),
             interval_listing(title, self.intervals),
         )
 

@@ -39,7 +39,7 @@ def normal_solution(products: np.ndarray, targets: int) -> np.ndarray:
     length = np.where(length > 0, length, 1.0)
     normal = products[..., :-targets, :-targets] / (length * length.swapaxes(-1, -2))
     normal = normal + TUNING.negligible * np.eye(length.shape[-2])
-    return np.asarray(np.linalg.solve(normal, products[..., :-targets, -targets:] / length) / length)
+    return np.linalg.solve(normal, products[..., :-targets, -targets:] / length) / length
 
 
 @dataclass(frozen=True, eq=False)

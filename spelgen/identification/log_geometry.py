@@ -68,17 +68,17 @@ class GeometryProblem:
 
     def thinned(self, count: int) -> GeometryProblem:
         """Return the same least-squares problem on at most `count` samples, evenly spaced, to save time."""
-        return self._on(self.samples.thinned(count))
+        return self._with(samples=self.samples.thinned(count), _equations={})
 
     def selected(self, rows: np.ndarray) -> GeometryProblem:
         """Return the same least-squares problem on the samples that a mask (S,) selects."""
-        return self._on(self.samples.part(rows))
+        return self._with(samples=self.samples.part(rows), _equations={})
 
-    def _on(self, samples: MotionSamples) -> GeometryProblem:
-        """Return the same least-squares problem on other samples."""
-        fewer = copy(self)
-        fewer.samples, fewer._equations = samples, {}
-        return fewer
+    def _with(self, **changes: object) -> GeometryProblem:
+        """Return a copy with other attributes; the cached equations are shared, unless they are changed, too."""
+        changed = copy(self)
+        vars(changed).update(changes)
+        return changed
 
     def on_torques(self, counted: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem in which only some of the torques are fitted.
@@ -88,30 +88,24 @@ class GeometryProblem:
         counted: mask (S, n), True for the torques that are fitted, per sample and per joint of the arm. Hypotheses that
         exchange the columns of joints do not permute the mask.
         """
-        fewer = copy(self)
-        fewer._equations, fewer._counted = {}, counted[..., None]
-        return fewer
+        return self._with(_counted=counted[..., None], _equations={})
 
     def with_hysteresis(self) -> GeometryProblem:
         """Return the same least-squares problem with a friction model with hysteresis.
 
         Its dry friction depends on the deflections of bristles, which are additional columns of the regressor.
         """
-        extended = copy(self)
-        extended._equations, extended._has_hysteresis = {}, True
         added = self.samples.bent.shape[2] * len(self.speeds)
-        extended.prior_mean = np.append(self.prior_mean, np.zeros(added))
-        extended._precision = block_diag(self._precision, np.zeros((added, added)))
-        return extended
+        mean = np.append(self.prior_mean, np.zeros(added))
+        precision = block_diag(self._precision, np.zeros((added, added)))
+        return self._with(_has_hysteresis=True, prior_mean=mean, _precision=precision, _equations={})
 
     def with_free_gains(self) -> GeometryProblem:
         """Return the same least-squares problem with an unknown positive factor on the torques of each joint.
 
         The factor is, for example, the unknown gain kp of a servo, whose torque is kp times the position error.
         """
-        extended = copy(self)
-        extended._has_free_gains = True
-        return extended
+        return self._with(_has_free_gains=True)
 
     def with_signs(self, signs: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem with torques multiplied by `signs` (S, n): 1 or -1 per sample and joint.
@@ -126,10 +120,9 @@ class GeometryProblem:
 
     def _on_torques(self, tau: np.ndarray) -> GeometryProblem:
         """Return the least-squares problem with the torques tau (S, n, E), in the unit of the log."""
-        other, values = copy(self), self.samples.values.copy()
+        values = self.samples.values.copy()
         values[:, :, 3] = tau
-        other.samples = self.samples._replace(values=values)
-        return other
+        return self._with(samples=self.samples._replace(values=values))
 
     def without_gravity(self, joint: int) -> GeometryProblem:
         """Return the least-squares problem with a model in which the torque of one joint contains no gravity.
@@ -140,9 +133,7 @@ class GeometryProblem:
         weightless = replace(self.unchanged, gravity=(0.0, 0.0, 0.0))
         rows = self.equations(self.unchanged)[0].copy()
         rows[:, joint] = self.equations(weightless)[0][:, joint]
-        other = copy(self)
-        other._equations = {self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])}
-        return other
+        return self._with(_equations={self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])})
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
         """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
@@ -483,13 +474,13 @@ def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:
 
 def _variance(tau: np.ndarray) -> np.ndarray:
     """Return the variance (n,) of torques (S, n); infinity for a constant torque, which then has the weight zero."""
-    return np.asarray(np.where(varying(tau), tau.var(axis=0), np.inf))
+    return np.where(varying(tau), tau.var(axis=0), np.inf)
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
     """Return the inverse of a symmetric positive definite matrix (K, K), which is first scaled to a unit diagonal."""
     scaled, scale = _with_unit_diagonal(matrix)
-    return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
+    return np.linalg.inv(scaled) / np.outer(scale, scale)
 
 
 def solution(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -1,11 +1,10 @@
 """Report on the logs of a robot: ranges, noise and sample times, and the findings of all checks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
+from spelgen.arm.configured_arm import Arm
 from spelgen.errors import Diagnostic, LogError, Severity, collect
+from spelgen.log_checks.check_servo_logs import ServoLogs
 from spelgen.log_checks.check_torque_logs import (
     COUPLED,
     CURRENT,
@@ -21,11 +20,7 @@ from spelgen.log_checks.robot_checks import CHECKS
 from spelgen.log_checks.statistics import Statistics, statistics
 from spelgen.logs.checks import LogChecks, joint_kinds
 from spelgen.logs.trajectory import Trajectory, require_joints
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
-    from spelgen.log_checks.check_servo_logs import ServoLogs
-    from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import LogMapping
 
 ABOUT_ARM = {COUPLED, CURRENT, LOADS, WITHOUT_GRAVITY, WRONG_LINK, AT_A_STOP, *WARNINGS} | {
     x.code for x in CHECKS
@@ -51,8 +46,6 @@ def check_logs(
     logs = [logs] if isinstance(logs, Trajectory) else logs
     checked: TorqueLogs | ServoLogs = TorqueLogs(arm, mapping or arm.settings.logs)
     if arm.settings.input == "position":
-        from spelgen.log_checks.check_servo_logs import ServoLogs
-
         checked = ServoLogs(arm)
     log_checks = LogChecks(joints, joint_kinds(arm.chain.coordinates))
     measured: list[Statistics] = []

@@ -1,15 +1,14 @@
 """Checks of logs of commanded positions: ranges of the signals, tracking of the commands, wrong commands."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from spelgen.arm.actuation import Drives
+from spelgen.arm.configured_arm import Arm
 from spelgen.errors import Diagnostic, LogError
 from spelgen.identification.geometry_search import compare_hypotheses, kinds_of_servo_faults
 from spelgen.identification.log_geometry import GeometryProblem
@@ -29,9 +28,6 @@ from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, delayed_commands, require_commands, split_at_gaps
 from spelgen.logs.tuning import SAMPLES, SIGNALS
 from spelgen.settings.log_mapping import SCALES
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
 
 MOVING = SAMPLES.moving
 # [s] Candidates for the delay of positions after commands. Negative delays show that rows of the log are shifted; the
@@ -116,10 +112,10 @@ COMMAND_DELAYS = (0.0, 0.02, 0.035, 0.05, 0.075, 0.1)
 ONE_ZERO = "one zero of positions and commands"
 ANGLES = ("rad", "deg", "turns", "mrad")  # Units of the positions of servos.
 UNIT: Check[Sequence[JointReport]] = Check(
-    "degrees", "error", lambda _: None, expected="the unit that 'units' under 'logs' states, rad by default"
+    "degrees", "error", expected="the unit that 'units' under 'logs' states, rad by default"
 )
 NORMALISED: Check[Sequence[JointReport]] = Check(
-    "normalised", "error", lambda _: None, expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
+    "normalised", "error", expected="degrees, with the step of the encoders (4096 counts: 0.0879)",
     do="write 'units: {q: normalised}' and 'calibration:' with the content of LeRobot's calibration file under 'logs' "
     "in the robot's YAML",
 )  # fmt: skip
@@ -544,4 +540,4 @@ def _following_table(joints: Sequence[JointReport]) -> Listing:
         "90th percentile of the distance from the command at rest [mrad, mm]; saturated: fraction of time with "
         "kp (u - q) beyond the effort limit, if kp is set."
     )
-    return Listing("Following", head, tuple(rows), note)
+    return Listing("Following", head, rows, note)

@@ -1,17 +1,15 @@
 """Checks of logs of torques against the model of the arm: columns, torque limits and stops, couplings of motors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spelgen.arm.configured_arm import Arm
 from spelgen.dynamics.regressor_dynamics import body_chain
-from spelgen.errors import Diagnostic, LogError, SpelgenError, shortened
+from spelgen.errors import Diagnostic, LogError, shortened
 from spelgen.identification.column_faults import UNITS, TorqueGain, TorqueSense
 from spelgen.identification.drive_hints import Coupling, drive_problem
 from spelgen.identification.geometry_search import compare_hypotheses, deviating_recordings, kinds_of_faults
@@ -47,11 +45,7 @@ from spelgen.logs.formats import BAG
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.tables import UNIT_CODES
 from spelgen.logs.trajectory import QUANTITIES, Trajectory, require_torques, split_at_gaps
-from spelgen.settings.log_mapping import CURRENTS
-
-if TYPE_CHECKING:
-    from spelgen.arm.configured_arm import Arm
-    from spelgen.settings.log_mapping import LogMapping
+from spelgen.settings.log_mapping import CURRENTS, LogMapping
 
 COUPLED, WRONG_LINK = "coupled-motors", "urdf-inertials"
 CURRENT, WITHOUT_GRAVITY = "current-without-gain", "torque-without-gravity"
@@ -59,7 +53,7 @@ SMALL_MOTION, LOADS, CHANGED = "small-motion", "different-loads", "torque-change
 # Codes of warnings after which couplings of motors and delays of torques are not tested. SMALL_MOTION: the motion is
 # too small. UNEXPLAINED: the logged columns may not be the torques of the joints. WARNINGS: the scale or the zeros of
 # torques, or their gravity, probably differ from the URDF.
-UNEXPLAINING = (SMALL_MOTION, UNEXPLAINED, *WARNINGS)
+UNEXPLAINING = {SMALL_MOTION, UNEXPLAINED, *WARNINGS}
 
 
 class TorqueLogs:
@@ -115,9 +109,7 @@ class TorqueLogs:
         # correction of the log fit best. Errors about the unit of positions, which is only guessed from their range,
         # are no obstacle: if the fit to the torques determines the unit, an error with this unit replaces the guess.
         self._guessed = summary.guessed
-        guesses = [
-            x for x in summary.errors if self._guessed and isinstance(x, LogError) and "degrees" in x.codes
-        ]
+        guesses = [x for x in summary.errors if self._guessed and "degrees" in x.codes]
         is_sound = bool(guesses) or not summary.errors
         unscaled = self._unscaled_currents()
         summary.notes.extend(unscaled)
@@ -130,19 +122,19 @@ class TorqueLogs:
             # samples.
             samples = [motion, motion if moving is None else moving]
             loads = [] if unscaled or self._guessed else self._load_changes(motion, moving)
-            geometry: Sequence[SpelgenError | Diagnostic] = []
+            geometry = Findings()
             if not unscaled:
                 geometry = self._geometry_findings(samples, evidence, accepted, loads)
             if guesses:
                 # The error about the unit is the first, since the wrong unit may cause others, such as jumps.
                 remaining = [x for x in summary.errors if x not in guesses]
-                geometry = [*([x for x in geometry if isinstance(x, LogError)] or guesses), *remaining]
-                summary.errors.clear()
-            summary.extend(geometry)
-            is_right = not any(isinstance(x, SpelgenError) or x.code in UNEXPLAINING for x in geometry)
-            if is_right and moving is not None:
-                self._check_drives(moving, summary)
-            if is_right:
+                summary.errors[:] = [*(geometry.errors or guesses), *remaining]
+            else:
+                summary.notes += geometry.notes
+                summary.errors += geometry.errors
+            if not summary.errors and UNEXPLAINING.isdisjoint(x.code for x in geometry.notes):
+                if moving is not None:
+                    self._check_drives(moving, summary)
                 summary.notes.extend(self._load_notes(loads))
         # Torques beyond the limits of the drives are not reported in two cases. If the log has another error, this
         # error is the reason. If the torques agree with the gravity of the URDF, the limits are only placeholders.
@@ -178,7 +170,7 @@ class TorqueLogs:
         evidence: Sequence[JointEvidence],
         accepted: set[str],
         loads: Sequence[LoadChange],
-    ) -> list[LogError | Diagnostic]:
+    ) -> Findings:
         """Return the findings about the geometry of the logs: senses, order, zeros and units of joints, and gravity.
 
         Recordings whose torques agree are tested together. If they have no errors, every other recording, which
@@ -197,25 +189,21 @@ class TorqueLogs:
         if unfiltered is not None and not loads:
             deviating = deviating_recordings(unfiltered)
         agreeing = [k for k in range(len(self._sources)) if k not in deviating]
-        findings, errors = list[LogError | Diagnostic](), list[list[LogError]]()
-        groups = [agreeing, *([k] for k in deviating)]
-        for numbers in groups:
-            results = self._tested(numbers, samples, evidence, accepted)
-            errors.append([x for x in results if isinstance(x, LogError)])
-            findings += results if numbers is agreeing else []
-            if errors[0] and 2 * len(agreeing) > len(self._sources):
-                return findings
+        findings = self._tested(agreeing, samples, evidence, accepted)
+        if findings.errors and 2 * len(agreeing) > len(self._sources):
+            return findings
+        of_deviating = [self._tested([k], samples, evidence, accepted) for k in deviating]
         # If all recordings have errors, they may have the same fault, which is clearest in all recordings together.
-        if errors[0] and all(errors):
+        if findings.errors and all(x.errors for x in of_deviating):
             together = self._tested(range(len(self._sources)), samples, evidence, accepted)
-            if any(isinstance(x, LogError) for x in together):
+            if together.errors:
                 return together
-        pairs = zip(errors, groups, strict=True)
-        named = [self._of_recordings(error, numbers) for group, numbers in pairs for error in group]
-        change = (
-            self._torque_change(unfiltered) if unfiltered and deviating and not (named or loads) else None
-        )
-        return [*(x for x in findings if not isinstance(x, LogError)), *named, *filter(None, [change])]
+        errors = [self._of_recordings(error, agreeing) for error in findings.errors]
+        for k, tested in zip(deviating, of_deviating, strict=True):
+            errors += [self._of_recordings(error, [k]) for error in tested.errors]
+        if unfiltered and deviating and not (errors or loads):
+            errors = self._torque_changes(unfiltered)
+        return replace(findings, errors=errors)
 
     def _tested(
         self,
@@ -223,8 +211,8 @@ class TorqueLogs:
         samples: Sequence[MotionSamples],
         evidence: Sequence[JointEvidence],
         accepted: set[str],
-    ) -> list[LogError | Diagnostic]:
-        """Return the findings about some of the recordings; [] for too few samples.
+    ) -> Findings:
+        """Return the findings about some of the recordings; none for too few samples.
 
         numbers: indices of these recordings. samples, evidence, accepted: see `_geometry_findings`.
         """
@@ -233,10 +221,10 @@ class TorqueLogs:
         problems = (self._problem(x, len(numbers) / len(self._sources)) for x in reversed(chosen))
         problem = next((x for x in problems if x is not None), None)
         if problem is None:
-            return []
+            return Findings()
         joints = self._evidence([x.report for x in evidence], chosen[0]) if is_part else evidence
         flat = FlatTops.joined([self._flat[k] for k in numbers])
-        return list(self._findings(problem, flat, joints, accepted))
+        return self._findings(problem, flat, joints, accepted)
 
     def _of_recordings(self, error: LogError, numbers: Sequence[int]) -> LogError:
         """Return an error about some of the recordings, with their names. numbers: indices of these recordings."""
@@ -311,12 +299,11 @@ class TorqueLogs:
 
     def _findings(
         self, problem: GeometryProblem, flat: FlatTops, evidence: Sequence[JointEvidence], accepted: set[str]
-    ) -> Iterator[LogError | Diagnostic]:
-        """Yield the findings about the geometry of recordings, in the order of the tests.
+    ) -> Findings:
+        """Return the findings about the geometry of recordings.
 
-        Tested are the range of the motion, lost signs of torques, clipped torques, hypotheses about senses, order,
-        zeros, units and gravity, and, if the torques agree with the mapping, the inertials of the URDF. The first
-        finding that explains the torques, or states that nothing explains them, ends the tests.
+        Tested are the range of the motion, lost signs of torques, clipped torques, torques that change, and hypotheses
+        (see `_compared`). The first error, or a warning about too little motion, ends the tests.
 
         Args:
             problem: least-squares problem of the samples.
@@ -324,7 +311,7 @@ class TorqueLogs:
             evidence: each joint of the URDF with its statistics.
             accepted: codes of the checks that the mapping accepts.
         """
-        motion = problem.unchanged.signals(problem.samples).motion[0]
+        findings, motion = Findings(), problem.unchanged.signals(problem.samples).motion[0]
         is_stated = any(self._mapping.unit("q", name) for name in self._arm.chain.joint_names)
         # A motion may only seem small because the mapping states a wrong unit of positions. Logs with a stated unit are
         # therefore tested even if their motion is small.
@@ -336,24 +323,31 @@ class TorqueLogs:
             small = "most joints move one way only"
         if small:
             message = f"{small}: too little motion to test senses, order, zeros, units and gravity"
-            yield Diagnostic("warning", SMALL_MOTION, "logs", None, message)
-            return
+            findings.notes.append(Diagnostic("warning", SMALL_MOTION, "logs", None, message))
+            return findings
         # If the unit of positions is unknown, signs and limits of torques are not tested: positions in a wrong unit
         # contradict all torques.
-        wrong: Sequence[SpelgenError] = []
         if not self._guessed and UNSIGNED not in accepted:
-            wrong = find_unsigned(problem)
-        if not wrong and not self._guessed:
+            findings.errors += find_unsigned(problem)
+        if not findings.errors and not self._guessed:
             limits = find_limits(problem, flat)
-            yield from limits.notes
-            wrong = limits.errors if CLIPPED not in accepted else []
-        yield from (x for x in wrong if isinstance(x, LogError))
-        if wrong:
-            return
-        change = self._torque_change(problem) if CHANGED not in accepted else None
-        if change is not None:
-            yield change
-            return
+            findings.notes += limits.notes
+            if CLIPPED not in accepted:
+                findings.errors += limits.errors
+        if not findings.errors and CHANGED not in accepted:
+            findings.errors += self._torque_changes(problem)
+        if not findings.errors:
+            findings.extend(self._compared(problem, evidence, accepted))
+        return findings
+
+    def _compared(
+        self, problem: GeometryProblem, evidence: Sequence[JointEvidence], accepted: set[str]
+    ) -> Iterator[LogError | Diagnostic]:
+        """Yield the findings of a comparison of hypotheses about senses, order, zeros, units and gravity.
+
+        If the torques agree with the mapping, they are about the inertials of the URDF. The first finding that explains
+        the torques, or states that nothing explains them, is the last. problem, evidence, accepted: see `_findings`.
+        """
         unchanged, *better = compare_hypotheses(problem, self._faults(evidence, problem))
         # Factors of single torques are tested by themselves: combined with other faults, they could explain any log.
         is_open = np.array([self._mapping.unit("tau", name) is None for name in self._arm.chain.joint_names])
@@ -390,11 +384,11 @@ class TorqueLogs:
             yield from _link_notes(problem, self._mapping, unchanged)
         yield geometry_finding(problem, self._mapping, unchanged, better, by_name=self._is_bag)
 
-    def _torque_change(self, problem: GeometryProblem) -> LogError | None:
-        """Return an error if the scale or zero of torques changes within a recording, else None."""
+    def _torque_changes(self, problem: GeometryProblem) -> list[LogError]:
+        """Return an error if the scale or zero of torques changes within a recording, else []."""
         change = None if self._guessed else torque_change(problem)
         if change is None:
-            return None
+            return []
         name, file = self._sources[change.recording]
         joints = (
             ", all joints" if change.joint is None else f", joint {problem.arm.joint_names[change.joint]!r}"
@@ -406,10 +400,9 @@ class TorqueLogs:
         torque = f"{round(change.factor, 2) + 0.0:g} times {reference}"
         if change.offset:
             torque = f"another zero than before it, by {change.offset:.2g}"
-        return LogError(
-            f"torques that are{since} {torque}", file=file, element=f"trajectory {name}{joints}, tau",
-            expected="one scale and zero of the torques", do=do, codes=(CHANGED,),
-        )  # fmt: skip
+        got, where = f"torques that are{since} {torque}", f"trajectory {name}{joints}, tau"
+        expected, codes = "one scale and zero of the torques", (CHANGED,)
+        return [LogError(got, file=file, element=where, expected=expected, do=do, codes=codes)]
 
     def _faults(self, evidence: Sequence[JointEvidence], problem: GeometryProblem) -> tuple[Fault, ...]:
         """Return the kinds of faults to test (see `kinds_of_faults`), with candidates for factors that correct units.
@@ -592,4 +585,4 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
         "variance that gravity explains, in addition to friction and acceleration; x URDF: ratio to the URDF's gravity "
         "torque."
     )
-    return Listing("Physics", head, tuple(rows), note)
+    return Listing("Physics", head, rows, note)

@@ -188,7 +188,7 @@ class LogReport:
             lines.append((finding.severity, finding.where, finding.message))
         for error in self.errors:
             lines.append(("error", "", str(error)))
-        table = Listing(self.heading(), ("", "where", "what"), tuple(lines), left=(0, 1, 2))
+        table = Listing(self.heading(), ("", "where", "what"), lines, left=(0, 1, 2))
         return "".join(map(Listing.html, (table, *self._short_listings())))
 
 
@@ -246,7 +246,7 @@ def _clock_table(trajectories: Sequence[Clock], limit: int | None) -> Listing:
             (clock.name, str(clock.samples), duration, rate, f"{clock.jitter:.1%}", str(clock.gaps), longest)
         )
     hidden = len(trajectories) - len(rows)
-    return Listing("Clock", head, tuple(rows), f"and {hidden} more" if hidden else "")
+    return Listing("Clock", head, rows, f"and {hidden} more" if hidden else "")
 
 
 def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> tuple[Listing, Listing]:
@@ -273,8 +273,8 @@ def signal_tables(joints: Sequence[JointReport], quantities: Sequence[str]) -> t
         "units above."
     )
     return (
-        Listing(f"Ranges [{'; '.join(units)}]", head, tuple(ranges), commands),
-        Listing("Signals", ("joint", *columns), tuple(signals), note),
+        Listing(f"Ranges [{'; '.join(units)}]", head, ranges, commands),
+        Listing("Signals", ("joint", *columns), signals, note),
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from spelgen.errors import Diagnostic, LogError, SpelgenError, collect
+from spelgen.errors import Diagnostic, LogError, collect
 from spelgen.labels import counted
 from spelgen.logs.fingerprints import Fingerprints
 from spelgen.logs.joint_signals import (
@@ -56,7 +56,8 @@ class Check(Generic[Subject]):
     Attributes:
         code: name of the check in reports; the option `--accept CODE` omits the check.
         severity: logs with a finding of severity "error" cannot be trained on.
-        find: function of the checked object that returns a message about the fault, or None if there is no fault.
+        find: function of the checked object that returns a message about the fault, or None if there is no fault. The
+            default finds nothing, for checks whose messages are computed elsewhere.
         unless: codes of earlier checks whose findings would explain this fault, too: if one of them has a finding, this
             check is omitted.
         everywhere: if True, a fault is reported only if it occurs in all trajectories.
@@ -66,7 +67,7 @@ class Check(Generic[Subject]):
 
     code: str
     severity: Literal["info", "warning", "error"]
-    find: Callable[[Subject], str | Advice | None]
+    find: Callable[[Subject], str | Advice | None] = lambda subject: None
     unless: tuple[str, ...] = ()
     everywhere: bool = False
     expected: str | None = None
@@ -87,10 +88,10 @@ class Findings:
     """
 
     notes: list[Diagnostic] = field(default_factory=list)
-    errors: list[SpelgenError] = field(default_factory=list)
+    errors: list[LogError] = field(default_factory=list)
     guessed: set[str] = field(default_factory=set)
 
-    def extend(self, findings: Iterable[Diagnostic | SpelgenError]) -> None:
+    def extend(self, findings: Iterable[Diagnostic | LogError]) -> None:
         """Add findings: instances of `Diagnostic` to the notes, and exceptions to the errors."""
         for finding in findings:
             if isinstance(finding, Diagnostic):
@@ -197,10 +198,10 @@ def find_low_rate(trajectory: Trajectory) -> str | None:
 CLOCK_CHECKS = [Check("gap", "info", find_gaps), Check("low-rate", "warning", find_low_rate)]
 # REPAIRED and REMARKED check nothing. They are the code and severity of messages that the reader of the log has written
 # about changed rows (REPAIRED) or about properties of the file (REMARKED).
-REPAIRED: Check[Trajectory] = Check("repaired", "warning", lambda trajectory: None)
-REMARKED: Check[Trajectory] = Check("as-logged", "info", lambda trajectory: None)
+REPAIRED: Check[Trajectory] = Check("repaired", "warning")
+REMARKED: Check[Trajectory] = Check("as-logged", "info")
 # This check compares a trajectory with earlier ones: `LogChecks` computes its message.
-REPEATED: Check[Trajectory] = Check("repeated-samples", "warning", lambda trajectory: None)
+REPEATED: Check[Trajectory] = Check("repeated-samples", "warning")
 CHECKS: list[Check[JointSignals]] = [
     # Register words (raw integers that overflow, or have a sign bit) are searched first. The jumps of such a signal
     # make dq/dt differ from qd, which the check "frozen" would otherwise report as a frozen signal.
@@ -276,7 +277,7 @@ class LogChecks:
 
     def __init__(self, joints: Sequence[str], joint_types: Sequence[str]) -> None:
         self.products = np.zeros((2 * len(joints),) * 2)
-        self._joints, self._kinds = joints, joint_types
+        self._joints, self._kinds = joints, dict(zip(joints, joint_types, strict=True))
         self._results: dict[tuple[str, AnyCheck], list[tuple[Advice, str, Path | None]]] = {}
         self._count = 0
         self._fingerprints = Fingerprints()
@@ -302,7 +303,7 @@ class LogChecks:
         self.products += products
         factors, correlations = velocity_agreement(products)
         wrong = []
-        for k, (joint, kind) in enumerate(zip(self._joints, self._kinds, strict=True)):
+        for k, (joint, kind) in enumerate(self._kinds.items()):
             signals = JointSignals(trajectory, k, kind, self._joints, factors, correlations[:, k])
             for check, advice in run_checks(CHECKS, signals, trajectory.accepted):
                 self._add(joint, check, advice, trajectory)
@@ -360,16 +361,15 @@ class LogChecks:
 
     def _kin(self, joint: str) -> list[str]:
         """Return the names of all joints of the same type as `joint`: all prismatic joints, or all others."""
-        kinds = dict(zip(self._joints, self._kinds, strict=True))
-        return [x for x in self._joints if (kinds[x] == "prismatic") == (kinds[joint] == "prismatic")]
+        is_prismatic = self._kinds[joint] == "prismatic"
+        return [x for x, kind in self._kinds.items() if (kind == "prismatic") == is_prismatic]
 
     def _limited(self, joint: str) -> list[str]:
         """Return the names of the joints of the same type as `joint`, without continuous joints.
 
         Only at joints with position limits do positions beyond two turns show a wrong unit.
         """
-        kinds = dict(zip(self._joints, self._kinds, strict=True))
-        return [x for x in self._kin(joint) if kinds[x] != "continuous"]
+        return [x for x in self._kin(joint) if self._kinds[x] != "continuous"]
 
     def _joint_keys(self, entries: dict[str, Mapping[str, Any]]) -> dict[str, object]:
         """Return the settings for the group `logs` that correct one fault of several joints.

@@ -149,7 +149,7 @@ class JointSignals(NamedTuple):
         """Return the joint's signal "q", "qd", "tau" or "u" as logged, (T,): without the mapping's unit and offset."""
         mapping = self.trajectory.mapping
         values = self.signal(quantity) - mapping.offset(quantity, self.joint)
-        return np.asarray(values / mapping.scale(quantity, self.joint))
+        return values / mapping.scale(quantity, self.joint)
 
     @property
     def factor(self) -> float:

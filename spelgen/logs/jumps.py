@@ -37,7 +37,7 @@ def unwrapped(values: np.ndarray, period: float) -> np.ndarray:
     is_half = np.abs(np.abs(turns) - 0.5) < 0.25
     rows = np.flatnonzero(is_half[:-1] & is_half[1:] & (turns[:-1] * turns[1:] < 0))
     whole[rows], whole[rows + 1] = 0.0, np.round(turns[rows] + turns[rows + 1])
-    return np.asarray(values - period * np.cumsum(whole))
+    return values - period * np.cumsum(whole)
 
 
 def centred(values: np.ndarray, period: float) -> np.ndarray:

@@ -251,7 +251,7 @@ def stale_rows(
         last = np.flatnonzero(values == values[-1])
         off = [values[-1]] if np.ptp(speed[last[len(last) // 2 :]]) < change else []
         stale = is_stale(values, speed, change)
-        return np.asarray(stale & ~np.isin(values, [values.min(), values.max(), *off]))
+        return stale & ~np.isin(values, [values.min(), values.max(), *off])
     stale = is_interrupted(t, q) & (quantity == "q")
     # If q or qd is frozen while the joint moves, the difference between q and the integral of qd changes. A block of
     # equal values is stale if this difference changes by more than 0.05 rad or m within the block.

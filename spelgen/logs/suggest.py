@@ -22,14 +22,12 @@ from spelgen.logs.column_names import (
     CURRENT,
     OTHERS,
     ColumnName,
-    parse_column_name,
-)
-from spelgen.logs.column_selection import (
     abbreviated_names,
     best_signal,
     columns_by_joint,
     columns_by_quantity,
     complete_signals,
+    parse_column_name,
     require_one_arm,
 )
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of

@@ -159,7 +159,7 @@ class Trajectory:
             if hasattr(values, "detach"):  # NumPy cannot convert a tensor on a GPU or with gradients.
                 values = values.detach().cpu()
             if isinstance(values, np.ma.MaskedArray):  # Masked values become NaN; asarray ignores masks.
-                return np.asarray(np.ma.filled(values.astype(float), np.nan))
+                return np.ma.filled(values.astype(float), np.nan)
             return np.asarray(values, dtype=float)
         except (TypeError, ValueError) as error:
             got = f"{type(values).__name__} ({error})"

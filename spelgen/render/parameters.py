@@ -75,8 +75,7 @@ def base_table(arm: Arm, identified: Content, posterior: Posterior | None) -> Li
     columns["determined"] = determined
     # The formula of a base parameter is omitted if it equals the name: the parameter is then not a combination.
     columns["made of"] = [x["formula"] if x["formula"] != x["name"] else "" for x in parameters]
-    rows = tuple(zip(*columns.values(), strict=True))
-    return Listing("Base parameters: identifiable combinations", tuple(columns), rows, f"{note}.")
+    return Listing.of_columns("Base parameters: identifiable combinations", columns, f"{note}.")
 
 
 def _interval(parameter: Content) -> str:
@@ -114,7 +113,7 @@ def _body_table(values: np.ndarray, arm: Arm | None, posterior: Posterior | None
     return Listing(
         "Masses, centres of mass and inertias",
         ("moves with", "by", "m [kg]", "centre of mass x, y, z [m]", "principal moments about it [kg m²]"),
-        tuple(rows),
+        rows,
         "In the frame of the joint; z is its axis. Only the base parameters are identifiable: many such sets give the "
         f"same motion. Every set shown is physically consistent.{alone}",
     )
@@ -155,7 +154,7 @@ def _joint_table(model: ArmModel, arm: Arm | None, posterior: Posterior | None) 
         friction = [joint.friction for joint in arm.chain.coordinates]
         columns["URDF: viscous"] = _with_units(damping, TORQUE_UNITS["viscous"], model.joint_types)
         columns["URDF: coulomb"] = _with_units(friction, TORQUE_UNITS["coulomb"], model.joint_types)
-    return Listing("Drives and friction", tuple(columns), tuple(zip(*columns.values(), strict=True)), note)
+    return Listing.of_columns("Drives and friction", columns, note)
 
 
 def _with_units(values: Sequence[float], unit: str, joint_types: Sequence[str]) -> list[str]:

@@ -17,7 +17,7 @@ from spelgen.dynamics.bristles import BristleReach, bristles_along
 from spelgen.dynamics.friction import DriveFriction
 from spelgen.dynamics.pinocchio_arm import arm_dynamics
 from spelgen.errors import LogError, SettingsError, in_one_line
-from spelgen.excitation.trajectory import Motion
+from spelgen.excitation.trajectory import Motion, motion_columns
 from spelgen.files import require_regular_file
 from spelgen.logs.csv_files import csv_table
 from spelgen.settings.settings import Settings
@@ -37,7 +37,7 @@ def read_motion(file: Path, joints: Sequence[str]) -> Motion:
         joints: Names of the n joints, in the order of the coordinates.
     """
     require_regular_file(file, LogError)
-    columns = ["t", *(f"{quantity}_{joint}" for quantity in ("q", "qd", "qdd") for joint in joints)]
+    columns = motion_columns(joints)
     refused = partial(LogError, file=file, do="`spelgen excite` writes such files for the same arm")
     try:
         table, _, _ = csv_table(file)

@@ -143,8 +143,7 @@ class Element:
     def text(self, key: str) -> str | None:
         """Return the text of the attribute ``key``; None if the attribute or the element is absent."""
         # An absent element counts as an element without attributes, so that callers need no branch for it.
-        text: str | None = None if self.xml is None else self.xml.get(key)
-        return text
+        return None if self.xml is None else self.xml.get(key)
 
     def name(self) -> str | None:
         """Return the name of the element; add an error and return None if it has no usable name."""

@@ -116,5 +116,4 @@ def sliding_friction(friction: FrictionLaws, qd: Tensor, gravity: Tensor) -> Ten
     # Without the term 1e-9 the mean of a joint at rest would be 0 / 0.
     speed = qd.abs() + 1e-9
     dry = friction.prepare().dry(qd, gravity) * speed
-    mean: Tensor = dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)
-    return mean
+    return dry.flatten(0, -2).sum(dim=0) / speed.flatten(0, -2).sum(dim=0)

@@ -23,10 +23,10 @@ from spelgen.fitting.levenberg_marquardt import SolverState, levenberg_marquardt
 from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
-from spelgen.fitting.servo.covariance import posterior_content
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
 from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
+from spelgen.fitting.servo.posterior import posterior_content
 from spelgen.fitting.servo.problem import ServoProblem
 from spelgen.fitting.servo.report import servo_record, solution
 from spelgen.fitting.servo.rollouts import ServoRollouts

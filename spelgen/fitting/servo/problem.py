@@ -23,6 +23,7 @@ from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.servo.parameters import ParameterMap, ServoParameters
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.tuning import TUNING
+from spelgen.runtime.parts import applied
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,5 +184,5 @@ class ServoProblem:
             rows = torch.cat([torch.arange(p) * n + joint, p * n + torch.arange(r)])
             weighted = jacobian * weights[:, None, :, joint]
             curvature[:, rows[:, None], rows] += weighted @ jacobian.mT
-            descent[:, rows] -= (weighted @ errors[..., joint].unsqueeze(-1)).squeeze(-1)
+            descent[:, rows] -= applied(weighted, errors[..., joint])
         return NormalEquations(curvature, descent)

@@ -262,7 +262,7 @@ def servo_summary(record: Content | None) -> FitSummary | None:
     if undetermined:
         groups = [f"{ratio} of {', '.join(joints)}" for ratio, joints in undetermined.items()]
         end = f"Not determined by these logs: {'; '.join(groups)}"
-    listing = Listing("Servos", head, tuple(rows), f"All columns but kp are {ABOUT}. {end}.")
+    listing = Listing("Servos", head, rows, f"All columns but kp are {ABOUT}. {end}.")
     delay = f"{1000 * record['delay']['value']:.1f} ms, +- {1000 * record['delay']['half']:.1f} ms"
     errors = ", ".join(number(1000 * rms) for rms in record["rms"])
     text = f"delay {delay}\nerrors on training windows, RMS by joint: {errors} mrad\n{listing.text()}"

@@ -21,6 +21,7 @@ from spelgen.fitting.servo.tuning import TUNING
 from spelgen.logs.filtering import derivative, velocities
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import LogRows, Trajectory, delayed_commands, split_at_gaps, steps_between
+from spelgen.runtime.parts import applied
 
 
 class MidpointMotion(NamedTuple):
@@ -182,7 +183,7 @@ def body_load(model: ArmModel, motion: MidpointMotion) -> BodyLoad:
             configuration = model.configuration(q, prepared)
             mass = configuration.mass
             inertia = mass.diagonal(dim1=-2, dim2=-1) - armature
-            coupling = (mass @ qdd.unsqueeze(-1)).squeeze(-1) - (inertia + armature) * qdd
+            coupling = applied(mass, qdd) - (inertia + armature) * qdd
             bias = model.nonlinear_effects(configuration, qd) + coupling
             regressor = regressor_of(model.chain, q, qd, qdd)
             batches.append(BodyLoad(inertia, bias, model.gravity(configuration), regressor))

@@ -122,8 +122,7 @@ def torque_nmse(model: ArmModel, samples: TorqueSamples) -> list[float]:
             past = known_past(model, block.z, block.direction)
             error = model.inverse_dynamics(block.q, block.qd, block.qdd, *past) - block.tau
             squares += error.square().sum(dim=0)
-    nmse: list[float] = (squares / len(tau) / tau.var(dim=0, correction=0)).tolist()
-    return nmse
+    return (squares / len(tau) / tau.var(dim=0, correction=0)).tolist()
 
 
 def torque_delay(model: ArmModel, logs: Sequence[Trajectory], preprocessing: Preprocessing) -> TorqueDelay:

@@ -111,7 +111,7 @@ def _likely_nmse(samples: TorqueSamples, solution: TorqueSolution) -> np.ndarray
     # The nMSE is multiplied by seconds / median: by 1.27 for three seconds of motion and by 1.06 for twelve, so that
     # the correction is important only for short logs.
     median = 2 * float(gammaincinv(seconds / 2, 0.5))
-    return np.asarray(solution.held_out_nmse * seconds / median)
+    return solution.held_out_nmse * seconds / median
 
 
 def _few_data(
