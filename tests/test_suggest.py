@@ -235,6 +235,10 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
     # the error must not advise to rename the columns of effort to q
     with pytest.raises(LogError, match="or write their names under 'logs'"):
         read_logs(path, scara)
+    # files without times cannot be merged by them: their rows are joined
+    without_times = written(tmp_path / "untimed.csv", head[1:], TAU)
+    with pytest.raises(LogError, match=r"no positions .*join\(pandas.read_csv\(OTHER\), lsuffix"):
+        suggest_mapping(without_times, scara.chain.joint_names)
 
 
 def test_a_row_per_joint_is_to_be_pivoted(scara, tmp_path):

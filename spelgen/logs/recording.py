@@ -245,6 +245,8 @@ def stale_rows(
         # friction may hold servos of an SO-101 at rest while their commands change by up to 0.13 rad.
         margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3))
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
+    sound = ~is_outlier(q, smooth=True)
+    q = np.interp(t, t[sound], q[sound])  # an outlier is no motion
     if quantity == "tau":
         speed = qd if qd.size else np.gradient(q, t)
         change = 0.2 * float(np.ptp(speed))

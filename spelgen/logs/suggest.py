@@ -41,10 +41,9 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.logs.values import logged_column
 from spelgen.settings.log_mapping import CURRENTS, LogMapping, mapped_unit
 
-JOINING = (
-    "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
-    "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
-)
+JOINING = "join files with a signal each in Python: {}.to_csv('log.csv', index=False)"
+BY_TIME = "pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), on={!r}, suffixes=('_q', '_tau'))"
+BY_ROW = "pandas.read_csv(FILE).join(pandas.read_csv(OTHER), lsuffix='_q', rsuffix='_tau')"
 
 
 class Suggestion(NamedTuple):
@@ -136,7 +135,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
         got = f"no {listed(absent)} in addition to its other columns"
-        raise LogError(got, file=file, expected=expected, do=JOINING)
+        join = BY_TIME.format(clock.name) if clock.name else BY_ROW
+        raise LogError(got, file=file, expected=expected, do=JOINING.format(join))
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
