@@ -297,7 +297,9 @@ def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     try:
         names = info["features"][feature]["names"] or []
         if isinstance(names, dict):  # LeRobot writes the names of motors as a list, or as a dict of lists.
-            names = chain(*names.values())
+            names = [*names.values()]
+        if isinstance(next(iter(names), ""), list):  # Recorders of Unitree write a list of lists.
+            names = chain(*names)
         return [str(name).removesuffix(ENDING) for name in names]
     except (KeyError, TypeError, AttributeError) as error:
         raise LogError(
