@@ -40,7 +40,8 @@ def columns_by_quantity(
             if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
                 commanded.append(column)
             continue
-        if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
+        is_numbered = column.number >= 0 and column.words & (MEASURED | {"joint", "joints", "axis", "axes"})
+        if quantity is None and (column.joint or is_numbered):
             unstated.append(column)
         if quantity in by_quantity:
             by_quantity[quantity].append(column)
@@ -78,6 +79,17 @@ def complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozens
     for column in columns:
         signals.setdefault(frozenset(column.words), []).append(column)
     return {words: named for words, named in signals.items() if len(named) >= joints}
+
+
+def of_one_arm(columns: Sequence[ColumnName], joints: Sequence[str]) -> list[ColumnName]:
+    """Return the columns without numbered columns of other arms or legs: `FL_0_q` is not of the joints FR_hip, FR_knee.
+
+    A word that all joint names share names the arm. A column of another arm has another unknown word in its place.
+    """
+    arm = set.intersection(*(set(re.findall(r"[^\W\d_]+", x.lower())) for x in joints))
+    signals = {frozenset(x.words & KNOWN) for x in columns if x.words & arm}
+    is_other = [not (x.joint or x.words & arm or x.words <= KNOWN) for x in columns]
+    return [x for x, y in zip(columns, is_other, strict=True) if not (y and x.words & KNOWN in signals)]
 
 
 def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> None:

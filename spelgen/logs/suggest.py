@@ -30,6 +30,7 @@ from spelgen.logs.column_selection import (
     columns_by_joint,
     columns_by_quantity,
     complete_signals,
+    of_one_arm,
     require_one_arm,
 )
 from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
@@ -96,6 +97,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
     columns = [parse_column_name(x, labels, stated.get(x, ""), dates.get(x, set())) for x in names]
+    columns = of_one_arm(columns, joints)
     if not commands:
         columns = _with_letters(_with_states(columns, table, len(joints)), table)
     columns_of = columns_by_quantity(columns, commands, len(joints))
