@@ -127,6 +127,9 @@ def _unwrap(rows: Rows) -> None:
             # a period. A check reports such words.
             if word is not None and word.key == "sign_bit":
                 continue
+            # The register of a joint without limits may overflow at another period than a turn, such as 25 rad.
+            if word is not None and abs(period - 2 * pi) < 1e-6:
+                period = word.value * abs(scale)
         result = unwrapped(column, period)
         if quantity == "u":
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
