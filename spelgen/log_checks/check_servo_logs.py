@@ -443,8 +443,7 @@ def _command_faults(
         if k in faults:
             continue
         # A joint whose command hardly changes may be held by dry friction: it moves less than the command.
-        is_scaled = gain > 3 or (following.moves[k] and gain < 1 / 3)
-        if correlation > FOLLOWS and is_scaled:
+        if correlation > FOLLOWS and (gain > 3 or (following.moves[k] and gain < 1 / 3)):
             units = _command_units(gain, mapping.unit("q", joints[k]), mapping.unit("u", joints[k]))
             got, do = f"positions that move {gain:.3g} times as far as commands", "log both in one unit"
             faults[k] = CommandFault(got, "both in the same unit", {"units": units} if units else {}, do)

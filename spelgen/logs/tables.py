@@ -268,27 +268,19 @@ def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, r
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
-    absent = {x for x in shared if not re.search(_as_word(x), "\n".join(names), re.I)}
-    shorter, distinct = (
-        {joint: [x for x in of_joint if x not in omitted] for joint, of_joint in words.items()}
-        for omitted in (absent, shared)
-    )
-    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
-    forms = []
-    for form in (words, shorter, distinct, letters):
+    absent = {x for x in shared if x.lower() not in "\n".join(names).lower()}
+    capital, forms = r"(?-i:(?<=[a-z])(?=[A-Z]))", []
+    for omitted, number in (({}, ""), (absent, ""), (shared, ""), (shared, r"\d+")):
+        form = {
+            x: [y for y in z if y not in omitted and not re.fullmatch(number, y)] for x, z in words.items()
+        }
         # A shortened name must contain a letter. A bare number does not identify a joint, since the columns may be
         # numbered in another order than the joints.
-        if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
-            parts = {x: re.findall(r"\d+|[^\W\d_]+", "_".join(of_x)) for x, of_x in form.items()}
-            texts = {x: r"[\W_]?".join(of_x) for x, of_x in parts.items()}
-            forms.append({x: re.compile(_as_word(text), re.I) for x, text in texts.items()})
+        if not omitted or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
+            texts = {x: r"[\W_]?".join(re.findall(r"\d+|[^\W\d_]+", "_".join(y))) for x, y in form.items()}
+            word = rf"(?:(?<![^\W_])|{capital})%s(?:(?![^\W_])|{capital})"
+            forms.append({x: re.compile(word % text, re.I) for x, text in texts.items()})
     return next((x for x in forms if all(any(map(y.search, names)) for y in x.values())), forms[0])
-
-
-def _as_word(pattern: str) -> str:
-    """Return a regular expression that finds a pattern as a separate word; words may begin with a capital letter."""
-    capital = r"(?-i:(?<=[a-z])(?=[A-Z]))"
-    return rf"(?:(?<![^\W_])|{capital}){pattern}(?:(?![^\W_])|{capital})"
 
 
 def stated_units(schema: pa.Schema) -> dict[str, str]:
