@@ -144,7 +144,7 @@ def names_in_log(names: Mapping[str, str], logged: Sequence[str]) -> dict[str, s
     """Return {joint: its name in a log} for joints that are found in the names of a log (see `joint_patterns`).
 
     Of several names with a joint's name, the one with the fewest words is the joint's: panda_joint1 in place of
-    panda_finger_joint1. names: {joint: its name in the mapping}, by default that of the URDF.
+    panda_finger_joint1. names: {joint: its name in the mapping}, by default its name in the URDF.
     """
     patterns, found = joint_patterns(list(names.values()), logged), dict[str, str]()
     for joint, name in names.items():

@@ -57,7 +57,7 @@ def best_signal(columns: Sequence[ColumnName], joints: int, arm: Collection[str]
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. In this order, names with a word of the arm are preferred to those of other
+    differ only in the words of the joint. In this order, names with a word of the arm are preferred to names of other
     arms (`FR_0_actual` to `FL_0_actual` for the joints FR_hip, FR_knee), measurements to values that a model computed,
     torques to currents, signals of joints to signals of motors, names with a word such as "actual" to names with
     "feedback", which may be a term of a controller, and these to other names, unfiltered to filtered values, and names
