@@ -19,6 +19,7 @@ from spelgen.errors import SpelgenError
 from spelgen.log_checks.check_logs import check_logs
 from spelgen.logs.jumps import is_interrupted
 from spelgen.logs.read import read_logs, write_logs
+from spelgen.logs.recording import stale_rows
 from spelgen.logs.trajectory import Trajectory
 from spelgen.settings.log_mapping import SCALES
 
@@ -284,6 +285,17 @@ def test_values_that_stay_are_found_without_velocities_and_until_the_end(arm, qu
     message = message_of(load_arm(arm.robot.path), path)
     end = min(last, len(log))
     assert f"{quantity} that stays at" in message and f"in {end - start - 1} samples" in message
+
+
+def test_an_outlier_of_a_position_is_no_motion():
+    """Velocities and torques of a joint at rest are not stale because one of its positions was lost."""
+    t = 0.02 * np.arange(1000)
+    q, qd = np.full(1000, 0.4), np.zeros(1000)
+    q[800:], qd[800:] = 0.4 + np.sin(t[:200]), np.cos(t[:200])
+    q[40] = -3.14
+    tau = np.where(t < t[800], 2.0, 5.0 * np.cos(3.0 * t))
+    assert not stale_rows("qd", qd, t, q, qd, np.zeros(0)).any()
+    assert not stale_rows("tau", tau, t, q, np.zeros(0), np.zeros(0)).any()
 
 
 @pytest.mark.parametrize("ramp", [1, 3])

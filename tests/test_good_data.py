@@ -11,6 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 import torch
+import yaml
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, RunError, SpelgenError
@@ -316,6 +317,22 @@ def test_normalised_positions_of_lerobot_are_converted_by_the_calibration_or_ref
     (folder / "calibration.json").write_text(json.dumps({"shoulder": CALIBRATION["shoulder"]}))
     with pytest.raises(LogError, match="normalised range"):
         read_logs(folder, JOINTS, POSITION)
+
+
+def test_motors_of_an_arm_of_a_humanoid_are_found_among_those_of_both_arms(tmp_path):
+    """Motors have capital letters in place of underscores. Recorders of Unitree write them as a list of lists."""
+    names = [f"kLeft{x}" for x in ("Shoulder", "Elbow")] + [f"kRight{x}" for x in ("Shoulder", "Elbow")]
+    folder = dataset(tmp_path / "set", np.hstack([Q, Q + 1.0]), names=names)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    for feature in info["features"].values():
+        feature["names"] = [feature["names"]]
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    for side, offset in (("left", 0.0), ("right", 1.0)):
+        joints = [f"{side}_shoulder_joint", f"{side}_elbow_joint"]
+        found = suggest_mapping(folder, joints)
+        assert f'"{side}_elbow_joint": {{name: "k{side.title()}Elbow"}}' in found.text and not found.missing
+        (log,) = read_logs(folder, joints, POSITION | yaml.safe_load(found.text))
+        np.testing.assert_allclose(log.q, Q + offset, atol=1e-5)
 
 
 @pytest.mark.parametrize("form", ["features", "state"])

@@ -209,6 +209,33 @@ def test_sign_bits_and_outliers_of_half_a_turn_of_angles_without_limits(robots, 
     assert kept.q[:, 1] == pytest.approx(np.delete(columns["q_joint2"], 700), abs=1e-9)
 
 
+def test_small_outliers_of_the_motion_of_a_joint_at_rest_are_no_fault(robots, tmp_path):
+    arm = load_arm(robots / "two_link.urdf")
+    columns = motion(arm, 3)
+    noise = np.random.default_rng(1).normal(size=(2, len(columns["t"])))
+    noise[:, [500, 900]] = 100.0
+    columns["q_joint2"], columns["qd_joint2"] = 0.4 + 3e-8 * noise[0], 1e-5 * noise[1]
+    assert errors(read_logs(written(columns, tmp_path / "log.csv"), arm), arm) == ""
+    columns["qd_joint2"][700] = 3.0
+    assert "qd that deviates" in errors(read_logs(written(columns, tmp_path / "spike.csv"), arm), arm)
+
+
+@pytest.mark.parametrize("limit", [12.5, 4.0, 95.5])
+def test_registers_of_joints_without_limits_overflow_at_another_period_than_a_turn(robots, tmp_path, limit):
+    """A word of 16 bits represents -limit .. limit. Twice the limit may be close to whole turns, such as 25 rad."""
+    text = (robots / "two_link.urdf").read_text().replace('type="revolute"', 'type="continuous"')
+    (tmp_path / "x.urdf").write_text(text)
+    arm = load_arm(tmp_path / "x.urdf")
+    columns = motion(arm, 3)
+    t, step = columns["t"], 2 * limit / 65535
+    q = 4.5 * limit * np.sin(0.8 * t)
+    columns["qd_joint1"] = 3.6 * limit * np.cos(0.8 * t)
+    columns["q_joint1"] = np.floor((q + limit) / step) % 65536 * step - limit
+    (log,) = read_logs(written(columns, tmp_path / "log.csv"), arm)
+    assert np.ptp(log.q[:, 0] - q) < 3 * step
+    assert any("wraps at" in remark for remark in log.remarks)
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("form", ["sign bit", "unsigned"])
 def test_words_of_a_load_register_are_named_too(arm, tmp_path, form, seed):

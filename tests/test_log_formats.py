@@ -23,6 +23,7 @@ import yaml
 from spelgen.arm.configured_arm import load_arm
 from spelgen.errors import LogError, SettingsError, SpelgenErrors
 from spelgen.logs import checks, formats, npz
+from spelgen.logs.bags import names_in_log
 from spelgen.logs.formats import FORMATS
 from spelgen.logs.read import read_logs, write_logs
 from spelgen.logs.suggest import suggest_mapping
@@ -521,8 +522,15 @@ def test_the_line_that_maps_prefixed_names_of_a_bag_is_right(bag, prefix):
     (line,) = re.findall(r"write '(.*)' under 'logs'", str(caught.value))
     mapping = LogMapping.model_validate(yaml.safe_load(f"{{{line}}}"))
     check(read_logs([folder], joints, mapping=mapping)[0], "bag", rtol=1e-12)
-    with pytest.raises(LogError, match=r"messages of ROS, .* other names of joints are mapped by 'name'"):
-        suggest_mapping(folder, JOINTS)
+    drafted = LogMapping.model_validate(yaml.safe_load(suggest_mapping(folder, joints).text))
+    check(read_logs([folder], joints, mapping=drafted)[0], "bag", rtol=1e-12)
+
+
+def test_names_of_fingers_are_no_names_of_the_arm_and_two_arms_are_ambiguous():
+    joints = {f"fer_joint{k}": f"fer_joint{k}" for k in (1, 2)}
+    fingers = [f"panda_{x}joint{k}" for x in ("finger_", "") for k in (1, 2)]
+    assert names_in_log(joints, fingers) == {x: x.replace("fer", "panda") for x in joints}
+    assert not names_in_log(joints, [f"{side}_joint{k}" for side in ("left", "right") for k in (1, 2)])
 
 
 def test_of_several_topics_one_is_named(bag):

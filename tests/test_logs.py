@@ -338,6 +338,16 @@ def test_many_turns_are_believed_where_the_units_are_declared(tmp_path):
         check(read_logs([tmp_path], JOINTS), JOINTS, ("revolute", "revolute"))
 
 
+def test_degrees_of_most_joints_are_the_unit_of_a_joint_that_hardly_moves():
+    """Without logged velocities, nothing shows that the third joint, which moves by 4 degrees, is in rad."""
+    t = swing().t
+    q = np.degrees(np.stack([np.sin(3 * t), np.cos(2 * t), 0.2 + 0.03 * np.sin(t)], axis=1))
+    mapping = LogMapping(velocity="differentiated")
+    log = Trajectory(t, q, np.gradient(q, t, axis=0), np.cos(q), mapping=mapping)
+    with pytest.raises(LogError, match=r"'a', 'b': got q .* q in deg, .*; write 'units: \{q: deg\}' under"):
+        check([log], ("a", "b", "c"), ("revolute",) * 3)
+
+
 def test_a_velocity_that_is_no_derivative_is_a_warning():
     (note,) = check([scaled(swing(), qd=np.array([1.0, 1.3]))], JOINTS, ("revolute", "revolute"))
     assert (note.severity, note.code, note.where) == (

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +28,7 @@ import spelgen
 from spelgen.cli.main import app
 from spelgen.dynamics.servo_rollout import replayed
 from spelgen.errors import LogError, OptionError, RunError, SettingsError
+from spelgen.evaluation.evaluate import read_test_logs
 from spelgen.files import write_json
 from spelgen.fitting.levenberg_marquardt import NormalEquations
 from spelgen.fitting.run_folder import RunFolder
@@ -71,6 +73,14 @@ def fitted(arm, logs, tmp_path_factory):
 def results(fitted, logs):
     """Return the evaluation of the fitted model on the last log, which was not used for the fit."""
     return spelgen.evaluate(fitted, logs[5:])
+
+
+def test_test_logs_of_a_servo_run_are_read_with_a_file_of_names_only(fitted, arm, logs, tmp_path):
+    text = Path(spelgen.write_logs(tmp_path / "log.csv", logs[5:], arm)).read_text()
+    (tmp_path / "other.csv").write_text(text.replace("elbow", "e"))
+    (tmp_path / "map.yaml").write_text("joints: {elbow: {name: e}}\n")
+    (read,) = read_test_logs(fitted.folder, [tmp_path / "other.csv"], tmp_path / "map.yaml")
+    np.testing.assert_allclose(read.u, logs[5].u, atol=1e-9)
 
 
 def test_ratios_to_kp_are_found(fitted):

@@ -278,6 +278,15 @@ def test_periodic_commands_are_no_increments_and_have_no_opposite_sense(arm):
     assert not spelgen.check_logs([log], arm).errors
 
 
+def test_a_joint_at_rest_in_one_of_several_recordings_has_no_other_unit(arm, logs):
+    """Dry friction holds a joint whose command changes by 1 degree. Positions without velocities have no wrong ones."""
+    u, q = logs[0].u.copy(), logs[0].q.copy()
+    u[:, 1], q[:, 1] = 0.3 + 0.02 * (u[:, 1] - u[:, 1].mean()), 0.3 + 0.004 * (q[:, 1] - q[:, 1].mean())
+    held = replace(logs[0], u=u, q=q, mapping=LogMapping(input="position", velocity="differentiated"))
+    found = spelgen.check_logs([held, *logs[1:]], arm)
+    assert not found.errors and "velocity-is-no-derivative" not in codes(found)
+
+
 def opposite(log, k):
     sign = 1.0 - 2.0 * (np.arange(2) == k)
     return replace(log, q=log.q * sign, qd=log.qd * sign, u=log.u * sign)

@@ -235,6 +235,25 @@ def test_a_file_of_torques_only_is_to_be_joined_with_the_positions(scara, tmp_pa
     # the error must not advise to rename the columns of effort to q
     with pytest.raises(LogError, match="or write their names under 'logs'"):
         read_logs(path, scara)
+    # files without times cannot be merged by them: their rows are joined
+    without_times = written(tmp_path / "untimed.csv", head[1:], TAU)
+    with pytest.raises(LogError, match=r"no positions .*join\(pandas.read_csv\(OTHER\), lsuffix"):
+        suggest_mapping(without_times, scara.chain.joint_names)
+
+
+def test_actual_and_target_positions_of_one_of_four_legs_are_found(tmp_path):
+    legs = ("FR", "FL", "RR", "RL")
+    head = [
+        "timestamp",
+        *(f"{leg}_{k}_{x}" for leg in legs for k in range(3) for x in ("target", "actual", "error")),
+    ]
+    values = np.random.default_rng(0).normal(size=(len(T), 36)).cumsum(axis=0)
+    path = written(tmp_path / "legs.csv", head, np.column_stack([T, values]))
+    for leg in legs:
+        found = suggest_mapping(path, [f"{leg}_{x}_joint" for x in ("hip", "thigh", "calf")], commands=True)
+        for k, part in enumerate(("hip", "thigh", "calf")):
+            columns = f'columns: {{"q": "{leg}_{k}_actual", "u": "{leg}_{k}_target"}}'
+            assert f'"{leg}_{part}_joint":\n    {columns}' in found.text
 
 
 def test_a_row_per_joint_is_to_be_pivoted(scara, tmp_path):

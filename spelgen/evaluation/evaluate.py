@@ -133,9 +133,10 @@ def read_test_logs(
     if mapping is None:
         mapping = record.mapping
     # The names in a mapping are checked against all joints of the URDF, not only the joints of the model: one mapping
-    # may be used for several models of an arm.
+    # may be used for several models of an arm. The file need not state that the logs have commanded positions.
     elif isinstance(mapping, str | Path) and run.urdf.exists():
         mapping = load_mapping(mapping, read_urdf(run.urdf).joint)
+        mapping = mapping.model_copy(update={"input": record.mapping.input})
     return read_logs(paths, spec.joint_names, mapping, "test", joint_types=spec.joint_types)
 
 

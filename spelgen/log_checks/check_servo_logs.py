@@ -438,7 +438,8 @@ def _command_faults(
     for k, (correlation, gain) in enumerate(zip(correlations, following.gain, strict=True)):
         if k in faults:
             continue
-        if correlation > FOLLOWS and abs(np.log(gain)) > np.log(3):
+        # A joint whose command hardly changes may be held by dry friction: it moves less than the command.
+        if correlation > FOLLOWS and (gain > 3 or (following.moves[k] and gain < 1 / 3)):
             units = _command_units(gain, mapping.unit("q", joints[k]), mapping.unit("u", joints[k]))
             got, do = f"positions that move {gain:.3g} times as far as commands", "log both in one unit"
             faults[k] = CommandFault(got, "both in the same unit", {"units": units} if units else {}, do)

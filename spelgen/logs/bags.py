@@ -5,6 +5,7 @@ This module reads the records of such a file itself. A record is an operation co
 body. https://mcap.dev/spec
 """
 
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
@@ -139,22 +140,32 @@ def _joint_states(
     return columns
 
 
+def names_in_log(names: Mapping[str, str], logged: Sequence[str]) -> dict[str, str]:
+    """Return {joint: its name in a log} for joints that are found in the names of a log (see `joint_patterns`).
+
+    Of several names with a joint's name, the one with the fewest words is the joint's: panda_joint1 in place of
+    panda_finger_joint1. names: {joint: its name in the mapping}, by default its name in the URDF.
+    """
+    patterns, found = joint_patterns(list(names.values()), logged), dict[str, str]()
+    for joint, name in names.items():
+        words = {x: len(re.findall(r"[^\W_]+", x)) for x in logged if patterns[name].search(x)}
+        fewest = [x for x, count in words.items() if count == min(words.values())]
+        found |= {joint: fewest[0]} if len(fewest) == 1 else {}
+    return found
+
+
 def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
     """Return the advice, for an error message, to map the names of joints to names in the log.
 
-    The mapping gives each joint of the URDF a name, by default the URDF's. The log has other names. A joint's name is
-    searched in them, in full or without the words that all joint names share: "fer_j1" is found by "j1" in "panda_j1"
-    (see `joint_patterns`). If each joint is found in exactly one logged name, the advice contains the settings that map
-    the names; otherwise it shows the form of the settings for one joint.
-
-    names: {joint: its name in the mapping}. logged: names of joints in the log.
+    For the arguments and the search see `names_in_log`. Joints that are not found have a placeholder.
     """
-    patterns = joint_patterns(list(names.values()), logged)
-    matches = {joint: list(filter(patterns[name].search, logged)) for joint, name in names.items()}
-    if all(len(full_names) == 1 for full_names in matches.values()):
-        return mapping_line({"joints": {x: {"name": full_name} for x, (full_name,) in matches.items()}})
-    line = mapping_line({"joints": {next(iter(names)): {"name": "NAME IN THE LOG"}}})
-    return f"{line}, and so for the other joints"
+    found = names_in_log(names, logged)
+    return mapping_line({"joints": {x: {"name": found.get(x, "NAME IN THE LOG")} for x in names}})
+
+
+def logged_names(path: Path) -> list[str]:
+    """Return the names of all joints in the joint states of a bag."""
+    return list(dict.fromkeys(name for message in _messages(path, None, []) for name in message.state.name))
 
 
 def _messages(path: Path, topic: str | None, remarks: list[str]) -> Iterator[StampedState]:

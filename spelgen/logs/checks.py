@@ -279,7 +279,7 @@ class LogChecks:
         self.products = np.zeros((2 * len(joints),) * 2)
         self._joints, self._kinds = joints, dict(zip(joints, joint_types, strict=True))
         self._results: dict[tuple[str, AnyCheck], list[tuple[Advice, str, Path | None]]] = {}
-        self._count = 0
+        self._count, self._has_velocities = 0, False
         self._fingerprints = Fingerprints()
 
     def add(self, trajectory: Trajectory) -> Trajectory:
@@ -289,6 +289,7 @@ class LogChecks:
         an unknown reason are replaced by dq/dt.
         """
         self._count += 1
+        self._has_velocities |= "qd" in trajectory.mapping.quantities
         findings: list[tuple[AnyCheck, Advice]] = run_checks(CLOCK_CHECKS, trajectory, trajectory.accepted)
         findings += [(REPAIRED, Advice(message)) for message in trajectory.repairs]
         findings += [(REMARKED, Advice(message)) for message in trajectory.remarks]
@@ -375,7 +376,7 @@ class LogChecks:
         """Return the settings for the group `logs` that correct one fault of several joints.
 
         If the fault is a wrong unit of most joints of one type (revolute or prismatic), the units are also set for the
-        other joints of this type, unless a joint's ratio of dq/dt to qd contradicts the units.
+        other joints of this type, unless a joint's ratio of dq/dt to qd, if logged, contradicts the units.
 
         entries: {joint: settings of this joint that correct the fault}.
         """
@@ -385,7 +386,8 @@ class LogChecks:
         factors, _ = velocity_agreement(self.products)
         is_shared = "units" in entries[first] and 2 * len(entries) > len(self._limited(first))
         for joint, factor in zip(self._joints, factors.tolist(), strict=True):
-            if is_shared and joint in kin and (np.isnan(factor) or is_factor(factor, ratio)):
+            is_unknown = np.isnan(factor) or not self._has_velocities
+            if is_shared and joint in kin and (is_unknown or is_factor(factor, ratio)):
                 entries.setdefault(joint, {"units": dict(units)})
         return joint_keys(entries, self._joints)
 

@@ -5,7 +5,7 @@ Names may have words of several languages.
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -150,7 +150,8 @@ def columns_by_quantity(
             if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
                 commanded.append(column)
             continue
-        if quantity is None and (column.joint or column.words & {"joint", "joints", "axis", "axes"}):
+        is_numbered = column.number >= 0 and column.words & (MEASURED | {"joint", "joints", "axis", "axes"})
+        if quantity is None and (column.joint or is_numbered):
             unstated.append(column)
         if quantity in by_quantity:
             by_quantity[quantity].append(column)
@@ -162,19 +163,21 @@ def columns_by_quantity(
     return by_quantity
 
 
-def best_signal(columns: Sequence[ColumnName], joints: int) -> Sequence[ColumnName]:
+def best_signal(columns: Sequence[ColumnName], joints: int, arm: Collection[str]) -> Sequence[ColumnName]:
     """Return the columns of the best signal of a quantity, for example of the measured and not the desired positions.
 
     A log may contain several signals of a quantity, each with a column for each joint. Names of a signal's columns
-    differ only in the words of the joint. In this order, measurements are preferred to values that a model computed,
+    differ only in the words of the joint. In this order, names with a word of the arm are preferred to names of other
+    arms (`FR_0_actual` to `FL_0_actual` for the joints FR_hip, FR_knee), measurements to values that a model computed,
     torques to currents, signals of joints to signals of motors, names with a word such as "actual" to names with
     "feedback", which may be a term of a controller, and these to other names, unfiltered to filtered values, and names
     with few words to longer names. Example: `tau_J` is preferred to `tau_hat_filtered`.
 
     columns: all columns of the quantity, which are returned if no signal has a column for each of the `joints`.
+    arm: words that all joint names share.
     """
     complete = complete_signals(columns, joints)
-    best = min(reversed(complete), key=_rank, default=frozenset[str]())
+    best = min(reversed(complete), key=lambda x: _rank(x, arm), default=frozenset[str]())
     return complete.get(best, columns)
 
 
@@ -190,18 +193,19 @@ def complete_signals(columns: Sequence[ColumnName], joints: int) -> dict[frozens
     return {words: named for words, named in signals.items() if len(named) >= joints}
 
 
-def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> None:
+def require_one_arm(columns: Sequence[ColumnName], joints: int, arm: Collection[str], file: Path) -> None:
     """Raise LogError for positions of several arms, such as `left_q1` and `right_q1`, or q0 to q13 of 7 joints.
 
-    columns: columns of changing positions in the log `file`. joints: number of joints.
+    columns: columns of changing positions in the log `file`. joints: number of joints. arm: words that all joint names
+    share; columns with such a word belong to the arm.
     """
     signals = complete_signals(columns, joints)
-    best = min(signals, key=_rank, default=frozenset[str]())
+    best = min(signals, key=lambda x: _rank(x, arm), default=frozenset[str]())
     # `best` is the set of words in the names of the preferred signal. `arms` contains `best` and the sets that differ
     # from it only in unknown words (not in `KNOWN`), such as "left" and "right": these may name arms. The names of two
     # arms may also differ only in numbers, such as q0 to q13. Numbers are no words, so these columns are one signal,
     # with more columns than joints.
-    arms = [x for x in signals if _rank(x) == _rank(best) and not (x ^ best) & KNOWN]
+    arms = [x for x in signals if _rank(x, arm) == _rank(best, arm) and not (x ^ best) & KNOWN]
     of_joint: dict[str, list[str]] = {}
     for column in chain.from_iterable(signals[x] for x in arms):
         label = column.joint or (str(column.number) if column.number >= 0 else column.name)
@@ -221,11 +225,11 @@ def require_one_arm(columns: Sequence[ColumnName], joints: int, file: Path) -> N
         )  # fmt: skip
 
 
-def _rank(words: frozenset[str]) -> list[int]:
+def _rank(words: frozenset[str], arm: Collection[str]) -> list[int]:
     """Return the sort key of a signal with these words; `best_signal` prefers the signal with the smallest key."""
     ranks = [not words.isdisjoint(x) for x in (COMPUTED, CURRENT, {"motor", "theta"})]
     measured = [words.isdisjoint(MEASURED - FEEDBACK), words.isdisjoint(FEEDBACK)]
-    return [*ranks, *measured, not words.isdisjoint(FILTERED), len(words)]
+    return [words.isdisjoint(arm), *ranks, *measured, not words.isdisjoint(FILTERED), len(words)]
 
 
 def columns_by_joint(

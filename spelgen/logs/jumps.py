@@ -335,7 +335,7 @@ def _word_sizes(values: np.ndarray, turn: float | None) -> list[float]:
     differences = differences[differences > FINEST_WORD * np.ptp(values)]
     if differences.size:
         step = float(differences.min())
-        numbers = values / step
+        numbers = (values - levels[0]) / step  # zero may lie between two steps
         if np.abs(numbers - np.round(numbers)).max() < 0.02:
             sizes += [step * 2.0**k for k in range(10, 18)]
     return sizes

@@ -296,9 +296,11 @@ def _motor_names(folder: Path, info: Any, feature: str) -> list[str]:
     """
     try:
         names = info["features"][feature]["names"] or []
-        if isinstance(names, dict):  # LeRobot writes the names of motors as a list, or as a dict of lists.
-            names = chain(*names.values())
-        return [str(name).removesuffix(ENDING) for name in names]
+        # LeRobot writes the names of motors as a list or as a dict of lists, Unitree's recorders as a list of lists.
+        lists = (
+            names.values() if isinstance(names, dict) else [x if isinstance(x, list) else [x] for x in names]
+        )
+        return [str(name).removesuffix(ENDING) for name in chain(*lists)]
     except (KeyError, TypeError, AttributeError) as error:
         raise LogError(
             f"no names of {feature} ({type(error).__name__})", file=folder / INFO,

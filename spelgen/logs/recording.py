@@ -127,6 +127,9 @@ def _unwrap(rows: Rows) -> None:
             # a period. A check reports such words.
             if word is not None and word.key == "sign_bit":
                 continue
+            # The register of a joint without limits may overflow at another period than a turn, such as 25 rad.
+            if word is not None and abs(period - 2 * pi) < 1e-6:
+                period = word.value * abs(scale)
         result = unwrapped(column, period)
         if quantity == "u":
             # Registers of commands and of positions may start in different revolutions. The commands are shifted by
@@ -245,6 +248,8 @@ def stale_rows(
         # friction may hold servos of an SO-101 at rest while their commands change by up to 0.13 rad.
         margin = round(0.25 / max(float(np.median(np.diff(t))), 1e-3))
         return is_stale(values, u, COMMANDED, margin) if quantity == "q" else np.zeros(len(t), bool)
+    sound = ~is_outlier(q, smooth=True)
+    q = np.interp(t, t[sound], q[sound])  # an outlier is no motion
     if quantity == "tau":
         speed = qd if qd.size else np.gradient(q, t)
         change = 0.2 * float(np.ptp(speed))

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from spelgen.errors import LogError, shortened
 from spelgen.labels import listed
+from spelgen.logs.bags import logged_names, names_in_log
 from spelgen.logs.column_names import (
     COMMANDED,
     CURRENT,
@@ -30,7 +31,7 @@ from spelgen.logs.column_names import (
     parse_column_name,
     require_one_arm,
 )
-from spelgen.logs.formats import BAG, FORMATS, LEROBOT, format_of
+from spelgen.logs.formats import BAG, LEROBOT, format_of
 from spelgen.logs.parquet_files import dataset_motors
 from spelgen.logs.row_names import first_list, rows_by_names
 from spelgen.logs.tables import JOINTS_KEY, SERVO_ADVICE, joint_patterns, reading, stated_units, stored_names
@@ -39,9 +40,11 @@ from spelgen.logs.unit_checks import time_unit
 from spelgen.logs.values import logged_column
 from spelgen.settings.log_mapping import CURRENTS, LogMapping, mapped_unit
 
-JOINING = (
-    "join files with a signal each by their times, in Python: pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), "
-    "on='t', suffixes=('_q', '_tau')).to_csv('log.csv', index=False)"
+JOINING = "join files with a signal each in Python: {}.to_csv('log.csv', index=False)"
+BY_TIME = "pandas.read_csv(FILE).merge(pandas.read_csv(OTHER), on={!r}, suffixes=('_q', '_tau'))"
+BY_ROW = "pandas.read_csv(FILE).join(pandas.read_csv(OTHER), lsuffix='_q', rsuffix='_tau')"
+MOTORS = (
+    "# LeRobot stores degrees (units: {q: deg}) or -100..100 (units: {q: normalised}, and a calibration)."
 )
 
 
@@ -59,18 +62,16 @@ def suggest_mapping(file: Path, joints: Sequence[str], *, commands: bool = False
     """Return a draft of the column mapping for a log file, from the names and first values of its columns.
 
     commands: True if the log contains commanded positions instead of torques. Raises LogError for a file that cannot be
-    read, is a ROS bag, has joint names in a column, has positions of several arms, or has no positions but only torques
-    or only commands. If `commands` is False, LogError is also raised for a file without torques that has commanded
+    read, has joint names in a column, has positions of several arms, or has no positions but only torques or only
+    commands. If `commands` is False, LogError is also raised for a file without torques that has commanded
     positions, or only times, positions and velocities.
     """
     log_format = format_of(file)
     if log_format is LEROBOT:
-        return _dataset_mapping(file, joints)
-    assert log_format is not None, "log_files gives logs alone"
+        return _mapping_of_names(file, joints, dataset_motors(file), MOTORS)
     if log_format is BAG:
-        suffixes = " or ".join(x.suffixes[0] for x in FORMATS if not x.marker)
-        do = "other names of joints are mapped by 'name' under 'logs', 'joints'"
-        raise LogError("messages of ROS, with names and units", file=file, expected=suffixes, do=do)
+        return _mapping_of_names(file, joints, logged_names(file))
+    assert log_format is not None, "log_files gives logs alone"
     with reading(file):
         table = log_format.read(file, (), LogMapping())[0].read(None)
     return _table_mapping(table, file, joints, commands)
@@ -95,6 +96,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     names, stated = _names(table), stated_units(table.schema)
     labels = joint_patterns(joints, names)
     columns = [parse_column_name(x, labels, stated.get(x, ""), dates.get(x, set())) for x in names]
+    arm = set.intersection(*(set(re.findall(r"[^\W\d_]+", x.lower())) for x in joints))
     if not commands:
         columns = _with_letters(_with_states(columns, table, len(joints)), table)
     columns_of = columns_by_quantity(columns, commands, len(joints))
@@ -105,12 +107,12 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
         raise LogError("commanded positions and no torques", file=file, expected="torques", do=SERVO_ADVICE)
     # Constant columns are omitted: they may belong to a second arm that is at rest.
     moving = _changing(columns_of["q"], table)
-    require_one_arm(moving, len(joints), file)
+    require_one_arm(moving, len(joints), arm, file)
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
     # to a base or gripper at rest. A base at rest has seven positions, but six velocities and torques.
-    moved = {x.number for x in best_signal(moving, len(joints))}
+    moved = {x.number for x in best_signal(moving, len(joints), arm)}
     if len(moved) == len(joints):
         count = len(columns_of["q"])
         for quantity, named in columns_of.items():
@@ -121,7 +123,7 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # The order of numbered columns may differ from the order of the arm's joints: ROS often sorts joints by name. If
     # cells of the log contain joint names, they state the order.
     order = _order_in_cells(table, joints)
-    signals = {x: best_signal(named, len(joints)) for x, named in columns_of.items()}
+    signals = {x: best_signal(named, len(joints), arm) for x, named in columns_of.items()}
     by_joint = {x: columns_by_joint(named, joints, order) for x, named in signals.items()}
     used = {clock.name, *(column.name for named in by_joint.values() for column in named.values())}
     if not by_joint["q"]:
@@ -134,7 +136,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     if absent and used.issuperset(x.name for x in columns):
         expected = "all signals of a recording in one file"
         got = f"no {listed(absent)} in addition to its other columns"
-        raise LogError(got, file=file, expected=expected, do=JOINING)
+        join = BY_TIME.format(clock.name) if clock.name else BY_ROW
+        raise LogError(got, file=file, expected=expected, do=JOINING.format(join))
     # A mapping has columns of velocities for all joints or for none. If the velocities of a joint are absent, all
     # velocities are computed from positions.
     if not commands and len(by_joint["qd"]) < len(joints):
@@ -147,8 +150,9 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     unused = {x: [y.name for y in named if y.name not in used] for x, named in columns_of.items()}
     unused = {x: abbreviated_names(y) for x, y in unused.items()}
     lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
-    unknown = _unknown_units({**by_joint, "t": {"": clock}})
-    lines += [f"# not a known unit of {quantity}: {unit}" for quantity, unit in unknown]
+    stated_by = {**by_joint, "t": {"": clock}}
+    pairs = sorted({(x, column.unit) for x, named in stated_by.items() for column in named.values()})
+    lines += [f"# not a known unit of {x}: {unit}" for x, unit in pairs if unit and not mapped_unit(x, unit)]
     missing = [f"{x} of {joint}" for joint in joints for x, named in by_joint.items() if joint not in named]
     lines += [f"# no column was found for {name}" for name in missing]
     return Suggestion("\n".join([*lines, ""]), tuple(missing))
@@ -162,7 +166,8 @@ def _mapping_lines(
     clock: column of the times, with the name "" if there is none. by_joint: {quantity: {joint: column}}.
     """
     units = _units(by_joint, joints)
-    common = {"t": unit_of_times} | _common(units)
+    # Units that all joints have are stated once.
+    common = {"t": unit_of_times} | dict(sorted(set.intersection(*(set(x.items()) for x in units.values()))))
     rate = "sample_rate: # [Hz] of the rows, which have no times: write its value"
     is_divided = any("{trajectory}" in x.name for x in by_joint["q"].values())
     lines = [
@@ -175,17 +180,7 @@ def _mapping_lines(
         lines.append("velocity: differentiated")
     if any(x.words & COMMANDED for x in by_joint.get("tau", {}).values()):
         lines.append("# tau: commanded torques, since no others were logged")
-    return [
-        *lines,
-        "joints:",
-        *chain.from_iterable(_joint_lines(x, by_joint, units[x], common) for x in joints),
-    ]
-
-
-def _unknown_units(by_joint: ByJoint) -> list[tuple[str, str]]:
-    """Return the pairs (quantity, unit) of columns whose unit is not known, in ascending order."""
-    pairs = {(quantity, column.unit) for quantity, named in by_joint.items() for column in named.values()}
-    return sorted((quantity, unit) for quantity, unit in pairs if unit and not mapped_unit(quantity, unit))
+    return [*lines, "joints:", *chain(*(_joint_lines(x, by_joint, units[x], common) for x in joints))]
 
 
 def _with_states(columns: Sequence[ColumnName], table: pa.Table, joints: int) -> list[ColumnName]:
@@ -352,19 +347,17 @@ def _joint_lines(
         yield "    counts_per_turn: 4096 # of the joint, the gear included: write its value"
 
 
-def _dataset_mapping(folder: Path, joints: Sequence[str]) -> Suggestion:
-    """Return a draft of the mapping for a LeRobot data set, which assigns a motor to each joint by name."""
-    motors = dataset_motors(folder)
-    motor_of = {x: next(filter(y.search, motors), None) for x, y in joint_patterns(joints, motors).items()}
+def _mapping_of_names(log: Path, joints: Sequence[str], logged: Sequence[str], *comments: str) -> Suggestion:
+    """Return a draft of the mapping for a log that has joints or motors with these names, and no columns to choose."""
+    name_of = names_in_log({x: x for x in joints}, logged)
     lines = [
-        f"# Drafted from the motors of {json.dumps(folder.name)}: check it.",
-        "# LeRobot stores degrees, 'units: {q: deg}', or -100..100 of the calibrated range:",
-        "# 'units: {q: normalised}' and 'calibration:' with the content of the robot's calibration file.",
+        f"# Drafted from the names of joints in {json.dumps(log.name)}: check it.",
+        *comments,
         "joints:",
-        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in motor_of.items() if name),
+        *(f"  {json.dumps(joint)}: {{name: {json.dumps(name)}}}" for joint, name in name_of.items()),
     ]
-    missing = [f"q of {joint}" for joint, name in motor_of.items() if not name]
-    lines += [f"# no motor was found for {name}" for name in missing]
+    missing = [f"q of {joint}" for joint in joints if joint not in name_of]
+    lines += [f"# no name was found for {name}" for name in missing]
     return Suggestion("\n".join([*lines, ""]), tuple(missing))
 
 
@@ -387,12 +380,6 @@ def _units(by_joint: ByJoint, joints: Sequence[str]) -> dict[str, dict[str, str]
             if unit is not None and (quantity != "u" or unit != units[joint].get("q")):
                 units[joint][quantity] = unit
     return units
-
-
-def _common(units: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Return {quantity: unit} of the units that all joints have. units: {joint: {quantity: unit}}."""
-    first = next(iter(units.values()), {})
-    return {x: unit for x, unit in first.items() if all(y.get(x) == unit for y in units.values())}
 
 
 def _unit_of_times(name: str, table: pa.Table) -> str | None:

@@ -255,27 +255,31 @@ def _naming(unused: Collection[str]) -> str:
 def joint_patterns(joints: Sequence[str], names: Collection[str]) -> dict[str, re.Pattern[str]]:
     """Return {joint: pattern that finds its name as a separate word}: the joint 1 is found in `q_1`, but not in `q_12`.
 
-    Three forms of the joint names are searched in `names`, the column names. The first form that finds all joints is
-    used:
+    Four forms of the joint names are searched in `names`, the column names. The first form that finds all joints is
+    used. A new word may also begin with a capital letter, as in `kLeftElbow`.
 
     1. The full name.
-    2. The name without the words that all joints share: `shoulder_pan` for shoulder_pan_joint.
-    3. The name without these words and without numbers: `S` for joint_1_s.
+    2. The name without the words that all joints share and no column has: `left_elbow` for left_elbow_joint. A shared
+       word that columns have, such as `left`, may distinguish two arms.
+    3. The name without the words that all joints share: `shoulder_pan` for shoulder_pan_joint.
+    4. The name without these words and without numbers: `S` for joint_1_s.
 
     If no form finds all joints, the full name is used.
     """
     words = {joint: re.findall(r"[^\W_]+", joint) for joint in joints}
     shared = set.intersection(*map(set, words.values())) if len(joints) > 1 else set()
-    distinct = {joint: [x for x in of_joint if x not in shared] for joint, of_joint in words.items()}
-    letters = {joint: [x for x in of_joint if not x.isdigit()] for joint, of_joint in distinct.items()}
-    forms = []
-    for form in (words, distinct, letters):
+    absent = {x for x in shared if x.lower() not in "\n".join(names).lower()}
+    capital, forms = r"(?-i:(?<=[a-z])(?=[A-Z]))", []
+    for omitted, number in (({}, ""), (absent, ""), (shared, ""), (shared, r"\d+")):
+        form = {
+            x: [y for y in z if y not in omitted and not re.fullmatch(number, y)] for x, z in words.items()
+        }
         # A shortened name must contain a letter. A bare number does not identify a joint, since the columns may be
         # numbered in another order than the joints.
-        if form is words or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
-            parts = {joint: re.findall(r"\d+|\D+", "_".join(of_joint)) for joint, of_joint in form.items()}
-            texts = {x: r"[\W_]?".join(re.escape(y.strip("_")) for y in of_x) for x, of_x in parts.items()}
-            forms.append({x: re.compile(rf"(?<![^\W_]){text}(?![^\W_])", re.I) for x, text in texts.items()})
+        if not omitted or all(any(not x.isdigit() for x in of_joint) for of_joint in form.values()):
+            texts = {x: r"[\W_]?".join(re.findall(r"\d+|[^\W\d_]+", "_".join(y))) for x, y in form.items()}
+            word = rf"(?:(?<![^\W_])|{capital})%s(?:(?![^\W_])|{capital})"
+            forms.append({x: re.compile(word % text, re.I) for x, text in texts.items()})
     return next((x for x in forms if all(any(map(y.search, names)) for y in x.values())), forms[0])
 
 

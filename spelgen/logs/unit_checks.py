@@ -244,7 +244,7 @@ def find_wrong_velocity(signals: JointSignals) -> str | Advice | None:
     """Return a finding if qd is not dq/dt, with advice if another sign or other columns correct it."""
     factor, correlation, tolerance = signals.factor, signals.correlation, 1 - SIGNALS.agreement
     # If the median time step exceeds 0.5 s, the times are not in seconds, and dq/dt is wrong: see `find_time_unit`.
-    if signals.step > SIGNALS.slowest_step:
+    if signals.step > SIGNALS.slowest_step or "qd" not in signals.trajectory.mapping.quantities:
         return None
     if np.isnan(correlation) or signals.is_at_rest or _is_below_resolution(signals):
         return None
