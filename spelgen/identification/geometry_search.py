@@ -188,8 +188,7 @@ def _weighed(
     hypothesis must lower both costs.
 
     If the model with hysteresis explains the torques of moving joints under `base` (`GEOMETRY.exact`), a lower torque
-    residual may be due to errors of the friction model. The decrease of a hypothesis without other delays is then 0
-    unless `_is_certain`.
+    residual may be due to errors of the friction model. The decrease is then 0 unless `_is_certain`.
 
     Args:
         problem: problem without hysteresis.
@@ -210,10 +209,10 @@ def _weighed(
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:
             other_fit = stateful.fit(hypothesis)
             other = other_fit.cost - least.cost
-            is_late = (np.append(hypothesis.delay, hypothesis.drift) != times).any()
+            is_late = bool((np.append(hypothesis.delay, hypothesis.drift) != times).any())
             change = max(other, change if is_late else min(change, other / 2))
             moved = moving | hypothesis.signals(problem.samples).moving_joints
-            if is_exact and not is_late and not _is_certain((plain, fit), (least, other_fit), moved):
+            if is_exact and not _is_certain((plain, fit), (least, other_fit), moved, is_late):
                 change = 0.0
         best[k] = replace(fit, cost=base.cost + change)
     return best
@@ -223,24 +222,30 @@ def _is_certain(
     plain: tuple[HypothesisFit, HypothesisFit],
     stateful: tuple[HypothesisFit, HypothesisFit],
     moving: np.ndarray,
+    is_late: bool,
 ) -> bool:
     """Return True if a hypothesis is better than another one by more than errors of the friction model explain.
 
-    It must concern joints that move. If it does not exchange joints, it must also have more plausible parameters in
-    both models, by `GEOMETRY.ambiguous`, or lower the squared residual of a joint to a tenth.
+    It must concern joints that move. If it does not exchange whole joints, it must also lower the squared residual of a
+    joint with hysteresis to a fifth, or have more plausible parameters in both models, by `GEOMETRY.ambiguous`. Delays
+    are as plausible as hysteresis, so only the residual counts for them.
 
-    plain, stateful: fits of the other hypothesis and of this one, without and with hysteresis. moving: (n,) mask.
+    Args:
+        plain: fits of the other hypothesis and of this one, without hysteresis.
+        stateful: the same with hysteresis.
+        moving: mask (n,) of the joints that move.
+        is_late: True if the hypothesis has other delays.
     """
     old, new = (fit.hypothesis for fit in plain)
-    exchanged = (old.source != new.source).any(axis=0)
-    if exchanged.any():
-        return bool(moving[exchanged].all())
-    changed = (old.scale != new.scale).any(axis=0) | (old.offset != new.offset)
+    exchanged = old.source != new.source
+    if exchanged.any() and (exchanged[0] == exchanged[1]).all():
+        return bool(moving[exchanged[0]].all())
+    changed = (exchanged | (old.scale != new.scale)).any(axis=0) | (old.offset != new.offset)
     if changed.any() and not moving[changed].any():
         return False
+    is_lower = stateful[1].errors < 0.2 * stateful[0].errors
     gain = min(before.penalties - after.penalties for before, after in (plain, stateful))
-    is_lower = stateful[1].errors < 0.1 * stateful[0].errors
-    return gain > GEOMETRY.ambiguous or bool(is_lower[moving].any())
+    return bool(is_lower[moving].any()) or (gain > GEOMETRY.ambiguous and not is_late)
 
 
 def _with_likely_senses(problem: GeometryProblem, fit: HypothesisFit) -> HypothesisFit:

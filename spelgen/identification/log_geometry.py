@@ -368,6 +368,9 @@ class GeometryProblem:
         for columns in (viscous, coulomb, *bristles):
             functionals[n + drives, columns] = normal[drives, viscous, columns]
         functionals[2 * n + np.arange(len(self._last)), self._last] = 1.0
+        # friction of a joint at rest, whose velocity is noise, dissipates no power
+        speed = np.sqrt(normal[drives, viscous, viscous])
+        functionals[n + drives[speed < 0.01 * speed.max()]] = 0.0
         negative = np.minimum(functionals @ x, 0.0)
         variance = (functionals @ covariance * functionals).sum(axis=1)
         odds = 0.5 * np.square(negative) / np.maximum(variance, 1e-30)

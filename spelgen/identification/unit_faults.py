@@ -116,7 +116,8 @@ class TorqueUnit(WrongScale):
         products = (torque * tau).sum(axis=0)
         gains = np.square(torque).sum(axis=0) / np.where(products > 0, products, np.inf)
         common = float(np.median(gains[gains > 0])) if (gains > 0).any() else 1.0
-        is_free = self._is_open & (gains > 0)
+        is_known = self._is_open & (gains > 0)
+        is_free = is_known & present.signals(problem.samples).moving_joints
         ratios = np.where(is_free, gains, common) / common
         is_other = is_other_unit(ratios)
         # If no gain differs much from the median gain, only one common factor on all torques can be wrong. It is known
@@ -134,7 +135,7 @@ class TorqueUnit(WrongScale):
         is_common = bool(is_other_unit(common))
         # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
         is_several = is_common or is_other_unit(np.square(ratios)).sum() > 1
-        several = is_free & (is_free.all() and is_several)
+        several = is_free & (is_known.all() and is_several)
         for initial, changed in ((ratios, is_other & (not is_common)), (gains, several)):
             factors, units = np.where(changed, initial, 1.0), np.eye(len(gains))[changed]
             fit = fitted(factors)
