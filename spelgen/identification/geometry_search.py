@@ -200,19 +200,19 @@ def _weighed(
     """
     best = sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)
-    plain, least = problem.fit(present), stateful.fit(present)
+    plain, bent = problem.fit(present), stateful.fit(present)
     # The torque of a joint at rest may vary less than its noise, and is then not explained by any model.
     moving = present.signals(problem.samples).moving_joints
-    is_exact = least.errors[moving].max(initial=0.0) < GEOMETRY.exact
+    is_exact = bent.errors[moving].max(initial=0.0) < GEOMETRY.exact
     for k, fit in enumerate(best):
         change, hypothesis = fit.cost - plain.cost, fit.hypothesis
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:
-            other_fit = stateful.fit(hypothesis)
-            other = other_fit.cost - least.cost
+            bent_fit = stateful.fit(hypothesis)
+            bent_change = bent_fit.cost - bent.cost
             is_late = bool((np.append(hypothesis.delay, hypothesis.drift) != times).any())
-            change = max(other, change if is_late else min(change, other / 2))
+            change = max(bent_change, change if is_late else min(change, bent_change / 2))
             moved = moving | hypothesis.signals(problem.samples).moving_joints
-            if is_exact and not _is_certain((plain, fit), (least, other_fit), moved, is_late):
+            if is_exact and not _is_certain((plain, fit), (bent, bent_fit), moved, is_late):
                 change = 0.0
         best[k] = replace(fit, cost=base.cost + change)
     return best
@@ -244,7 +244,7 @@ def _is_certain(
     if changed.any() and not moving[changed].any():
         return False
     is_lower = stateful[1].errors < 0.2 * stateful[0].errors
-    gain = min(before.penalties - after.penalties for before, after in (plain, stateful))
+    gain = min(present.penalties - fit.penalties for present, fit in (plain, stateful))
     return bool(is_lower[moving].any()) or (gain > GEOMETRY.ambiguous and not is_late)
 
 

@@ -177,8 +177,7 @@ def _moves_on_both_sides(velocities: np.ndarray, splits: np.ndarray) -> np.ndarr
 
     velocities: (S, n) [rad/s, m/s]. splits: (C,) numbers of samples before each time.
     """
-    parts = [(velocities[:count], velocities[count:]) for count in splits]
-    speeds = np.array([[part.std(axis=0) for part in pair] for pair in parts])
+    speeds = np.array([[velocities[:k].std(axis=0), velocities[k:].std(axis=0)] for k in splits])
     return np.asarray((speeds > MOTION.moving).all(axis=1))
 
 
@@ -248,8 +247,8 @@ def _change(
     drift = (
         offsets * (problem.samples.times / duration if time else late[:, 0, 0])[:, None, None] * in_recording
     )
-    # All columns after those of the inertial parameters and of the armature belong to friction, the columns of viscous
-    # and Coulomb friction first. Bristles are omitted if the zero changes, since they could imitate an offset.
+    # The columns of friction follow the columns of the armature; viscous and Coulomb friction are first. Bristles are
+    # omitted if the zero changes, since they could imitate an offset.
     friction = rows[..., inertials + n : inertials + 3 * n if offset else None]
     friction = friction[..., friction[:, chosen].any(axis=(0, 1))] * late
     alternatives = rows[..., _load_columns(problem)] * late, np.concatenate([friction, drift], axis=2)

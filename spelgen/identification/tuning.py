@@ -79,9 +79,9 @@ class LogGeometryTuning:
     # [1] A hypothesis explains the torques of a joint if their residual variance is at most this fraction of their
     # variance.
     explained: float = 0.05
-    # [1] The friction model with hysteresis explains the torques if it leaves less than this relative residual variance
-    # of every moving joint. With wrong senses, orders, units, zeros or gravity, the largest value of a joint is above
-    # 0.019, except for faults of symmetric wrists (benchmarks/log_geometry.py, 16 arms).
+    # [1] The friction model with hysteresis explains the torques if the relative residual variance of every moving
+    # joint is below this value. With wrong senses, orders, units, zeros or gravity, the largest value of a joint is
+    # usually above 0.019 (benchmarks/log_geometry.py, 16 arms); joints of symmetric wrists are an exception.
     exact: float = 0.01
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15

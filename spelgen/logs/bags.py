@@ -146,12 +146,12 @@ def names_in_log(names: Mapping[str, str], logged: Sequence[str]) -> dict[str, s
     Of several names with a joint's name, the one with the fewest words is the joint's: panda_joint1 in place of
     panda_finger_joint1. names: {joint: its name in the mapping}, by default its name in the URDF.
     """
-    patterns, found = joint_patterns(list(names.values()), logged), dict[str, str]()
+    patterns, name_of = joint_patterns(list(names.values()), logged), dict[str, str]()
     for joint, name in names.items():
         words = {x: len(re.findall(r"[^\W_]+", x)) for x in logged if patterns[name].search(x)}
         fewest = [x for x, count in words.items() if count == min(words.values())]
-        found |= {joint: fewest[0]} if len(fewest) == 1 else {}
-    return found
+        name_of |= {joint: fewest[0]} if len(fewest) == 1 else {}
+    return name_of
 
 
 def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
@@ -159,8 +159,8 @@ def names_line(names: Mapping[str, str], logged: Sequence[str]) -> str:
 
     For the arguments and the search see `names_in_log`. Joints that are not found have a placeholder.
     """
-    found = names_in_log(names, logged)
-    return mapping_line({"joints": {x: {"name": found.get(x, "NAME IN THE LOG")} for x in names}})
+    name_of = names_in_log(names, logged)
+    return mapping_line({"joints": {x: {"name": name_of.get(x, "NAME IN THE LOG")} for x in names}})
 
 
 def logged_names(path: Path) -> list[str]:
