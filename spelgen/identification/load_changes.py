@@ -21,7 +21,7 @@ TOGETHER = 20
 SAMPLES = 1200
 """Largest number of samples of the recordings that are compared at a time."""
 FEWEST = 20
-"""Number of samples below which a recording is not compared with others."""
+"""Number of samples below which recordings, or parts of one, are not compared."""
 Candidate = tuple[float, int, float, int]
 """Change of the cost, recording, time [s] and joint (n: all n joints) of a possible change of the torques."""
 
@@ -173,12 +173,13 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
 
 
 def _moves_on_both_sides(velocities: np.ndarray, splits: np.ndarray) -> np.ndarray:
-    """Return the mask (C, n) of the joints that move both before and after each of C times.
+    """Return the mask (C, n) of the joints with `FEWEST` samples in motion both before and after each of C times.
 
     velocities: (S, n) [rad/s, m/s]. splits: (C,) numbers of samples before each time.
     """
-    speeds = np.array([[velocities[:k].std(axis=0), velocities[k:].std(axis=0)] for k in splits])
-    return np.asarray((speeds > MOTION.moving).all(axis=1))
+    moved = np.cumsum(np.abs(velocities) > MOTION.moving, axis=0)
+    earlier = moved[splits - 1]
+    return np.asarray(np.minimum(earlier, moved[-1] - earlier) >= FEWEST)
 
 
 def _falls(torque: np.ndarray, residual: np.ndarray, splits: np.ndarray) -> np.ndarray:
