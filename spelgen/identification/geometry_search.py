@@ -187,8 +187,8 @@ def _weighed(
     For a hypothesis with another delay than `base`, the decrease is min(a, b): hysteresis resembles a delay, so such a
     hypothesis must lower both costs.
 
-    If the model with hysteresis explains the torques of moving joints under `base` (`GEOMETRY.exact`), a lower torque
-    residual may be due to errors of the friction model. The decrease is then 0 unless `_is_certain`.
+    If the model with hysteresis explains the torques under `base` (`GeometryProblem.explains`), a lower torque residual
+    may be due to errors of the friction model. The decrease is then 0 unless `_is_certain`.
 
     Args:
         problem: problem without hysteresis.
@@ -201,9 +201,7 @@ def _weighed(
     best = sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)
     plain, bent = problem.fit(present), stateful.fit(present)
-    # The torque of a joint at rest may vary less than its noise, and is then not explained by any model.
-    moving = present.signals(problem.samples).moving_joints
-    is_exact = bent.errors[moving].max(initial=0.0) < GEOMETRY.exact
+    moving, is_exact = present.signals(problem.samples).moving_joints, stateful.explains(bent)
     for k, fit in enumerate(best):
         change, hypothesis = fit.cost - plain.cost, fit.hypothesis
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:

@@ -241,6 +241,14 @@ class GeometryProblem:
         cost += self._implausible(x, covariance, normal) + self._beyond_limits(signals.motion[0])
         return HypothesisFit(hypothesis, cost, misfit, x, covariance, errors)
 
+    def explains(self, fit: HypothesisFit) -> bool:
+        """Return True if a fit explains the torque of each moving joint, up to `GEOMETRY.exact` of its variance.
+
+        The torque of a joint at rest may vary less than its noise, and is then not explained by any model.
+        """
+        moving = fit.hypothesis.signals(self.samples).moving_joints
+        return bool(fit.errors[moving].max(initial=0.0) < GEOMETRY.exact)
+
     def misfit(self, errors: np.ndarray) -> float:
         """Return the negative log likelihood of the torques, up to a constant.
 

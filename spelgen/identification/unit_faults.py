@@ -60,9 +60,7 @@ class TorqueUnit(WrongScale):
         ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
         # The candidates are ratios of gravity torques that were fitted without hysteresis, which resembles gravity in
         # small motions. They are omitted if the fit with hysteresis has masses near the URDF's.
-        moving = base.hypothesis.signals(problem.samples).moving_joints
-        is_right = ratio > 0 and not is_other_unit(ratio)
-        is_right &= base.errors[moving].max(initial=0.0) < GEOMETRY.exact
+        is_right = ratio > 0 and not is_other_unit(ratio) and problem.explains(base)
         candidates = [] if is_found or is_right else [x.copy() for x in self._torque_factors]
         if is_open.all():
             # The ratio of the fitted gravity torque to the URDF's depends on the other corrections of `base`, such as
