@@ -200,17 +200,17 @@ def _weighed(
     """
     best = sorted(fits, key=RANK)
     present, times = base.hypothesis, np.append(base.hypothesis.delay, base.hypothesis.drift)
-    plain, bent = problem.fit(present), stateful.fit(present)
-    moving, is_exact = present.signals(problem.samples).moving_joints, stateful.explains(bent)
+    plain_base, stateful_base = problem.fit(present), stateful.fit(present)
+    moving, is_exact = present.signals(problem.samples).moving_joints, stateful.explains(stateful_base)
     for k, fit in enumerate(best):
-        change, hypothesis = fit.cost - plain.cost, fit.hypothesis
+        change, hypothesis = fit.cost - plain_base.cost, fit.hypothesis
         if k < GEOMETRY.weighed and change < -GEOMETRY.slight:
-            bent_fit = stateful.fit(hypothesis)
-            bent_change = bent_fit.cost - bent.cost
+            stateful_fit = stateful.fit(hypothesis)
+            stateful_change = stateful_fit.cost - stateful_base.cost
             is_late = bool((np.append(hypothesis.delay, hypothesis.drift) != times).any())
-            change = max(bent_change, change if is_late else min(change, bent_change / 2))
+            change = max(stateful_change, change if is_late else min(change, stateful_change / 2))
             moved = moving | hypothesis.signals(problem.samples).moving_joints
-            if is_exact and not _is_certain((plain, fit), (bent, bent_fit), moved, is_late):
+            if is_exact and not _is_certain((plain_base, fit), (stateful_base, stateful_fit), moved, is_late):
                 change = 0.0
         best[k] = replace(fit, cost=base.cost + change)
     return best
