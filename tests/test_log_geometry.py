@@ -298,6 +298,24 @@ def test_another_unit_is_offered_as_gain(arm):
 
 
 @pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
+@pytest.mark.parametrize("mass", [None, 0.05])
+def test_the_size_of_an_arm_shows_mnm_if_its_urdf_has_no_masses_or_copied_ones(arm, mass):
+    """Copied masses do not show the unit of torques: true masses are 100 times as large here, torques are in Nm."""
+    copied = mass and (mass, 0, 0, 0.1 * mass, mass, 0, 0, mass, 0, mass)
+    bodies = tuple(replace(x, inertia=copied) for x in arm.chain.bodies)
+    unknown = replace(arm, chain=replace(arm.chain, bodies=bodies))
+    log = recorded(arm, 3)
+    report = check_logs([log], unknown)
+    assert report.errors == () and "torque-scale" not in [x.code for x in report.findings]
+    (error,) = check_logs([replace(log, tau=1000 * log.tau)], unknown).errors
+    assert "gain: 0.001" in str(error) and "by the arm's size" in str(error)
+    (error,) = check_logs([flipped(log, 1, motion=True, torque=False)], unknown).errors
+    name = arm.chain.joint_names[1]
+    assert str(error).startswith(f"joint {name!r}: got positions and velocities of the opposite sense")
+    assert f"write 'joints: {{{name}: {{sign: -1, gain: -1}}}}'" in str(error)
+
+
+@pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
 def test_effort_limits_of_a_draft_are_no_evidence_of_another_unit(arm):
     """Torques that agree with the URDF's gravity are in Nm, although the URDF states an effort limit of 1 Nm."""
     coordinates = tuple(x._replace(effort=1.0) for x in arm.chain.coordinates)

@@ -47,7 +47,7 @@ READ = {
     ),
     "lwr4_inertial_without_inertia": (
         "lwr_a1_joint lwr_a2_joint lwr_e1_joint lwr_a3_joint lwr_a4_joint lwr_a5_joint lwr_a6_joint",
-        {"inertial-without-inertia", "missing-inertial", "repeated-element"},
+        {"inertial-without-inertia", "missing-inertial", "placeholder-inertial", "repeated-element"},
         {"ambiguous-chain", "dependent-joints"},
     ),
     "fingerpro_two_inertials": (
@@ -76,7 +76,7 @@ READ = {
         set(),
     ),
     "threelinks_nonunit_axis": ("joint_1_2 joint_2_3", {"non-unit-axis", "placeholder-inertial"}, set()),
-    "edo_axis_noise": ("joint_1 joint_2 joint_3 joint_4 joint_5 joint_6", set(), set()),
+    "edo_axis_noise": ("joint_1 joint_2 joint_3 joint_4 joint_5 joint_6", {"placeholder-inertial"}, set()),
     "low_cost_arm_space_in_names": (
         "Revolute_2 Revolute_3 Revolute_5 Revolute_6 Revolute_7",
         set(),

@@ -468,8 +468,10 @@ class TestLint:
         assert codes(write(sound + JOINT)) == []
         assert code in codes(write(f'<link name="base"/><link name="arm">{inertial}</link>' + JOINT))
 
-    def test_one_tensor_on_most_links_is_a_placeholder(self, write):
-        links = "".join(f'<link name="{name}">{INERTIAL}</link>' for name in ("base", "arm", "tip"))
+    @pytest.mark.parametrize("tensors", [("1.5", "1.5", "1.5"), ("1.5", "1.6", "1.7")])
+    def test_one_tensor_or_mass_on_most_links_is_a_placeholder(self, write, tensors):
+        inertials = zip(("base", "arm", "tip"), tensors, strict=True)
+        links = "".join(f'<link name="{name}">{INERTIAL.replace("1.5", x)}</link>' for name, x in inertials)
         text = links + JOINT + joint(name="k", parent="arm", child="tip")
         assert codes(write(text)) == ["placeholder-inertial"]
 

@@ -22,6 +22,7 @@ from spelgen.identification.drive_hints import FRICTION, bristle_columns, drive_
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.motion_samples import MotionSamples
+from spelgen.identification.reference_inertials import reference_inertials
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.runtime.body_chain import BodyChain
 
@@ -53,6 +54,7 @@ class GeometryProblem:
         # so that each 0.2 s count as one error. The number is at most 150, since the errors of a rigid model are
         # systematic and do not average out in long logs.
         self.count = float(np.clip(seconds / 0.2, 1.0, 150.0))
+        self.reference = reference_inertials(arm)
         mean, precision = inertial_prior(arm)
         self._bodies = len(mean)
         # indices of the mass and moments of inertia of the bodies that carry no joint
@@ -136,13 +138,17 @@ class GeometryProblem:
         return self._with(_equations={self.unchanged.motion_key: (rows, block_products(rows, 1)[:, 0])})
 
     def gravity_torques(self, fit: HypothesisFit) -> tuple[np.ndarray, np.ndarray]:
-        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and with the URDF's.
+        """Return two gravity torques (S, n) [Nm, N] for comparison: with fitted parameters, and of `reference`.
 
         The hypothesis of `fit` determines the positions and the vector of gravity.
         """
         weightless = replace(fit.hypothesis, gravity=(0.0, 0.0, 0.0))
         columns = self.equations(fit.hypothesis)[0] - self.equations(weightless)[0]
-        return columns @ fit.parameters, columns @ self.prior_mean
+        return columns @ fit.parameters, columns[..., : self._bodies] @ self.reference.parameters
+
+    def reference_torques(self, hypothesis: Hypothesis) -> np.ndarray:
+        """Return the torques (S, n) [Nm, N] of the motion under a hypothesis with the inertials of `reference`."""
+        return np.asarray(self.equations(hypothesis)[0][..., : self._bodies] @ self.reference.parameters)
 
     def prediction_deviation(self, fit: HypothesisFit) -> np.ndarray:
         """Return the standard deviation (S, n) [Nm, N] of a fit's torques due to the covariance of its parameters."""
@@ -426,22 +432,24 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
     The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
-    prior of a body without <inertial> in the URDF has mean 0 and is wide. The prior of a body that carries no joint
-    includes a tool or load that the URDF does not contain.
+    prior of a body without <inertial> in the URDF, or with a copied mass, has mean 0 and is wide. The prior of a body
+    that carries no joint includes a tool or load that the URDF does not contain.
     """
-    masses = [float(body.inertia[0]) for body in arm.bodies if body.inertia and body.inertia[0] > 0]
-    typical = float(np.median(masses)) if masses else 1.0
-    mean, precisions = [], []
-    for k, body in enumerate(arm.bodies):
+    reference = reference_inertials(arm)
+    known = reference.parameters.reshape(-1, 10)
+    masses = known[known[:, 0] > 0, 0]
+    typical = float(np.median(masses)) if len(masses) else 1.0
+    parameters = known * (not reference.is_guess)
+    precisions = []
+    for k, parameters_of_body in enumerate(parameters):
         lengths = [np.linalg.norm(np.array(x.translation, dtype=float)) for x in arm.bodies if x.parent == k]
-        mean.append(np.array(body.inertia or (0.0,) * 10, dtype=float))
-        root = _root(mean[-1], float(max(lengths, default=0.0)), typical)
+        root = _root(parameters_of_body, float(max(lengths, default=0.0)), typical)
         covariance = root @ root.T
         if not lengths:
             deviations = GEOMETRY.load * typical * np.power(GEOMETRY.load_distance, [0, 1, 2])
             covariance += np.diag(np.square(np.repeat(deviations, (1, 3, 6))))
         precisions.append(np.linalg.inv(covariance))
-    return np.concatenate(mean), block_diag(*precisions)
+    return parameters.ravel(), block_diag(*precisions)
 
 
 def _root(own: np.ndarray, length: float, typical: float) -> np.ndarray:

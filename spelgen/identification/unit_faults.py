@@ -11,6 +11,7 @@ from spelgen.arm.arm import Chain
 from spelgen.identification.column_faults import UNITS, JointSense, TorqueSense, WrongScale, position_unit
 from spelgen.identification.hypotheses import Correction, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
+from spelgen.identification.reference_inertials import ReferenceInertials, is_other_unit
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.settings.log_mapping import SCALES
 
@@ -38,14 +39,23 @@ class TorqueUnit(WrongScale):
     needed = 0.0
     evidence = "by the URDF's masses"
 
-    def __init__(self, factors: Sequence[np.ndarray], is_open: np.ndarray, is_milli: np.ndarray) -> None:
+    def __init__(
+        self,
+        factors: Sequence[np.ndarray],
+        is_open: np.ndarray,
+        is_milli: np.ndarray,
+        reference: ReferenceInertials,
+    ) -> None:
         """Define the candidates for factors that correct the unit of the torques.
 
         factors: candidates, (n,) each: one factor per joint, by which its torques are multiplied. is_open: (n,) True
         for joints whose torque may have another unit: the column mapping states no unit for it, or mNm, although the
         numbers may be in Nm. is_milli: (n,) True for the joints with mNm in the mapping, a subset of `is_open`.
+        reference: inertial parameters with whose gravity torque the torques are compared.
         """
         super().__init__([])
+        if reference.is_guess:
+            self.evidence = "by the arm's size, since the URDF has no masses or only copied ones"
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
@@ -56,33 +66,37 @@ class TorqueUnit(WrongScale):
         its own factor (see `_separate`). The other corrections in `base` remain.
         """
         is_open, is_found = self._is_open, self in base.hypothesis.faults
+        is_wrong = problem.reference.is_other_unit
         fitted, of_urdf = problem.gravity_torques(base)
         ratio = float((fitted * of_urdf).sum() / max(float(np.square(of_urdf).sum()), 1e-12))
         # The candidates are ratios of gravity torques that were fitted without hysteresis, which resembles gravity in
         # small motions. They are omitted if the fit with hysteresis has masses near the URDF's.
-        is_right = ratio > 0 and not is_other_unit(ratio) and problem.explains(base)
+        is_right = ratio > 0 and not is_wrong(ratio) and problem.explains(base)
         candidates = [] if is_found or is_right else [x.copy() for x in self._torque_factors]
         if is_open.all():
             # The ratio of the fitted gravity torque to the URDF's depends on the other corrections of `base`, such as
             # reversed or exchanged joints. The factor 1 / ratio is therefore computed for each `base`. If `base` has a
             # torque factor already, a negative ratio shows that the sign of this factor is wrong.
-            if (ratio > 0 or (ratio and is_found)) and is_other_unit(ratio):
-                candidates.append(np.full(len(is_open), rounded_factor(1 / ratio)))
+            if (ratio > 0 or (ratio and is_found)) and is_wrong(ratio):
+                candidates.append(np.full(len(is_open), problem.reference.rounded_factor(1 / ratio)))
             # If the log has another fault, such as another zero, its torques may not show the gravity of the URDF.
             # Torques a hundred times as large as the URDF's, or as small, are then in another unit, too: in mNm if
             # the ratio, to which friction contributes, is near a thousand.
             tau = base.hypothesis.signals(problem.samples).tau
-            expected = problem.residual(base.hypothesis, problem.prior_mean) + tau
+            expected = problem.reference_torques(base.hypothesis)
             size = float(np.linalg.norm(tau)) / max(float(np.linalg.norm(expected)), 1e-12)
             if not (candidates or is_found) and of_urdf.any() and not 0.01 < size < 100.0:
-                size = size if is_other_unit(size / 1e3) else 1e3
-                candidates.append(np.full(len(is_open), rounded_factor(1 / size)))
+                size = size if is_wrong(size / 1e3) else 1e3
+                candidates.append(np.full(len(is_open), problem.reference.rounded_factor(1 / size)))
         for factor in candidates:
             # Torques declared in mNm were multiplied by 0.001. If the logged numbers are in fact in Nm, the factor on
             # these torques must be 1000. The masses of the URDF give this factor only approximately, so factors from
             # 200 to 5000 are replaced by 1000.
-            is_unit = self._is_milli & ~is_other_unit(factor / 1e3)
+            is_unit = self._is_milli & ~is_wrong(factor / 1e3)
             factor[is_unit] = np.copysign(1e3, factor[is_unit])
+        if problem.reference.is_guess:
+            # Guessed masses show mNm, but give no factor for other units.
+            candidates = [x for x in candidates if np.isin(np.abs(x), (1e-3, 1e3)).all()]
         scales = [np.stack([np.ones(len(is_open)), factor]) for factor in candidates]
         fits = list(self._scaled_by(scales, problem, base))
         yield from fits
@@ -117,22 +131,23 @@ class TorqueUnit(WrongScale):
         is_known = self._is_open & (gains > 0)
         is_free = is_known & present.signals(problem.samples).moving_joints
         ratios = np.where(is_free, gains, common) / common
-        is_other = is_other_unit(ratios)
+        # The ratios compare joints with each other, so that their limit does not depend on the masses.
+        is_other = is_other_unit(ratios, GEOMETRY.other_unit)
         # If no gain differs much from the median gain, only one common factor on all torques can be wrong. It is known
         # only if the torques contain gravity, which is compared to the URDF's gravity torques.
         if not (is_other.any() or has_gravity):
             return
 
         def fitted(factors: np.ndarray) -> HypothesisFit:
-            rounded = [rounded_factor(x) for x in factors]
+            rounded = [problem.reference.rounded_factor(x) for x in factors]
             if len(set(rounded)) > 1:
                 rounded = [float(f"{x:.2g}") for x in factors]
             rescaled = scale * np.stack([np.ones_like(factors), rounded])
             return problem.fit(present.changed(self, scale=rescaled))
 
-        is_common = bool(is_other_unit(common))
+        is_common = bool(problem.reference.is_other_unit(common))
         # If only one joint differs from the common factor, the masses of the URDF are the reason for this factor.
-        is_several = is_common or is_other_unit(np.square(ratios)).sum() > 1
+        is_several = is_common or is_other_unit(np.square(ratios), GEOMETRY.other_unit).sum() > 1
         several = is_free & (is_known.all() and is_several)
         for initial, changed in ((ratios, is_other & (not is_common)), (gains, several)):
             factors, units = np.where(changed, initial, 1.0), np.eye(len(gains))[changed]
@@ -180,30 +195,6 @@ class TorqueUnit(WrongScale):
         """
         torque = correction.factors[1]
         return "torque-scale" if (torque > 0.1).all() and (torque < 10).all() else ""
-
-
-def is_other_unit(factor: np.ndarray | float) -> np.ndarray:
-    """Return True for ratios that are explained by another unit of torques, and not by wrong inertials of the URDF.
-
-    A ratio is the gravity torque in the log divided by the URDF's gravity torque. Its magnitude shows another unit if
-    it is at least `GEOMETRY.other_unit`, or at most the inverse. factor: a ratio, or an array of ratios; the result has
-    the same shape.
-    """
-    return np.asarray(np.abs(np.log(np.abs(factor))) >= np.log(GEOMETRY.other_unit))
-
-
-def rounded_factor(factor: float) -> float:
-    """Return a factor on torques, rounded for a message; its sign remains.
-
-    A factor near 0.001 becomes 0.001, the factor from mNm to Nm. Any other factor is rounded to one digit if this
-    changes it by less than 10 %, otherwise to two digits.
-    """
-    if 1 / 1.5 < abs(factor) / 1e-3 < 1.5:
-        # Magnitudes from 0.00067 to 0.0015 become 0.001. The range is wide, since the factor is only as exact as the
-        # masses of the URDF.
-        return float(np.copysign(1e-3, factor))
-    one = float(f"{factor:.1g}")
-    return one if abs(one - factor) < 0.1 * abs(factor) else float(f"{factor:.2g}")
 
 
 class PositionUnit(WrongScale):

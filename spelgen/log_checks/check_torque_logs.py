@@ -18,6 +18,7 @@ from spelgen.identification.least_squares import varying
 from spelgen.identification.load_changes import LoadChange, load_changes, torque_change
 from spelgen.identification.log_geometry import GeometryProblem
 from spelgen.identification.motion_samples import DriveLog, MotionSamples, joined_samples
+from spelgen.identification.reference_inertials import reference_inertials
 from spelgen.identification.torque_delay import delay_of
 from spelgen.identification.tuning import GEOMETRY, HINTS
 from spelgen.identification.unit_faults import GIVE_GEAR, PositionUnit, TorqueUnit, position_factors
@@ -64,6 +65,7 @@ class TorqueLogs:
 
     def __init__(self, arm: Arm, mapping: LogMapping) -> None:
         self._arm, self._mapping, self._drives = arm, mapping, arm.actuation.drives()
+        self._reference = reference_inertials(arm.chain)
         self._samples: list[MotionSamples] = []
         self._moving = DriveLog(arm.chain.joint_types, self._drives, Preprocessing())
         self._flat: list[FlatTops] = []
@@ -139,7 +141,7 @@ class TorqueLogs:
         # Torques beyond the limits of the drives are not reported in two cases. If the log has another error, this
         # error is the reason. If the torques agree with the gravity of the URDF, the limits are only placeholders.
         faults = dict[Check[JointEvidence], dict[str, str]]()
-        if summary.errors or any(joint.shows_unit for joint in evidence):
+        if summary.errors or any(joint.shows_unit(self._reference) for joint in evidence):
             accepted.add("torque-beyond-drive")
         for joint in evidence:
             # the units of a joint are not tested if the mapping states the unit of its torque
@@ -153,12 +155,13 @@ class TorqueLogs:
         for check, joints in faults.items():
             where = f"joint {', '.join(map(repr, joints))}, tau"
             summary.add(check, next(iter(joints.values())), where)
-        return completed, (*signal_tables(completed, QUANTITIES), _physics_table(completed))
+        physics = _physics_table(completed, self._reference.source)
+        return completed, (*signal_tables(completed, QUANTITIES), physics)
 
     def _evidence(self, reports: Sequence[JointReport], motion: MotionSamples) -> list[JointEvidence]:
         """Return the joints of the URDF with their statistics `reports` and fits of gravity to the samples `motion`."""
         evidence, coordinates = [], self._arm.chain.coordinates
-        fits = fit_gravity(self._arm.chain, motion)
+        fits = fit_gravity(self._arm.chain, motion, self._reference.parameters)
         for coordinate, report, gravity in zip(coordinates, reports, fits, strict=True):
             offset = self._mapping.offset("q", coordinate.name)
             evidence.append(JointEvidence(coordinate, replace(report, gravity=gravity), offset))
@@ -419,12 +422,13 @@ class TorqueLogs:
         coarse = problem.thinned(GEOMETRY.coarse_samples)
         _, of_urdf = coarse.gravity_torques(coarse.fit(coarse.unchanged))
         loads = of_urdf.std(axis=0)
-        factors = torque_factors(evidence, is_open.tolist(), loads > TUNING.loaded * loads.max())
+        loaded = loads > TUNING.loaded * loads.max()
+        factors = torque_factors(evidence, is_open.tolist(), loaded, coarse.reference)
         # Units of positions are tested only if velocities have the same unit per second, so that one factor changes
         # both.
         motion = {(self._mapping.unit("q", name), self._mapping.unit("qd", name)) for name in names}
         stated = {(unit, f"{unit}/s") for unit in (*UNITS["revolute"], *UNITS["prismatic"])}
-        torque_unit = TorqueUnit(factors, is_open, is_milli)
+        torque_unit = TorqueUnit(factors, is_open, is_milli, coarse.reference)
         if not motion <= {(None, None), *stated}:
             return kinds_of_faults(problem.arm, [torque_unit])
         # The unit of a single joint's positions is tested if they range over more than its limits, or over more than
@@ -571,8 +575,10 @@ def _coupling_hint(arm: Arm, coupling: Coupling, remaining: float) -> Diagnostic
     return Diagnostic("warning", COUPLED, f"joint {names[coupling.joint]!r}", None, message)
 
 
-def _physics_table(joints: Sequence[JointReport]) -> Listing:
-    head = ("joint", "dq/dt : qd", "agree", "gravity in tau", "x URDF")
+def _physics_table(joints: Sequence[JointReport], source: str) -> Listing:
+    """Return the table of velocities and gravity; `source` of the gravity torque: "URDF" or "guess"."""
+    head = ("joint", "dq/dt : qd", "agree", "gravity in tau", f"x {source}")
+    torque = "the URDF's gravity torque" if source == "URDF" else "the gravity torque of guessed masses"
     rows = []
     for joint in joints:
         fit = joint.gravity
@@ -582,7 +588,6 @@ def _physics_table(joints: Sequence[JointReport]) -> Listing:
         rows.append((joint.name, *velocity, percent(fit.explained), number(fit.factor if is_seen else None)))
     note = (
         "dq/dt : qd and its correlation are 1 where qd is the derivative of q; gravity in tau: part of tau's "
-        "variance that gravity explains, in addition to friction and acceleration; x URDF: ratio to the URDF's gravity "
-        "torque."
+        f"variance that gravity explains, in addition to friction and acceleration; x {source}: ratio to {torque}."
     )
     return Listing("Physics", head, rows, note)

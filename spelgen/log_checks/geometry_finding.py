@@ -10,6 +10,7 @@ import numpy as np
 
 from spelgen.arm.arm import Chain
 from spelgen.errors import Diagnostic, LogError
+from spelgen.identification.column_faults import WrongScale
 from spelgen.identification.continuous_faults import Gravity, ZeroOffset
 from spelgen.identification.hypotheses import Correction, Fault, Hypothesis, HypothesisFit
 from spelgen.identification.log_geometry import GeometryProblem
@@ -55,7 +56,12 @@ def geometry_finding(
     """
     best, hypotheses = better[0], [x.hypothesis for x in better]
     corrections = [Correction(problem.arm, mapping, by_name, problem.unchanged, x) for x in hypotheses]
-    faults, correction = best.hypothesis.faults, corrections[0]
+    correction = corrections[0]
+    # One fault may cancel the correction of another: torques of all joints reversed, for example, and one once more.
+    scaled = [
+        x for x in best.hypothesis.faults if not isinstance(x, WrongScale) or x.has(*correction.factors).any()
+    ]
+    faults = scaled or best.hypothesis.faults
     where = " and ".join(dict.fromkeys(_place(correction, fault) for fault in faults))
     evidence = faults[0].evidence
     if len(faults) > 1 or not evidence:
@@ -125,7 +131,7 @@ def _unexplained_joints(problem: GeometryProblem, unchanged: HypothesisFit) -> t
     """
     coarse, errors = problem.thinned(GEOMETRY.coarse_samples), unchanged.errors
     signals = coarse.unchanged.signals(coarse.samples)
-    of_urdf = signals.tau + coarse.residual(coarse.unchanged, coarse.prior_mean)
+    of_urdf = coarse.reference_torques(coarse.unchanged)
     is_moving = problem.unchanged.signals(problem.samples).moving_joints
     weights = np.stack([signals.tau.var(axis=0) + 1e-30, is_moving + 1e-30])
     mean = float((weights @ errors / weights.sum(axis=1)).max())

@@ -94,7 +94,7 @@ def find_unsigned(problem: GeometryProblem) -> list[LogError]:
     # The signs of the suspected torques are unknown at each sample. Two initial guesses are refined: the signs of the
     # torques predicted with the URDF's parameters, and the signs of the velocities. The second guess is good for joints
     # with little load, whose torque is mostly friction.
-    for torque in (problem.residual(problem.unchanged, problem.prior_mean) + tau, qd):
+    for torque in (problem.reference_torques(problem.unchanged), qd):
         for _ in range(4):
             signs = np.where(suspects, np.sign(torque * tau), 1.0)
             fit = problem.with_signs(signs).fit(problem.unchanged)

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.linalg import orth
 
 from spelgen.arm.arm import Chain, Coordinate
-from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
+from spelgen.dynamics.regressor_dynamics import regressor
 from spelgen.identification.motion_samples import MotionSamples
-from spelgen.identification.unit_faults import is_other_unit, rounded_factor
+from spelgen.identification.reference_inertials import ReferenceInertials
 from spelgen.labels import UNITS
 from spelgen.log_checks.report import MEASURES, GravityFit, JointReport
 from spelgen.log_checks.statistics import has_few_levels
@@ -52,10 +52,15 @@ class RobotCheckTuning:
 TUNING = RobotCheckTuning()
 
 
-def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
+def fit_gravity(arm: Chain, motion: MotionSamples, inertials: np.ndarray) -> list[GravityFit]:
     """Return the fit of the gravity torque of the URDF to the logged torque, for each joint of the arm.
 
-    The fit shows whether the torques contain gravity, and in which unit they are. motion: samples with torques.
+    The fit shows whether the torques contain gravity, and in which unit they are.
+
+    Args:
+        arm: kinematics and gravity.
+        motion: samples with torques.
+        inertials: (10 B,) inertial parameters of the B bodies, of the URDF or guessed (see `ReferenceInertials`).
     """
     # at least 100 samples are required: with fewer samples gravity and friction are confounded
     q, qd, qdd = motion.motion
@@ -63,7 +68,7 @@ def fit_gravity(arm: Chain, motion: MotionSamples) -> list[GravityFit]:
         return [GravityFit()] * q.shape[1]
     still = np.zeros_like(q)
     rows = regressor(arm, q, still, still)  # rows: (S, n, 10 B) for S samples and B bodies
-    load = rows @ urdf_parameters(arm)
+    load = rows @ inertials
     # friction and the joint's own inertia are removed, since in a slow swing they are correlated with gravity
     friction = np.stack([np.ones_like(qd), qd, np.tanh(qd / SAMPLES.moving), qdd], axis=2)
     fits = []
@@ -126,11 +131,12 @@ class JointEvidence(NamedTuple):
             lower = upper = None
         return -inf if lower is None else lower, inf if upper is None else upper
 
-    @property
-    def shows_unit(self) -> bool:
-        """True if the torque contains gravity of about the magnitude in the URDF: its unit is then right."""
+    def shows_unit(self, reference: ReferenceInertials) -> bool:
+        """Return True if the torque contains gravity of about the magnitude of `reference`: its unit is then right."""
         gravity = self.report.gravity
-        return (gravity.correlation or 0.0) > TUNING.seen and not is_other_unit(gravity.factor or 1.0)
+        return (gravity.correlation or 0.0) > TUNING.seen and not reference.is_other_unit(
+            gravity.factor or 1.0
+        )
 
 
 def find_beyond_limits(joint: JointEvidence) -> str | None:
@@ -174,7 +180,10 @@ def find_above(limit: str, quantity: str, joint: JointEvidence) -> str | None:
 
 
 def torque_factors(
-    joints: Sequence[JointEvidence], undeclared: Sequence[bool], loaded: Sequence[bool] | np.ndarray
+    joints: Sequence[JointEvidence],
+    undeclared: Sequence[bool],
+    loaded: Sequence[bool] | np.ndarray,
+    reference: ReferenceInertials,
 ) -> list[np.ndarray]:
     """Return candidates for factors (n,) on the torques of n joints that correct a wrong unit of torques.
 
@@ -182,12 +191,14 @@ def torque_factors(
     gravity in the logged torques divided by the gravity torque of the URDF; r is negative if the torques have the
     opposite sense. Wrong inertials may explain an |r| from 1/5 to 5. For any other r there is a candidate with the
     factor 1 / r for this joint and 1 for all others. If all joints are `undeclared` and the median of r over the joints
-    is also outside these bounds, there is a candidate with 1 / median for all joints.
+    is also outside these bounds, there is a candidate with 1 / median for all joints. If the masses are a guess, the
+    bounds are 1/30 and 30, and only the candidate for all joints is returned.
 
     Args:
         joints: the joints with their fits of gravity.
         undeclared: (n,) True for joints whose torque may have another unit: the mapping states no unit, or mNm.
         loaded: (n,) True for joints that gravity loads enough.
+        reference: inertial parameters of the gravity torque with which the torques were compared.
     """
     seen: list[float] = []
     factors = []
@@ -200,13 +211,13 @@ def torque_factors(
         if factor is None or not (is_known and undeclared[k] and loaded[k]):
             continue
         seen.append(factor)
-        if is_other_unit(factor):
+        if reference.is_other_unit(factor) and not reference.is_guess:
             single = np.ones(len(joints))
-            single[k] = rounded_factor(1 / factor)
+            single[k] = reference.rounded_factor(1 / factor)
             factors.append(single)
     median = float(np.median(seen)) if seen else 1.0
-    if all(undeclared) and is_other_unit(median):
-        factors.append(np.full(len(joints), rounded_factor(1 / median)))
+    if all(undeclared) and reference.is_other_unit(median):
+        factors.append(np.full(len(joints), reference.rounded_factor(1 / median)))
     return factors
 
 

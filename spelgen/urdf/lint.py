@@ -6,7 +6,7 @@ from math import inf, pi
 import numpy as np
 
 from spelgen.errors import Diagnostic
-from spelgen.urdf.robot import Inertial, Robot, Tensor, UrdfJoint
+from spelgen.urdf.robot import Inertial, Robot, UrdfJoint
 
 # [1] An inertia tensor is reported if its smallest principal moment is negative, or if the moments violate the triangle
 # inequality, by more than this fraction of the largest moment: printed tensors are rounded.
@@ -105,17 +105,19 @@ def _lint_inertial(link: str, inertial: Inertial, farthest: float) -> Iterator[F
 
 
 def _lint_placeholders(inertials: Sequence[Inertial]) -> Iterator[Finding]:
-    """Yield a warning if most links have the same inertia tensor: it was probably copied, not computed."""
-    lines: dict[Tensor, list[int]] = {}
-    for inertial in inertials:
-        if any(inertial.tensor):
-            lines.setdefault(inertial.tensor, []).append(inertial.line)
-    total = sum(map(len, lines.values()))
-    repeated = max(lines.values(), key=len, default=[])
-    # Two equal tensors are no evidence of a copy, because two links may have the same shape.
-    if len(repeated) > total / 2 and len(repeated) >= 3:
-        message = f"{len(repeated)} of {total} links have the same inertia tensor: perhaps placeholders"
-        yield "placeholder-inertial", "robot", repeated[0], message
+    """Yield a warning if most links have the same inertia tensor, or the same mass: it was probably copied."""
+    tensors = [(x.tensor, x.line) for x in inertials if any(x.tensor)]
+    masses = [(x.mass, x.line) for x in inertials if x.mass > 0]
+    for quantity, stated in (("inertia tensor", tensors), ("mass", masses)):
+        lines: dict[object, list[int]] = {}
+        for value, line in stated:
+            lines.setdefault(value, []).append(line)
+        repeated = max(lines.values(), key=len, default=[])
+        # Two equal values are no evidence of a copy, because two links may have the same shape.
+        if len(repeated) > len(stated) / 2 and len(repeated) >= 3:
+            message = f"{len(repeated)} of {len(stated)} links have the same {quantity}: perhaps placeholders"
+            yield "placeholder-inertial", "robot", repeated[0], message
+            return
 
 
 def _lint_joint(joint: UrdfJoint) -> Iterator[Finding]:
