@@ -298,11 +298,13 @@ def test_another_unit_is_offered_as_gain(arm):
 
 
 @pytest.mark.parametrize("arm", ["ur10e"], indirect=True)
-@pytest.mark.parametrize("mass", [None, 0.05])
-def test_the_size_of_an_arm_shows_mnm_if_its_urdf_has_no_masses_or_copied_ones(arm, mass):
+@pytest.mark.parametrize("masses", ["none", "some", "copied"])
+def test_the_size_of_an_arm_shows_mnm_if_its_urdf_lacks_masses_or_has_copied_ones(arm, masses):
     """Copied masses do not show the unit of torques: true masses are 100 times as large here, torques are in Nm."""
-    copied = mass and (mass, 0, 0, 0.1 * mass, mass, 0, 0, mass, 0, mass)
-    bodies = tuple(replace(x, inertia=copied) for x in arm.chain.bodies)
+    copied = (0.05, 0, 0, 0.005, 0.05, 0, 0, 0.05, 0, 0.05)
+    inertias = {"none": [None] * 6, "copied": [copied] * 6}
+    inertias["some"] = [arm.chain.bodies[0].inertia, copied, *[None] * 4]
+    bodies = tuple(replace(x, inertia=y) for x, y in zip(arm.chain.bodies, inertias[masses], strict=True))
     unknown = replace(arm, chain=replace(arm.chain, bodies=bodies))
     log = recorded(arm, 3)
     report = check_logs([log], unknown)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from spelgen.arm.arm import Chain
-from spelgen.dynamics.regressor_dynamics import body_chain
+from spelgen.dynamics.regressor_dynamics import body_chain, urdf_parameters
 from spelgen.identification.drive_hints import FRICTION, bristle_columns, drive_rows
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.least_squares import block_products, varying
@@ -435,11 +435,9 @@ def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
     prior of a body without <inertial> in the URDF, or with a copied mass, has mean 0 and is wide. The prior of a body
     that carries no joint includes a tool or load that the URDF does not contain.
     """
-    reference = reference_inertials(arm)
-    known = reference.parameters.reshape(-1, 10)
-    masses = known[known[:, 0] > 0, 0]
-    typical = float(np.median(masses)) if len(masses) else 1.0
-    parameters = known * (not reference.is_guess)
+    parameters = urdf_parameters(arm).reshape(-1, 10) * (not arm.has_copied_masses)
+    masses = reference_inertials(arm).parameters[::10]
+    typical = float(np.median(masses[masses > 0])) if masses.any() else 1.0
     precisions = []
     for k, parameters_of_body in enumerate(parameters):
         lengths = [np.linalg.norm(np.array(x.translation, dtype=float)) for x in arm.bodies if x.parent == k]

@@ -21,7 +21,7 @@ class ReferenceInertials(NamedTuple):
 
     @property
     def is_guess(self) -> bool:
-        """True if the URDF has no masses, or copied ones, so that the parameters are a guess."""
+        """True if the URDF lacks masses, or has copied ones, so that the parameters are a guess."""
         return self.other_unit != GEOMETRY.other_unit
 
     @property
@@ -56,14 +56,14 @@ def is_other_unit(ratio: np.ndarray | float, limit: float) -> np.ndarray:
 
 
 def reference_inertials(arm: Chain) -> ReferenceInertials:
-    """Return the inertial parameters of the URDF, or a guess if the URDF has no masses or only copied ones.
+    """Return the inertial parameters of the URDF, or a guess if it has copied masses or lacks a third of the masses.
 
     The guess has a point mass at the middle of each link, proportional to its length and the square of the reach, the
     sum of all lengths. It is zero for arms with fewer than four joints or with a prismatic joint, since the length of
     the last link or of a telescope is not in the URDF.
     """
     stated = urdf_parameters(arm)
-    if stated.any() and not arm.has_copied_masses:
+    if 3 * np.count_nonzero(stated[::10]) >= 2 * len(arm.bodies) and not arm.has_copied_masses:
         return ReferenceInertials(stated, GEOMETRY.other_unit)
     guess = np.zeros((len(arm.bodies), 10))
     links = [body for body in arm.bodies if body.parent >= 0]

@@ -55,7 +55,7 @@ class TorqueUnit(WrongScale):
         """
         super().__init__([])
         if reference.is_guess:
-            self.evidence = "by the arm's size, since the URDF has no masses or only copied ones"
+            self.evidence = "by the arm's size, since the URDF lacks masses or has copied ones"
         self._torque_factors, self._is_open, self._is_milli = factors, is_open, is_milli
 
     def fits(self, problem: GeometryProblem, base: HypothesisFit) -> Iterator[HypothesisFit]:
