@@ -670,6 +670,9 @@ def test_leaders_command_followers(scara, tmp_path):
         (("pos_{}_revolutions", "vel_{}_rps"), (1 / (2 * np.pi),) * 2),
         (("q{}_rad", "qd{}_deg_s"), (1, 180 / np.pi)),
         (("q{}_rad", "qd{}_deg_per_s"), (1, 180 / np.pi)),
+        (("q{}_rad", "speed{}_deg_per_sec"), (1, 180 / np.pi)),
+        (("q{} deg", "qd{} rad/sec"), (180 / np.pi, 1)),
+        (("q{}_deg", "qd{}_radps"), (180 / np.pi, 1)),
         (("q{} (rad)", "qd{} (deg s^-1)"), (1, 180 / np.pi)),
         (("q{} [mrad]", "qd{}"), (1000, 1000)),
     ],
@@ -774,7 +777,7 @@ def test_matrices_with_a_column_per_time_are_to_be_transposed(scara, tmp_path):
 
 
 def test_a_joint_at_rest_between_moving_joints_is_not_omitted_for_a_moving_gripper(scara, tmp_path):
-    """Five numbered columns of an arm with four joints: joint 2 rests, the gripper moves. The draft names the gripper."""
+    """Five numbered columns of an arm with four joints: joint 2 rests and the gripper moves."""
     head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(5))]
     rest = [np.where(np.arange(4) == 1, values[:1], values) for values in (Q, QD, TAU)]
     rows = np.column_stack([T, *(np.column_stack([x, np.sin(5 * T)]) for x in rest)])
