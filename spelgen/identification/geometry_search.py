@@ -110,10 +110,8 @@ def compare_hypotheses(problem: GeometryProblem, faults: Sequence[Fault]) -> tup
     unchanged = finer.fit(problem.unchanged)
     # only three hypotheses are confirmed, since a message lists at most three
     fits = [_with_likely_senses(finer, finer.fit(fit.hypothesis)) for fit in likely[:3]]
-    confirmed = [
-        x for x in _weighed(finer, finer.with_hysteresis(), fits, unchanged) if _explains(x, unchanged)
-    ]
-    return unchanged, *(_likely(unchanged, confirmed) if confirmed else ())
+    confirmed = _weighed(finer, finer.with_hysteresis(), fits, unchanged)
+    return unchanged, *_likely(unchanged, confirmed)
 
 
 def deviating_recordings(problem: GeometryProblem) -> list[int]:
@@ -285,23 +283,6 @@ def _likely(unchanged: HypothesisFit, fits: Sequence[HypothesisFit]) -> tuple[Hy
         senses = [fit for fit in fits if fit.rank < bound and _is_one_sense(fit.hypothesis)]
         likely = [*sorted(senses, key=RANK)[:1], *(fit for fit in likely if fit not in senses)]
     return tuple(likely)
-
-
-def _explains(fit: HypothesisFit, unchanged: HypothesisFit) -> bool:
-    """Return False if a hypothesis only lowers errors that a rigid arm has with and without it.
-
-    Springs, counterweights and cables leave errors above `GEOMETRY.explained` at some joints. A wrong sense, order, zero
-    or gravity can lower them by a third. With the right one, the squared residual of a joint falls to less than half,
-    or the parameters become much more plausible.
-    """
-    is_geometric = all(
-        isinstance(x, JointSense | TorqueSense | WrongOrder | ZeroOffset | Gravity)
-        for x in fit.hypothesis.faults
-    )
-    is_slight = bool((fit.errors > GEOMETRY.halved * unchanged.errors).all())
-    is_poor = fit.errors.max() > GEOMETRY.explained
-    is_plausible = unchanged.penalties - fit.penalties > 2 * GEOMETRY.needed
-    return not (is_geometric and is_slight and is_poor) or is_plausible
 
 
 def _is_one_sense(hypothesis: Hypothesis) -> bool:

@@ -79,10 +79,6 @@ class LogGeometryTuning:
     # [1] A hypothesis explains the torques of a joint if their residual variance is at most this fraction of their
     # variance.
     explained: float = 0.05
-    # [1] A wrong sense, order, zero or gravity of a log whose torques a rigid arm does not explain is reported only if
-    # the squared residual of a joint falls below this fraction. On recordings of two arms with springs and
-    # counterweights, wrong hypotheses have fractions from 0.52 on.
-    halved: float = 0.5
     # [1] The friction model with hysteresis explains the torques if the relative residual variance of every moving
     # joint is below this value. With wrong senses, orders, units, zeros or gravity, the largest value of a joint is
     # usually above 0.019 (benchmarks/log_geometry.py, 16 arms); joints of symmetric wrists are an exception.
