@@ -40,7 +40,8 @@ class Arm:
     def turning_joints(self) -> tuple[str, ...]:
         """Names of the revolute joints without position limits, or with limits that are more than two turns apart."""
         revolute = [x for x in self.chain.coordinates if x.joint_type == "revolute"]
-        return tuple(x.name for x in revolute if x.limits is None or np.ptp(x.limits) > 4 * np.pi)
+        # limits such as 6.2832 are rounded turns
+        return tuple(x.name for x in revolute if x.limits is None or np.ptp(x.limits) > 4.04 * np.pi)
 
     def __repr__(self) -> str:
         joints = counted(len(self.chain.coordinates), "joint")
