@@ -805,3 +805,14 @@ def test_positions_named_by_their_joint_alone_and_short_names_of_kuka(scara, tmp
     head = ["time", *(name.format(k + 1) for name in signals for k in range(4))]
     rows = np.column_stack([T, *signals.values()])
     require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_a_draft_does_not_replace_the_settings_beside_the_urdf(scara, tmp_path):
+    (tmp_path / "arm.urdf").write_text(scara.robot.path.read_text())
+    names = [f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4)]
+    log = written(tmp_path / "log.csv", ["t", *names], np.column_stack([T, Q, QD, TAU]))
+    robot = str(tmp_path / "arm.urdf")
+    words = ["logs", str(log), "--robot", robot, "--suggest", str(tmp_path / "arm.yaml"), "--force"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code and "settings of the robot" in result.output + str(result.exception)
+    assert not (tmp_path / "arm.yaml").exists()
