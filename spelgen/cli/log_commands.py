@@ -157,9 +157,8 @@ def logs(
     # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
         if suggest.resolve() == robot.with_suffix(".yaml").resolve():
-            raise SpelgenError(
-                "this file has the settings of the robot", file=suggest, do="name another file"
-            )
+            do = "name another file"
+            raise SpelgenError("this file has the settings of the robot", file=suggest, do=do)
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
     log_mapping = options.log_mapping(arm, mapping, accept)

@@ -114,11 +114,10 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     # before or after them to a base or gripper at rest. A base at rest has seven positions, but six velocities and
     # torques. A constant column between changing ones is a joint of the arm at rest.
     moved = {x.number for x in best_signal(moving, len(joints), arm)}
-    numbers = {
-        x.number for x in columns_of["q"] if min(moved, default=0) <= x.number <= max(moved, default=0)
-    }
+    numbers = sorted({x.number for x in columns_of["q"]})
+    runs = [set(numbers[k : k + len(joints)]) for k in range(len(numbers) - len(joints) + 1)]
     listed_columns = dict(columns_of)
-    if len(moved) == len(joints) and moved == numbers:
+    if moved in runs:
         count = len(columns_of["q"])
         for quantity, named in columns_of.items():
             complete = (
