@@ -482,3 +482,19 @@ def test_registers_of_all_joints_and_of_commands_have_one_line(tmp_path, form):
     assert errors([log], arm) == ""
     for k, joint in enumerate(motion):
         assert log.u[:, k] == pytest.approx(2 * np.pi / 4096 * counts[joint], abs=1e-9)
+
+
+def test_a_joint_whose_limits_are_more_than_two_turns_apart_may_turn_so_far(robots, tmp_path):
+    """Wrists of some arms turn by 450 degrees to both sides: positions of 2.4 turns have no wrong unit.
+
+    The logged velocities are estimates, and 17 % too small.
+    """
+    text = (robots / "six_dof.urdf").read_text()
+    last = re.compile(r'(<joint name="joint6".*?lower=")[^"]*(" upper=")[^"]*"', re.DOTALL)
+    (tmp_path / "arm.urdf").write_text(last.sub(r'\g<1>-7.86\g<2>7.86"', text))
+    arm = load_arm(tmp_path / "arm.urdf")
+    columns = motion(arm, 0)
+    columns |= {"q_joint6": 7.7 * np.sin(columns["t"]), "qd_joint6": 0.83 * 7.7 * np.cos(columns["t"])}
+    (log,) = read_logs(written(columns, tmp_path / "log.csv"), arm)
+    assert errors([log], arm) == ""
+    assert log.q[:, -1] == pytest.approx(columns["q_joint6"], abs=1e-9)

@@ -670,6 +670,9 @@ def test_leaders_command_followers(scara, tmp_path):
         (("pos_{}_revolutions", "vel_{}_rps"), (1 / (2 * np.pi),) * 2),
         (("q{}_rad", "qd{}_deg_s"), (1, 180 / np.pi)),
         (("q{}_rad", "qd{}_deg_per_s"), (1, 180 / np.pi)),
+        (("q{}_rad", "speed{}_deg_per_sec"), (1, 180 / np.pi)),
+        (("q{} deg", "qd{} rad/sec"), (180 / np.pi, 1)),
+        (("q{}_deg", "qd{}_radps"), (180 / np.pi, 1)),
         (("q{} (rad)", "qd{} (deg s^-1)"), (1, 180 / np.pi)),
         (("q{} [mrad]", "qd{}"), (1000, 1000)),
     ],
@@ -771,3 +774,45 @@ def test_matrices_with_a_column_per_time_are_to_be_transposed(scara, tmp_path):
     np.savez(tmp_path / "log.npz", t=T, q=Q.T, qd=QD.T, tau=TAU.T)
     with pytest.raises(LogError, match="transpose it: rows are times"):
         suggested(tmp_path / "log.npz", scara)
+
+
+def test_a_joint_at_rest_between_moving_joints_is_not_omitted_for_a_moving_gripper(scara, tmp_path):
+    """Five numbered columns of an arm with four joints: joint 2 rests and the gripper moves."""
+    head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(5))]
+    rest = [np.where(np.arange(4) == 1, values[:1], values) for values in (Q, QD, TAU)]
+    rows = np.column_stack([T, *(np.column_stack([x, np.sin(5 * T)]) for x in rest)])
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    np.testing.assert_allclose(found.q, rest[0], atol=1e-9)
+    np.testing.assert_allclose(found.tau, rest[2], atol=1e-9)
+    assert "# not used for q: q4" in text
+
+
+def test_columns_of_a_base_or_gripper_at_rest_are_named_in_the_draft(scara, tmp_path):
+    head = ["t", *(f"{x}{k}" for x in ("q", "qd", "tau") for k in range(5))]
+    rows = np.column_stack([T, *(np.column_stack([np.zeros(200), x]) for x in (Q, QD, TAU))])
+    found, text = suggested(written(tmp_path / "log.csv", head, rows), scara)
+    require_same(found)
+    assert "# not used for q: q0" in text
+
+
+@pytest.mark.parametrize("names", [("j{}", "vel_{}", "tau_{}"), ("mp{}", "qd{}", "mt{}")])
+def test_positions_named_by_their_joint_alone_and_short_names_of_kuka(scara, tmp_path, names):
+    """`j1` is the position of joint 1. KUKA's interface FRI has `mp`, `ip`, `mt` and `et`: measured and commanded
+    positions, measured and external torques.
+    """
+    others = {"ip{}": Q + 0.1, "et{}": TAU + 1.0} if names[0] == "mp{}" else {}
+    signals = dict(zip(names, (Q, QD, TAU), strict=True)) | others
+    head = ["time", *(name.format(k + 1) for name in signals for k in range(4))]
+    rows = np.column_stack([T, *signals.values()])
+    require_same(suggested(written(tmp_path / "log.csv", head, rows), scara)[0])
+
+
+def test_a_draft_does_not_replace_the_settings_beside_the_urdf(scara, tmp_path):
+    (tmp_path / "arm.urdf").write_text(scara.robot.path.read_text())
+    names = [f"{x}{k}" for x in ("q", "qd", "tau") for k in range(4)]
+    log = written(tmp_path / "log.csv", ["t", *names], np.column_stack([T, Q, QD, TAU]))
+    robot = str(tmp_path / "arm.urdf")
+    words = ["logs", str(log), "--robot", robot, "--suggest", str(tmp_path / "arm.yaml"), "--force"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code and "settings of the robot" in result.output + str(result.exception)
+    assert not (tmp_path / "arm.yaml").exists()

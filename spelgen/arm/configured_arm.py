@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from spelgen.arm.actuation import Actuation, derive_actuation
 from spelgen.arm.arm import Chain, make_arm
 from spelgen.errors import Diagnostic
@@ -36,9 +38,10 @@ class Arm:
 
     @property
     def turning_joints(self) -> tuple[str, ...]:
-        """Names of the revolute joints without position limits."""
-        joints = self.chain.coordinates
-        return tuple(x.name for x in joints if x.joint_type == "revolute" and x.limits is None)
+        """Names of the revolute joints without position limits, or with limits that are more than two turns apart."""
+        revolute = [x for x in self.chain.coordinates if x.joint_type == "revolute"]
+        # limits such as 6.2832 are rounded turns
+        return tuple(x.name for x in revolute if x.limits is None or np.ptp(x.limits) > 4.04 * np.pi)
 
     def __repr__(self) -> str:
         joints = counted(len(self.chain.coordinates), "joint")

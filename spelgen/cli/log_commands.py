@@ -12,7 +12,7 @@ import typer
 from spelgen.cli import options
 from spelgen.cli.console import FAILED, answer, note, progress_bar, refuse_warnings, say
 from spelgen.cli.options import argument, option, output_option
-from spelgen.errors import SpelgenErrors
+from spelgen.errors import SpelgenError, SpelgenErrors
 from spelgen.files import write_text
 from spelgen.labels import counted
 
@@ -156,6 +156,9 @@ def logs(
     arm = options.ArmOptions(robot, joints, tip, angle_tolerance).load()
     # The mapping is suggested before the logs are read: logs with other column names cannot be read without a mapping.
     if suggest is not None:
+        if suggest.resolve() == robot.with_suffix(".yaml").resolve():
+            do = "name another file"
+            raise SpelgenError("this file has the settings of the robot", file=suggest, do=do)
         options.require_free(suggest, force=force)
         mapping = _suggested(paths, arm, suggest)
     log_mapping = options.log_mapping(arm, mapping, accept)

@@ -30,7 +30,7 @@ class JointNames(Protocol):
 class DescribedArm(Protocol):
     """Protocol of a loaded arm (see `load_arm`), whose settings contain the column mapping of its logs.
 
-    turning_joints: names of the revolute joints without position limits.
+    turning_joints: names of the revolute joints without position limits, or with limits more than two turns apart.
     """
 
     @property

@@ -19,11 +19,11 @@ WORDS = {
     for quantity, words in (
         ("t", "t ts tm time times timestamp stamp clock tick datetime secs seconds millis zeit zeitstempel uhrzeit "
               "temps tiempo tempo tijd czas время 时间 時間 時刻 시간"),
-        ("q", "q qpos pos position positions angle angles theta θ winkel posicion posición posizione posição positie "
-              "hoek положение позиция угол 位置 角度 위치 각도"),
+        ("q", "q mp qpos pos position positions angle angles theta θ winkel posicion posición posizione posição "
+              "positie hoek положение позиция угол 位置 角度 위치 각도"),
         ("qd", "qd dq qp qvel vel velocity velocities speed speeds omega ω geschwindigkeit geschw vitesse velocidad "
                "velocidade velocità snelheid prędkość скорость spd 速度 속도"),
-        ("tau", "tau τ torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
+        ("tau", "tau τ mt torque torques trq tq tor effort efforts eff force forces qfrc moment load current currents "
                 "curr cur iq iqf drehmoment strom couple par coppia corrente corriente koppel момент ток 力矩 扭矩 "
                 "电流 トルク 電流 토크 전류"),
     )
@@ -34,10 +34,10 @@ COMMANDED, MEASURED, OTHERS, COMPUTED = (
     frozenset(words.split())
     for words in (
         "target targets desired des d command commands commanded cmd reference ref setpoint goal action demand planned "
-        "ipo set soll u leader consigne feedforward ff заданное заданный 目标 指令 设定 目標 목표",
+        "ipo ip set soll u leader consigne feedforward ff заданное заданный 目标 指令 设定 目標 목표",
         "actual act ai measured meas msr present feedback feed fb ist follower observation mesure 实际 反馈 実 現在 "
         "현재 실제",
-        "error err std external ext tcp ee eef cartesian tool contact gravity friction disturbance dist interact dd "
+        "error err std external ext et tcp ee eef cartesian tool contact gravity friction disturbance dist interact dd "
         "ddot dot vol volt voltage temp temperature bias passive constraint residual payload 温度",
         "computed model predicted pred sim simulated g c f",
     )
@@ -110,7 +110,8 @@ def parse_column_name(
     # A column named `t`, or with another word for time, contains times, even if a joint has the same name.
     if joint and name.lower() in WORDS["t"]:
         joint, bare = "", name
-    last = re.fullmatch(r"(.*?)[\s_.]*?((?:[^\W\d_]|°)+(?:/s|[\s_](?:per[\s_])?s)?)(?:(?!°)[\W\d_])*", bare)
+    second = r"(?:(?:/|[\s_]per[\s_])s(?:ec(?:ond)?)?|[\s_]s)?"
+    last = re.fullmatch(rf"(.*?)[\s_.]*?((?:[^\W\d_]|°)+{second})(?:(?!°)[\W\d_])*", bare)
     is_bare = last and (last[2].lower() in BARE or last[2] == name[:1])
     if not unit and last and not is_bare and is_unit(plain_unit(last[2])):
         bare, unit = last[1], plain_unit(last[2])
@@ -150,7 +151,9 @@ def columns_by_quantity(
             if column.quantity == "tau" and not column.words & (OTHERS | CURRENT):
                 commanded.append(column)
             continue
-        is_numbered = column.number >= 0 and column.words & (MEASURED | {"joint", "joints", "axis", "axes"})
+        is_numbered = column.number >= 0 and column.words & (
+            MEASURED | {"joint", "joints", "j", "axis", "axes"}
+        )
         if quantity is None and (column.joint or is_numbered):
             unstated.append(column)
         if quantity in by_quantity:

@@ -112,7 +112,7 @@ class JointSignals(NamedTuple):
 
     @property
     def turns(self) -> bool:
-        """True if the joint can rotate without limit."""
+        """True if the joint can rotate without limit, or by more than two turns."""
         return self.kind == "continuous" or bool(self.trajectory.mapping.word("period", "q", self.joint))
 
     @property

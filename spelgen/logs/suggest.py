@@ -111,9 +111,13 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     clocks = columns_of.pop("t")
     clock = _clock(clocks, columns, table)
     # If there are more numbered columns than joints, the changing columns belong to the arm, and the constant columns
-    # to a base or gripper at rest. A base at rest has seven positions, but six velocities and torques.
+    # before or after them to a base or gripper at rest. A base at rest has seven positions, but six velocities and
+    # torques. A constant column between changing ones is a joint of the arm at rest.
     moved = {x.number for x in best_signal(moving, len(joints), arm)}
-    if len(moved) == len(joints):
+    numbers = sorted({x.number for x in columns_of["q"]})
+    runs = [set(numbers[k : k + len(joints)]) for k in range(len(numbers) - len(joints) + 1)]
+    listed_columns = dict(columns_of)
+    if moved in runs:
         count = len(columns_of["q"])
         for quantity, named in columns_of.items():
             complete = (
@@ -146,8 +150,8 @@ def _table_mapping(table: pa.Table, file: Path, joints: Sequence[str], commands:
     lines = _mapping_lines(file.name, joints, by_joint, clock, unit_of_times)
     # Comments of the draft list unused columns, for example of a gripper, or of another arm with similar names.
     used |= set(clock.name.split(" + "))
-    columns_of = {"t": clocks} | {x: columns_of[x] for x in by_joint}
-    unused = {x: [y.name for y in named if y.name not in used] for x, named in columns_of.items()}
+    listed_columns = {"t": clocks} | {x: listed_columns[x] for x in by_joint}
+    unused = {x: [y.name for y in named if y.name not in used] for x, named in listed_columns.items()}
     unused = {x: abbreviated_names(y) for x, y in unused.items()}
     lines += [f"# not used for {x}: {shortened(y, TUNING.listed)}" for x, y in unused.items() if y]
     stated_by = {**by_joint, "t": {"": clock}}

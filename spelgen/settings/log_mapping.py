@@ -40,7 +40,7 @@ UNIT_NAMES: dict[str, dict[str, str]] = {
         "q": [("deg", "deg degs degree degrees grad °"), ("rad", "rad"), ("mrad", "mrad"), ("0.001 deg", "mdeg"),
               ("0.01 deg", "cdeg"), ("counts", "counts ticks pulse pulses cnt inc"), ("0.016666666667 deg", "arcmin"),
               ("turns", "turns turn rev revs revolutions"), ("m", "m"), ("10 mm", "cm"), ("mm", "mm")],
-        "qd": [("deg/s", "degps dps"), ("rpm", "rpm 1/min r/min"), ("turns/s", "rps")],
+        "qd": [("deg/s", "degps dps"), ("rad/s", "radps"), ("rpm", "rpm 1/min r/min"), ("turns/s", "rps")],
         "tau": [("Nm", "nm"), ("mNm", "mnm"), ("Ncm", "ncm"), ("kgf.cm", "kgfcm kgcm"), ("N", "n"), ("1000 N", "kn"),
                 ("A", "a amps ampere"), ("mA", "ma"), ("percent", "% percent"), ("permille", "‰ permille"),
                 ("1000 Nm", "knm"), ("1.355817948 Nm", "lbfft"), ("0.112984829 Nm", "lbfin")],
