@@ -74,12 +74,12 @@ class ServoObjective(Objective):
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Set the model to the initial guess, and prepare the first outer iteration; return no diagnostics."""
+        """Set the model to the initial guess, and prepare the first outer iteration; return warnings about limits."""
         self._since = time.monotonic()
-        set_initial_guess(self.model, self._windows)
+        notes = set_initial_guess(self.model, self._windows)
         self._set_up(copy.deepcopy(self.model.state_dict()))
         self._begin_iteration(self._rollouts.parameters.prior_mean)
-        return []
+        return notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Resume an interrupted fit at the start of the outer iteration in which it was interrupted."""
@@ -147,7 +147,10 @@ class ServoObjective(Objective):
         self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # The standard deviation of the rounding error of an encoder is step / sqrt(12). The step is at least 1e-5 rad.
-        self._noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        # The error of a joint at rest has no weight: its servo keeps the initial guess. Otherwise friction that
+        # prevents any motion would explain such a joint best.
+        noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        self._noise = noise.masked_fill(~self._windows.moving, torch.inf)
         self._rollouts = ServoRollouts.of(self.model, self._windows.subsampled(TUNING.sparse_windows))
 
     def _begin_iteration(self, x: ServoParameters) -> None:
