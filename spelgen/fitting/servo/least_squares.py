@@ -56,20 +56,18 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> list[Diagnostic
             loaded &= (factor / factor[loaded].median()).log().abs() < np.log(TUNING.kp_range)
         torque_error = error - damping * motion.qd
         squares = [x.square().mean(dim=(0, 1)) for x in (load.gravity, torque_error)]
-        carried = (squares[0] / squares[1].clamp(min=1e-12)).sqrt() / servo.nominal_kp
-        usual = carried.max() if carried.max() > 1e-6 else torch.ones(1)
-        factor = torch.where(loaded, factor, carried.maximum(_filled(factor, loaded, usual)))
-        factor = factor.masked_fill(is_known, 1.0)
+        # Friction of a joint at rest may carry the load without any error.
+        carried = (squares[0] / squares[1].clamp(min=TUNING.min_motion**2)).sqrt() / servo.nominal_kp
+        typical = factor[loaded].median() if loaded.any() else carried.max()
+        unloaded = carried.maximum(typical if typical > 1e-6 else torch.ones(1))
+        factor = torch.where(loaded, factor, unloaded).masked_fill(is_known, 1.0)
         kp = factor * servo.nominal_kp
         friction.nominal.mul_(factor)
         servo.raw_kp.copy_(factor.log())
-        lag = _filled(damping.clamp(min=smallest**2), moving, servo.nominal_kd / servo.nominal_kp)
-        servo.raw_kd.copy_((kp * lag / servo.nominal_kd).log())
-        ratio = torch.maximum(inertia - load.inertia.mean(dim=(0, 1)) / kp, torch.full_like(kp, smallest**3))
-        ratio = _filled(ratio, moving, model.nominal_armature / servo.nominal_kp)
-        model.raw_armature.copy_((kp * ratio / model.nominal_armature).log())
-        static_error = _filled(dry, moving, friction.nominal / kp)
-        friction.raw_coulomb.copy_((kp * static_error / friction.nominal).clamp(min=smallest).log())
+        servo.raw_kd.copy_((kp * damping.clamp(min=smallest**2) / servo.nominal_kd).log())
+        armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
+        model.raw_armature.copy_((armature / model.nominal_armature).log())
+        friction.raw_coulomb.copy_((kp * dry / friction.nominal).clamp(min=smallest).log())
         # The parameters are logarithms of friction constants, divided by the initial values of `FrictionLaws`. Logs of
         # positions determine only the sum of kd and viscous friction, both its linear and its saturating part. The sum
         # is fitted as kd, and both parts are set to exp(-6) times their initial values, which is negligible. The fit of
@@ -91,9 +89,22 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> list[Diagnostic
     return [Diagnostic("warning", "beyond-effort-limit", where, None, message)] if limits else []
 
 
-def _filled(values: Tensor, known: Tensor, default: Tensor) -> Tensor:
-    """Return values (n,) of joints that are known (n,); the others have the median of these, or `default` (n,)."""
-    return torch.where(known, values, values[known].median() if known.any() else default)
+def complete_joints_at_rest(model: ArmModel, moving: Tensor) -> None:
+    """Set kd, armature and Coulomb friction of joints at rest, divided by kp, to the medians of the moving joints.
+
+    The logs do not determine the servos of joints at rest. moving: (n,), False for joints at rest.
+    """
+    servo, friction = model.servo, model.friction
+    with torch.no_grad():
+        kp, coulomb = servo.kp(), friction.prepare().coulomb
+        for raw, values in (
+            (servo.raw_kd, servo.kd()),
+            (model.raw_armature, model.armature),
+            (friction.raw_coulomb, coulomb),
+        ):
+            ratios = values / kp
+            if moving.any():
+                raw.add_((ratios[moving].median() / ratios).log().masked_fill(moving, 0.0))
 
 
 def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
-from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
+from spelgen.fitting.servo.least_squares import complete_joints_at_rest, fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.posterior import posterior_content
 from spelgen.fitting.servo.problem import ServoProblem
@@ -136,6 +136,7 @@ class ServoObjective(Objective):
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
+        complete_joints_at_rest(self.model, self._windows.moving)
         record = servo_record(problem, solved, end, self._steps)
         linear = fit_linear_servos(self._windows.subsampled(TUNING.sparse_windows))
         self.results["servo"] = record | {"linear": asdict(linear)}

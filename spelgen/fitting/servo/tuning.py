@@ -122,7 +122,7 @@ class ServoTuning:
     # threshold is large, since neighbouring windows are correlated.
     kp_significance: float = 8.0
     # [rad, m] Smallest standard deviation of positions within windows of a joint that moves. The servo of a joint at
-    # rest is not fitted: its kd, armature and friction, divided by kp, are the median of those of the other joints.
+    # rest is not fitted. Also the smallest command error of a load that such a joint carries.
     min_motion: float = 0.01
     # [1] The initial kp is computed from the coefficient of gravity only if kp / nominal kp differs from the median of
     # the joints by less than this factor. The nominal kp itself is no reference: effort limits of URDFs, from which it
