@@ -52,16 +52,23 @@ def write_servo_arm(folder: Path, settings: str = "input: position\n") -> Path:
 
 
 def servo_logs(
-    count: int, seconds: float, servos: Servos = Servos(), seed: int = 0, swing: float = 1.0
+    count: int,
+    seconds: float,
+    servos: Servos = Servos(),
+    seed: int = 0,
+    swing: float = 1.0,
+    held: float | None = None,
 ) -> list[Trajectory]:
     """Simulate ``count`` logs of ``seconds`` each at 50 Hz, with encoders of 4096 steps per revolution.
 
     The commands are sums of sines about levels that jump every 2 s. swing: factor of the sines; 0: only levels.
-    servos: true parameters of the servos.
+    servos: true parameters of the servos. held: constant command of the elbow [rad]; None: it moves like the shoulder.
     """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 0.02)
     u = np.stack([_commands(rng, t, swing) for _ in range(count)])
+    if held is not None:
+        u[:, :, 1] = held
     q = np.stack([_simulated(t, each, servos) for each in u])
     q = np.round(q * 4096 / (2 * np.pi)) * (2 * np.pi / 4096)
     nothing = np.zeros((len(t), 0))

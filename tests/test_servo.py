@@ -37,7 +37,7 @@ from spelgen.fitting.servo.report import servo_summary
 from spelgen.fitting.servo.rollouts import ServoRollouts
 from spelgen.fitting.servo.windows import servo_windows
 from spelgen.identification.intervals import QUANTILE, jackknife_covariance
-from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS
+from spelgen.labels import DELAYED_COMMAND, LINEAR_SERVOS, MODEL
 from spelgen.listing import number
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, delayed_commands
@@ -469,3 +469,26 @@ def test_the_motion_of_single_joints_equals_the_motion_of_the_arm(arm):
         rollouts = rollouts.linearized(x, rollouts.predicted_motion(x))
     errors = rollouts.residual(x).square().mean(dim=(0, 1)).sqrt()
     assert errors.max() < 6e-4
+
+
+@pytest.mark.parametrize("effort", [1000, 0.2])
+def test_a_placeholder_for_the_effort_limit_does_not_change_the_fit(tmp_path, logs, effort):
+    path = write_servo_arm(tmp_path)
+    path.write_text(path.read_text().replace('effort="6"', f'effort="{effort}"'))
+    fit = spelgen.fit(spelgen.build(path, "closed-form"), logs[:2])
+    (replay, *_) = spelgen.evaluate(fit, logs[5:], arm=path).replays
+    assert max(replay.errors[MODEL].joints) < 4e-3
+    warned = [x.code for x in fit.diagnostics if x.severity == "warning"]
+    assert warned == (["beyond-effort-limit"] if effort < 1 else [])
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_joint_at_rest_gets_the_servo_of_the_other_joints(arm, logs):
+    log = servo_logs(1, 20.0, held=0.4)[0]
+    fit = spelgen.fit(spelgen.build(arm, "closed-form"), [log])
+    model = fit.model
+    for values in (model.friction.prepare().coulomb, model.servo.kd(), model.armature):
+        ratios = (values / model.servo.kp()).tolist()
+        assert 0.5 < ratios[1] / ratios[0] < 2
+    lag = fit.posterior.uncertain(lambda model: model.servo.kd() / model.servo.kp())
+    assert lag.std[0] < 0.1 * lag.value[0] and lag.std[1] > lag.value[1]

@@ -114,6 +114,15 @@ def test_anomalous_commands_are_reported(arm, logs, columns, code):
     assert code in codes(found)
 
 
+def test_a_joint_that_rests_at_its_command_does_not_have_copied_commands(arm, logs):
+    def column(value):
+        return lambda x: np.column_stack([x.qd[:, 0] if value == 0 else x.q[:, 0], np.full(len(x), value)])
+
+    resting = changed(logs, u=only(1, 0.25), q=column(0.25), qd=column(0.0))
+    found = codes(spelgen.check_logs(resting, arm))
+    assert "idle-command" in found and "commands-are-positions" not in found
+
+
 def test_errors_at_rest_are_reported(arm):
     shoulder, elbow = spelgen.check_logs(servo_logs(2, 12.0, swing=0.0), arm).joints
     # error at rest: up to (dry friction + gravity torque) / kp

@@ -4,10 +4,13 @@ One joint after the other moves, all joints follow sines of one frequency, or al
 hysteresis: it remains at the joint when the joint stops, and acts as a spring in small motions.
 """
 
+import re
+
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
+import spelgen
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor_dynamics import regressor, urdf_parameters
 from spelgen.log_checks.check_logs import check_logs
@@ -77,3 +80,18 @@ def test_motions_of_users_give_no_false_finding(robots, robot, motion, seed):
     report = check_logs([recorded(arm, motion, seed)], arm)
     assert [str(error) for error in report.errors] == []
     assert [finding for finding in report.findings if finding.code in FALSE] == []
+
+
+def test_friction_of_a_joint_at_rest_does_not_come_from_a_placeholder_of_its_effort_limit(robots, tmp_path):
+    path = tmp_path / "rpr.urdf"
+    path.write_text(re.sub('effort="[^"]*"', 'effort="1000"', (robots / "rpr.urdf").read_text()))
+    arm = load_arm(path)
+
+    def first_joint_at_rest(n, rng):
+        q = small(n, rng)
+        q[:, 0] = 0.3
+        return q
+
+    log = recorded(arm, first_joint_at_rest, 1)
+    fit = spelgen.fit(spelgen.build(arm, "closed-form"), [log], arm=arm)
+    assert fit.model.friction.prepare().coulomb[0] < log.tau[:, 0].std()

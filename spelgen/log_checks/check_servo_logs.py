@@ -497,16 +497,16 @@ def _command_warning(
     """
     correlation, offset, delay = following.correlation[k, k], following.offset[k], following.delay[k, k]
     shift = next((x for x in (0, 1, 2, -1, -2) if all(_is_shifted(log, k, x) for log in logs)), None)
-    if shift is not None:
-        # commands equal to positions: the logger wrote measured positions in place of commands
-        code = "commands-are-positions"
-        late = f", {counted(abs(shift), 'row')} {'later' if shift > 0 else 'earlier'}" * bool(shift)
-        message = f"u is q{late}, to the last bit: are they the commands that were sent?"
-    elif not following.moves[k]:
+    if not following.moves[k]:
         # a constant command contains no information on the servo
         width = report.high["u"] - report.low["u"]
         motion = f"moves by only {width:.3g}" if width else "does not move"
         code, message = "idle-command", f"its command {motion}: its servo is not determined"
+    elif shift is not None:
+        # commands equal to positions: the logger wrote measured positions in place of commands
+        code = "commands-are-positions"
+        late = f", {counted(abs(shift), 'row')} {'later' if shift > 0 else 'earlier'}" * bool(shift)
+        message = f"u is q{late}, to the last bit: are they the commands that were sent?"
     elif correlation < 0.5:
         code, message = "not-following", f"it does not follow its command (correlation {correlation:.2g})"
     elif abs(offset) > OTHER_ZERO[report.kind]:

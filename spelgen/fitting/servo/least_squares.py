@@ -19,14 +19,20 @@ from torch import Tensor
 from spelgen.baselines.linear_servos import LinearServos, linear_response
 from spelgen.dynamics.bristles import bristle_reach, bristles_along
 from spelgen.emission.assemble import ArmModel
+from spelgen.errors import Diagnostic
 from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import ServoWindows, body_load
 
+# [1] Largest logarithm of a linear servo's frequency and damping: logs of a joint at rest bound neither of them.
+LARGEST = 10.0
 
-def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
+
+def set_initial_guess(model: ArmModel, windows: ServoWindows) -> list[Diagnostic]:
     """Set kp, kd, armature, friction and offset of the model by linear regression of the command error u - q.
 
-    u is the commanded, q the measured position. See the top of this module for the equation.
+    u is the commanded, q the measured position. See the top of this module for the equation. Effort limits of the URDF
+    are placeholders in many files. Nominal friction is therefore scaled like kp, and a limit that the servo torques of
+    the logs exceed is removed. Return a warning about removed limits, if there are any.
     """
     delay = 1 / windows.rate
     model.servo.delay.fill_(delay)
@@ -40,15 +46,23 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
     coefficients, significance = _regression(columns[:, windows.burn_in :], error[:, windows.burn_in :])
     damping, inertia, dry, compliance, offset = coefficients.unbind(-1)
     with torch.no_grad():
-        is_known = servo.trained == 0
+        is_known, smallest = servo.trained == 0, TUNING.min_friction
+        moving = windows.moving
         factor = 1 / (compliance * servo.nominal_kp).clamp(min=1e-12)
         # The coefficient of the gravity load, 1 / kp, determines kp / nominal kp only at joints that carry such a load.
-        # The other joints have the median of this factor.
-        determined = ~is_known & (significance[:, 3] > TUNING.kp_significance)
-        determined &= factor.log().abs() < np.log(TUNING.kp_range)
-        common = factor[determined].median() if determined.any() else 1.0
-        factor = torch.where(determined, factor, common).masked_fill(is_known, 1.0)
-        kp, smallest = factor * servo.nominal_kp, TUNING.min_friction
+        # The other joints have the median of this factor, but carry their load: kp is at least gravity torque / error.
+        loaded = ~is_known & moving & (compliance > 0) & (significance[:, 3] > TUNING.kp_significance)
+        if loaded.any():
+            loaded &= (factor / factor[loaded].median()).log().abs() < np.log(TUNING.kp_range)
+        torque_error = error - damping * motion.qd
+        squares = [x.square().mean(dim=(0, 1)) for x in (load.gravity, torque_error)]
+        # Friction of a joint at rest may carry the load without any error.
+        carried = (squares[0] / squares[1].clamp(min=TUNING.min_motion**2)).sqrt() / servo.nominal_kp
+        typical = factor[loaded].median() if loaded.any() else carried.max()
+        unloaded = carried.maximum(typical if typical > 1e-6 else torch.ones(1))
+        factor = torch.where(loaded, factor, unloaded).masked_fill(is_known, 1.0)
+        kp = factor * servo.nominal_kp
+        friction.nominal.mul_(factor)
         servo.raw_kp.copy_(factor.log())
         servo.raw_kd.copy_((kp * damping.clamp(min=smallest**2) / servo.nominal_kd).log())
         armature = torch.maximum(kp * inertia - load.inertia.mean(dim=(0, 1)), smallest**3 * kp)
@@ -61,7 +75,36 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> None:
         friction.raw_viscous.fill_(-6.0)
         friction.raw_saturation.fill_(-6.0)
         friction.raw_stribeck.fill_(-2.0)
+        at_rest = (torque_error - load.gravity / kp).mean(dim=(0, 1))
+        offset = torch.where(moving, offset, at_rest)
         model.raw_offset.copy_((kp * offset / friction.nominal).clamp(-2.0, 2.0))
+        # A servo may be saturated for a moment, but not most of the time: it would not follow its command.
+        torque = (kp * torque_error).abs().flatten(0, 1).quantile(TUNING.limit_quantile, dim=0)
+        wrong = torque > servo.limit
+        pairs = zip(model.joints, torque.tolist(), servo.limit.tolist(), wrong.tolist(), strict=True)
+        limits = [f"{x.name!r} ({y:.3g}, limit {z:.3g})" for x, y, z, is_wrong in pairs if is_wrong]
+        servo.limit.masked_fill_(wrong, torch.inf)
+    message = "servos need torques [Nm, N] beyond the URDF's effort limits, which are not used"
+    where = f"joint {', '.join(limits)}"
+    return [Diagnostic("warning", "beyond-effort-limit", where, None, message)] if limits else []
+
+
+def complete_joints_at_rest(model: ArmModel, moving: Tensor) -> None:
+    """Set kd, armature and Coulomb friction of joints at rest, divided by kp, to the medians of the moving joints.
+
+    The logs do not determine the servos of joints at rest. moving: (n,), False for joints at rest.
+    """
+    servo, friction = model.servo, model.friction
+    with torch.no_grad():
+        kp, coulomb = servo.kp(), friction.prepare().coulomb
+        for raw, values in (
+            (servo.raw_kd, servo.kd()),
+            (model.raw_armature, model.armature),
+            (friction.raw_coulomb, coulomb),
+        ):
+            ratios = values / kp
+            if moving.any():
+                raw.add_((ratios[moving].median() / ratios).log().masked_fill(moving, 0.0))
 
 
 def _regression(columns: Tensor, errors: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,14 +169,13 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
             x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo. column: slice of the joint.
             """
             u = commands(x[2])[..., column] + x[3]
-            predicted = linear_response(
-                q[:, 0, column], qd[:, 0, column], u, dt, np.exp(x[:1]), np.exp(x[1:2])
-            )
+            frequency, damping = np.exp(x[:2].clip(-LARGEST, LARGEST))[:, None]
+            predicted = linear_response(q[:, 0, column], qd[:, 0, column], u, dt, frequency, damping)
             result: np.ndarray = (predicted - measured[..., column])[:, windows.burn_in :].ravel()
             return result
 
         fits.append(least_squares(residual, initial, bounds=bounds, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T
-    columns[:2] = np.exp(columns[:2])
+    columns[:2] = np.exp(columns[:2].clip(-LARGEST, LARGEST))
     frequency, damping, delay, offset = columns.tolist()
     return LinearServos(frequency, damping, delay, offset, float(late))

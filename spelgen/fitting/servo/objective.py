@@ -24,7 +24,7 @@ from spelgen.fitting.objective import Objective, Status
 from spelgen.fitting.process import TrainingProgress
 from spelgen.fitting.run_record import Content
 from spelgen.fitting.servo.laws import select_dead_zones, without_small_dead_zones
-from spelgen.fitting.servo.least_squares import fit_linear_servos, set_initial_guess
+from spelgen.fitting.servo.least_squares import complete_joints_at_rest, fit_linear_servos, set_initial_guess
 from spelgen.fitting.servo.parameters import ServoParameters
 from spelgen.fitting.servo.posterior import posterior_content
 from spelgen.fitting.servo.problem import ServoProblem
@@ -74,12 +74,12 @@ class ServoObjective(Objective):
         )
 
     def begin(self) -> list[Diagnostic]:
-        """Set the model to the initial guess, and prepare the first outer iteration; return no diagnostics."""
+        """Set the model to the initial guess, and prepare the first outer iteration; return warnings about limits."""
         self._since = time.monotonic()
-        set_initial_guess(self.model, self._windows)
+        notes = set_initial_guess(self.model, self._windows)
         self._set_up(copy.deepcopy(self.model.state_dict()))
         self._begin_iteration(self._rollouts.parameters.prior_mean)
-        return []
+        return notes
 
     def resume(self, checkpoint: Content, history: list[Content]) -> None:
         """Resume an interrupted fit at the start of the outer iteration in which it was interrupted."""
@@ -136,6 +136,7 @@ class ServoObjective(Objective):
         problem = self._problem.refined(2 * self._windows.steps, TUNING.last_difference_step)
         end, solved = solution(problem, x)
         problem.parameters.write(end)
+        complete_joints_at_rest(self.model, self._windows.moving)
         record = servo_record(problem, solved, end, self._steps)
         linear = fit_linear_servos(self._windows.subsampled(TUNING.sparse_windows))
         self.results["servo"] = record | {"linear": asdict(linear)}
@@ -147,7 +148,10 @@ class ServoObjective(Objective):
         self._initial_weights = weights
         steps = np.max([encoder_step(log.q) for log in self._logs], axis=0)
         # The standard deviation of the rounding error of an encoder is step / sqrt(12). The step is at least 1e-5 rad.
-        self._noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        # The error of a joint at rest has no weight: its servo keeps the initial guess. Otherwise friction that
+        # prevents any motion would explain such a joint best.
+        noise = torch.from_numpy(steps).clamp(min=1e-5) / 12**0.5
+        self._noise = noise.masked_fill(~self._windows.moving, torch.inf)
         self._rollouts = ServoRollouts.of(self.model, self._windows.subsampled(TUNING.sparse_windows))
 
     def _begin_iteration(self, x: ServoParameters) -> None:

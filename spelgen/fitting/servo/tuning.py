@@ -121,9 +121,15 @@ class ServoTuning:
     # [1] Smallest t value of the coefficient of gravity, 1 / kp, for which kp is computed from this coefficient. The
     # threshold is large, since neighbouring windows are correlated.
     kp_significance: float = 8.0
-    # [1] The initial kp is computed from the coefficient of gravity only if it differs from the nominal kp by less than
-    # this factor; otherwise kp / nominal kp is the median of the other joints.
+    # [rad, m] Smallest standard deviation of positions within windows of a joint that moves. The servo of a joint at
+    # rest is not fitted. Also the smallest command error of a load that such a joint carries.
+    min_motion: float = 0.01
+    # [1] The initial kp is computed from the coefficient of gravity only if kp / nominal kp differs from the median of
+    # the joints by less than this factor. The nominal kp itself is no reference: effort limits of URDFs, from which it
+    # is computed, are placeholders in many files.
     kp_range: float = 20.0
+    # [1] A limit of the torque is not used if this quantile of the magnitude of the servo's torque exceeds it.
+    limit_quantile: float = 0.95
     # [1] Number f = 0.05 in the lower bounds of three initial values, whose logarithms are fitted. With the powers of
     # f, in SI units, each bound is about 5 % of a nominal value. Dry friction: f times nominal friction. kd/kp: f^2 =
     # 0.0025 s, 5 % of 0.05 s (`ModelTuning.servo_lag`). armature/kp: f^3 = 0.000125 s^2, 5 % of 1 / (20 rad/s)^2

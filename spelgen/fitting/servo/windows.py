@@ -63,6 +63,11 @@ class ServoWindows:
         """Mean sample rate of the windows [Hz]."""
         return float(1 / self.dt.mean())
 
+    @property
+    def moving(self) -> Tensor:
+        """True for joints that move within the windows, (n,): the servo of a joint at rest is not determined."""
+        return self.q.std(dim=1).square().mean(dim=0).sqrt() > TUNING.min_motion
+
     def subsampled(self, count: int) -> ServoWindows:
         """Return at most ``count`` of these windows, evenly spread, with half as many integration steps per interval.
 

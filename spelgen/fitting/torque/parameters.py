@@ -174,10 +174,11 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
     with torch.no_grad():
         drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
         limit = drive_torque.std(dim=0) / model.friction.nominal
-        # The friction of drives at rest and of drives without torque is not limited, since the samples have no
-        # information on it.
+        # The samples have no information on the friction of drives at rest and of drives without torque. Their nominal
+        # friction is scaled like that of the other drives, since placeholders are alike at all joints.
         informative = (limit > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MIN_SPEED)
-        limit = torch.where(informative, limit, torch.inf)
+        common = limit[informative].median() if informative.any() else torch.inf
+        limit = torch.where(informative, limit, common)
         scale = limit.clamp(max=1.0)
         model.friction.nominal *= scale
     parameters = dict(rigid.initial)
