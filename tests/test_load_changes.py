@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_log_geometry import arm, pick_and_place, recorded  # noqa: F401
+from test_log_geometry import arm, excitation, pick_and_place, recorded  # noqa: F401
 
 from spelgen.arm.configured_arm import load_arm
 from spelgen.dynamics.regressor_dynamics import regressor
@@ -79,6 +79,29 @@ def test_recordings_with_one_load_are_not_doubted(arm, seed):  # noqa: F811
         still,
     ):
         assert warnings(arm, logs) == []
+
+
+def rests_first(joint):
+    """Return a motion in which all joints move, but a joint begins to move after 70 % of the time only."""
+
+    def motion(arm, rng):  # noqa: F811
+        t, q = excitation(arm, rng)
+        s = np.clip((t - 0.7 * t[-1]) / 2.0, 0.0, 1.0)
+        q[:, joint] *= 10 * s**3 - 15 * s**4 + 6 * s**5
+        return t, q
+
+    return motion
+
+
+@pytest.mark.parametrize("arm", ["rpr", "four_dof"], indirect=True)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_stiction_of_a_joint_at_rest_is_no_other_zero_of_its_torque(arm, seed):  # noqa: F811
+    """Dry friction carries a part of the load of a joint until it moves: it is no change of the torque's zero."""
+    log = recorded(arm, seed, rests_first(1), noise=0.01)
+    at_rest = np.abs(log.qd[:, 1]) < 1e-6
+    tau = log.tau.copy()
+    tau[:, 1] += at_rest * 0.4 * tau[:, 1].std()
+    assert check_logs([replace(log, tau=tau)], arm).errors == ()
 
 
 @pytest.mark.parametrize("arm", ["four_dof"], indirect=True)

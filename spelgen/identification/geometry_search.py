@@ -210,7 +210,8 @@ def _weighed(
             is_late = bool((np.append(hypothesis.delay, hypothesis.drift) != times).any())
             change = max(stateful_change, change if is_late else min(change, stateful_change / 2))
             moved = moving | hypothesis.signals(problem.samples).moving_joints
-            if is_exact and not _is_certain((plain_base, fit), (stateful_base, stateful_fit), moved, is_late):
+            pairs = (plain_base, fit), (stateful_base, stateful_fit)
+            if not _is_certain(*pairs, moved, is_late=is_late, is_exact=is_exact):
                 change = 0.0
         best[k] = replace(fit, cost=base.cost + change)
     return best
@@ -220,7 +221,9 @@ def _is_certain(
     plain: tuple[HypothesisFit, HypothesisFit],
     stateful: tuple[HypothesisFit, HypothesisFit],
     moving: np.ndarray,
+    *,
     is_late: bool,
+    is_exact: bool,
 ) -> bool:
     """Return True if a hypothesis is better than another one by more than errors of the friction model explain.
 
@@ -237,11 +240,11 @@ def _is_certain(
     old, new = (fit.hypothesis for fit in plain)
     exchanged = old.source != new.source
     if exchanged.any() and (exchanged[0] == exchanged[1]).all():
-        return bool(moving[exchanged[0]].all())
+        return bool(moving[exchanged[0]].all()) or not is_exact
     changed = (exchanged | (old.scale != new.scale)).any(axis=0) | (old.offset != new.offset)
-    if changed.any() and not moving[changed].any():
+    if is_exact and changed.any() and not moving[changed].any():
         return False
-    is_lower = stateful[1].errors < 0.2 * stateful[0].errors
+    is_lower = stateful[1].errors < (0.2 if is_exact else GEOMETRY.clear) * stateful[0].errors
     gain = min(present.penalties - fit.penalties for present, fit in (plain, stateful))
     return bool(is_lower[moving].any()) or (gain > GEOMETRY.ambiguous and not is_late)
 

@@ -25,6 +25,7 @@ from spelgen.logs.checks import check, joint_kinds
 from spelgen.logs.dynamics_samples import NEEDED, DynamicsSamples, dynamics_samples
 from spelgen.logs.preprocessing import Preprocessing
 from spelgen.logs.trajectory import Trajectory, recordings, require_torques
+from spelgen.logs.tuning import SAMPLES
 
 
 def identify(
@@ -133,6 +134,10 @@ class _Equations:
         self._blocks: list[DynamicsSamples] = []
         for x in samples:
             self._blocks += [x[start : start + TUNING.block] for start in range(0, len(x.q), TUNING.block)]
+        speeds = (
+            np.concatenate([x.qd for x in samples] or [np.zeros((0, len(drives.speeds)))]) @ drives.speeds.T
+        )
+        self._is_moving = np.abs(speeds).max(axis=0, initial=0.0) > SAMPLES.moving
         self._regressors: list[np.ndarray] = []
         # regressors are kept if they are small enough, otherwise they are recomputed for each pass over the samples
         size = 8 * sum(x.q.size for x in samples) * 10 * len(arm.bodies)
@@ -146,11 +151,13 @@ class _Equations:
     def _rows(self, friction: FrictionModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the regressor (T, n, K) of K parameters and the torques (T, n) [Nm, N] of each block of T samples."""
         reach = reach_of(self.arm.joint_types).values
+        # Friction and rotor inertia of a drive at rest are omitted: noise of its velocity would determine them.
+        is_seen = np.array([self._is_moving | (effect == "offset") for effect in friction.effects]).ravel()
         regressors = self._regressors or map(self._regressor, self._blocks)
         for block, bodies in zip(self._blocks, regressors, strict=True):
             deflection = None if block.z is None else block.z / reach
             columns = friction.columns(block.qd, block.qdd, deflection, self.drives.speeds)
-            yield np.concatenate([bodies, columns], axis=2), block.tau
+            yield np.concatenate([bodies, columns * is_seen], axis=2), block.tau
 
     def _products(self, friction: FrictionModel, parameters: int) -> np.ndarray:
         """Return the Gram matrices (n, BLOCKS, K + 1, K + 1) of regressor and torque per joint and block of samples.

@@ -128,8 +128,8 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
     """Return the change of the scale or zero of torques that the samples of a log show most clearly, or None.
 
     A change is another factor on the torque of one joint, a common factor on the torques of all joints, or another
-    offset of the torque of one joint, from a time on; or another factor in a whole recording. A single joint must move
-    before and after the change, since dry friction or a brake may carry any part of the load of a joint at rest.
+    offset of the torque of one joint, from a time on; or another factor in a whole recording. The samples in motion
+    must show the change of a single joint: dry friction or a brake may carry any part of the load of a joint at rest.
 
     Two other hypotheses are fitted: another load from this time on (the arm picks it up), and other friction from this
     time on together with offsets that drift (warm drives, drifting sensors). A change is returned only if its negative
@@ -167,9 +167,15 @@ def torque_change(problem: GeometryProblem) -> TorqueChange | None:
                 candidates.append((float(misfits[split, joint]), recording, float(starts[split]), joint))
     # The exact comparison takes time: it is made for six changes, and omitted if the residual shows hardly any change.
     likely = [x[1:] for x in sorted(candidates)[:6] if x[0] < -GEOMETRY.needed]
-    changes = [_change(subset, fit, *candidate) for candidate in likely]
-    fall, change = max(changes, key=itemgetter(0), default=(0.0, None))
-    return change if fall > GEOMETRY.needed else None
+    changes = []
+    for recording, time, joint in likely:
+        fall, change = _change(subset, fit, recording, time, joint)
+        if fall > GEOMETRY.needed and change.joint is not None:
+            moving = subset.selected(np.abs(velocities[:, joint]) > MOTION.moving)
+            fall = min(fall, _change(moving, moving.fit(moving.unchanged), recording, time, joint)[0])
+        changes.append((fall, change))
+    fall, best = max(changes, key=itemgetter(0), default=(0.0, None))
+    return best if fall > GEOMETRY.needed else None
 
 
 def _moves_on_both_sides(velocities: np.ndarray, splits: np.ndarray) -> np.ndarray:

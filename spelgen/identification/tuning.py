@@ -88,6 +88,9 @@ class LogGeometryTuning:
     # joint is below this value. With wrong senses, orders, units, zeros or gravity, the largest value of a joint is
     # usually above 0.019 (benchmarks/log_geometry.py, 16 arms); joints of symmetric wrists are an exception.
     exact: float = 0.01
+    # [1] A hypothesis lowers the squared residual of at least one moving joint to this fraction, or has more plausible
+    # parameters: errors of the friction model lower many residuals a little.
+    clear: float = 0.7
     # [1] Mean relative residual variance of the joints above which the columns of a log are probably in another order.
     unexplained: float = 0.15
     # [1] A recording has a fault of its own if its squared torque residual is larger than this multiple of the squared

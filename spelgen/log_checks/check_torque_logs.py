@@ -39,6 +39,7 @@ from spelgen.log_checks.robot_checks import (
     find_one_way,
     fit_gravity,
     torque_factors,
+    varies_along_a_line,
 )
 from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
@@ -324,6 +325,9 @@ class TorqueLogs:
         # Dry friction of a joint that moves one way is a constant torque, which wrong hypotheses explain as well.
         elif sum(find_one_way(joint) is not None for joint in evidence) > len(evidence) / 2:
             small = "most joints move one way only"
+        # If all positions are functions of one variable, signals of other joints explain the torques as well.
+        elif (np.ptp(motion, axis=0) > TUNING.smallest_motion).sum() > 1 and varies_along_a_line(motion):
+            small = "all joints move in phase"
         if small:
             message = f"{small}: too little motion to test senses, order, zeros, units and gravity"
             findings.notes.append(Diagnostic("warning", SMALL_MOTION, "logs", None, message))

@@ -139,6 +139,13 @@ class JointEvidence(NamedTuple):
         )
 
 
+def varies_along_a_line(motion: np.ndarray) -> bool:
+    """Return True if the positions (S, n) [rad, m] lie on a line of the joint space, up to 1 % of their variance."""
+    centered = motion - motion.mean(axis=0)
+    variances = np.linalg.eigvalsh(centered.T @ centered)
+    return bool(variances[:-1].sum() < 0.01 * variances[-1])
+
+
 def find_beyond_limits(joint: JointEvidence) -> str | None:
     """Return a message about measured or commanded positions beyond the position limits; None if there are none.
 

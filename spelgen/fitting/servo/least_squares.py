@@ -90,7 +90,7 @@ def set_initial_guess(model: ArmModel, windows: ServoWindows) -> list[Diagnostic
 
 
 def complete_joints_at_rest(model: ArmModel, moving: Tensor) -> None:
-    """Set kd, armature and Coulomb friction of joints at rest, divided by kp, to the medians of the moving joints.
+    """Set kd / kp, armature / kp and Coulomb friction / kp of joints at rest to the medians of the moving joints.
 
     The logs do not determine the servos of joints at rest. moving: (n,), False for joints at rest.
     """

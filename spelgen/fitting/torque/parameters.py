@@ -175,7 +175,7 @@ def limit_friction(model: ArmModel, samples: SampleBlock) -> None:
         drive_torque = joint_torque(model, samples) @ torch.linalg.inv(motors)
         limit = drive_torque.std(dim=0) / model.friction.nominal
         # The samples have no information on the friction of drives at rest and of drives without torque. Their nominal
-        # friction is scaled like that of the other drives, since placeholders are alike at all joints.
+        # friction gets the median factor of the other drives, since placeholders of a URDF are wrong by one factor.
         informative = (limit > 0) & ((samples.qd @ motors.mT).abs().amax(dim=0) > MIN_SPEED)
         common = limit[informative].median() if informative.any() else torch.inf
         limit = torch.where(informative, limit, common)

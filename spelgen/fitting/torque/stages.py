@@ -9,7 +9,7 @@ from spelgen.fitting.levenberg_marquardt import initial_state
 from spelgen.fitting.torque.jacobian import TorqueJacobian
 from spelgen.fitting.torque.joint_functions import TermKey, refit_terms
 from spelgen.fitting.torque.networks import select_networks
-from spelgen.fitting.torque.parameters import NEGLIGIBLE
+from spelgen.fitting.torque.parameters import MIN_SPEED, NEGLIGIBLE
 from spelgen.fitting.torque.problem import State, TorqueEstimate, TorqueProblem, alternate, refine
 from spelgen.fitting.torque.samples import TorqueSamples
 from spelgen.fitting.torque.selection import (
@@ -103,7 +103,9 @@ def find_compensation(problem: TorqueProblem, x: torch.Tensor) -> torch.Tensor:
     # `deviations` is |slope| divided by the standard deviation of the slope: the t statistic of the regression on
     # velocity.
     deviations = (explained * estimator.errors / (1 - explained)).sqrt()
-    decreasing = (slope < 0) & (deviations > 1) & ~problem.compensated
+    # the velocity of a joint at rest is noise
+    is_moving = samples.qd.abs().amax(dim=0) > MIN_SPEED
+    decreasing = (slope < 0) & (deviations > 1) & is_moving & ~problem.compensated
     if not first:
         return decreasing
     amplitude = (slope * products / estimator.count).sqrt()
