@@ -38,8 +38,8 @@ from spelgen.log_checks.robot_checks import (
     JointEvidence,
     find_one_way,
     fit_gravity,
+    move_in_phase,
     torque_factors,
-    varies_along_a_line,
 )
 from spelgen.logs.checks import OF_ONE, Check, Findings, run_checks
 from spelgen.logs.dynamics_samples import NEEDED
@@ -326,7 +326,7 @@ class TorqueLogs:
         elif sum(find_one_way(joint) is not None for joint in evidence) > len(evidence) / 2:
             small = "most joints move one way only"
         # If all positions are functions of one variable, signals of other joints explain the torques as well.
-        elif (np.ptp(motion, axis=0) > TUNING.smallest_motion).sum() > 1 and varies_along_a_line(motion):
+        elif move_in_phase(motion):
             small = "all joints move in phase"
         if small:
             message = f"{small}: too little motion to test senses, order, zeros, units and gravity"

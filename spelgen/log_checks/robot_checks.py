@@ -139,10 +139,14 @@ class JointEvidence(NamedTuple):
         )
 
 
-def varies_along_a_line(motion: np.ndarray) -> bool:
-    """Return True if the positions (S, n) [rad, m] lie on a line of the joint space, up to 1 % of their variance."""
-    centered = motion - motion.mean(axis=0)
-    variances = np.linalg.eigvalsh(centered.T @ centered)
+def move_in_phase(motion: np.ndarray) -> bool:
+    """Return True if two or more joints move, and their positions (S, n) [rad, m] are linear functions of one variable.
+
+    This variable explains all but 1 % of the variance of the positions, which are first divided by their standard
+    deviations. Joints that stay within `TUNING.smallest_motion` are omitted.
+    """
+    moved = motion[:, np.ptp(motion, axis=0) > TUNING.smallest_motion]
+    variances = np.linalg.eigvalsh(np.atleast_2d(np.corrcoef(moved.T))) if moved.shape[1] > 1 else np.ones(2)
     return bool(variances[:-1].sum() < 0.01 * variances[-1])
 
 
