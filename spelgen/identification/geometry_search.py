@@ -187,8 +187,8 @@ def _weighed(
     For a hypothesis with another delay than `base`, the decrease is min(a, b): hysteresis resembles a delay, so such a
     hypothesis must lower both costs.
 
-    If the model with hysteresis explains the torques under `base` (`GeometryProblem.explains`), a lower torque residual
-    may be due to errors of the friction model. The decrease is then 0 unless `_is_certain`.
+    A lower torque residual may be due to errors of the friction model, above all if the model with hysteresis explains
+    the torques under `base` (`GeometryProblem.explains`). The decrease is 0 unless `_is_certain`.
 
     Args:
         problem: problem without hysteresis.
@@ -227,15 +227,17 @@ def _is_certain(
 ) -> bool:
     """Return True if a hypothesis is better than another one by more than errors of the friction model explain.
 
-    It must concern joints that move. If it does not exchange whole joints, it must also lower the squared residual of a
-    joint with hysteresis to a fifth, or have more plausible parameters in both models, by `GEOMETRY.ambiguous`. Delays
-    are as plausible as hysteresis, so only the residual counts for them.
+    If it does not exchange whole joints, it must lower the squared residual of a moving joint with hysteresis to the
+    fraction `GEOMETRY.clear`, or have more plausible parameters in both models, by `GEOMETRY.ambiguous`. Delays are as
+    plausible as hysteresis, so only the residual counts for them. If the other hypothesis explains the torques, this
+    one must also concern joints that move, and the fraction is a fifth.
 
     Args:
         plain: fits of the other hypothesis and of this one, without hysteresis.
         stateful: the same with hysteresis.
         moving: mask (n,) of the joints that move.
         is_late: True if the hypothesis has other delays.
+        is_exact: True if the other hypothesis explains the torques with hysteresis.
     """
     old, new = (fit.hypothesis for fit in plain)
     exchanged = old.source != new.source
