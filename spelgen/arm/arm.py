@@ -123,7 +123,7 @@ class Chain:
         return all(body.inertia is not None and body.inertia[0] > 0 for body in self.bodies)
 
     @property
-    def has_copied_masses(self) -> bool:
+    def masses_are_copied(self) -> bool:
         """Whether two thirds of the bodies with mass, and at least three, have the same mass: a placeholder.
 
         It is true of 14 of 189 URDFs of real arms; true masses are up to 500 times as large.

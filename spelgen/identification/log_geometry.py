@@ -22,7 +22,7 @@ from spelgen.identification.drive_hints import FRICTION, bristle_columns, drive_
 from spelgen.identification.hypotheses import Hypothesis, HypothesisFit, Vector3
 from spelgen.identification.least_squares import block_products, varying
 from spelgen.identification.motion_samples import MotionSamples
-from spelgen.identification.reference_inertials import reference_inertials
+from spelgen.identification.reference_inertials import ReferenceInertials, reference_inertials
 from spelgen.identification.tuning import GEOMETRY
 from spelgen.runtime.body_chain import BodyChain
 
@@ -55,7 +55,7 @@ class GeometryProblem:
         # systematic and do not average out in long logs.
         self.count = float(np.clip(seconds / 0.2, 1.0, 150.0))
         self.reference = reference_inertials(arm)
-        mean, precision = inertial_prior(arm)
+        mean, precision = inertial_prior(arm, self.reference)
         self._bodies = len(mean)
         # indices of the mass and moments of inertia of the bodies that carry no joint
         parents = {body.parent for body in arm.bodies}
@@ -428,15 +428,16 @@ def _joint_step(
     return step[:count], gains / np.exp(np.clip(step[count:] * gains, -0.7, 1.0))
 
 
-def inertial_prior(arm: Chain) -> tuple[np.ndarray, np.ndarray]:
+def inertial_prior(arm: Chain, reference: ReferenceInertials) -> tuple[np.ndarray, np.ndarray]:
     """Return the prior of the inertial parameters of B bodies: mean (10 B,) and precision (10 B, 10 B).
 
     The mean has the values of the URDF. Errors of masses, centres of mass and inertia tensors are independent. The
     prior of a body without <inertial> in the URDF, or with a copied mass, has mean 0 and is wide. The prior of a body
-    that carries no joint includes a tool or load that the URDF does not contain.
+    that carries no joint includes a tool or load that the URDF does not contain. reference: inertial parameters, whose
+    median mass is the typical mass of a body.
     """
-    parameters = urdf_parameters(arm).reshape(-1, 10) * (not arm.has_copied_masses)
-    masses = reference_inertials(arm).parameters[::10]
+    parameters = urdf_parameters(arm).reshape(-1, 10) * (not arm.masses_are_copied)
+    masses = reference.parameters[::10]
     typical = float(np.median(masses[masses > 0])) if masses.any() else 1.0
     precisions = []
     for k, parameters_of_body in enumerate(parameters):

@@ -63,7 +63,7 @@ def reference_inertials(arm: Chain) -> ReferenceInertials:
     the last link or of a telescope is not in the URDF.
     """
     stated = urdf_parameters(arm)
-    if 3 * np.count_nonzero(stated[::10]) >= 2 * len(arm.bodies) and not arm.has_copied_masses:
+    if 3 * np.count_nonzero(stated[::10]) >= 2 * len(arm.bodies) and not arm.masses_are_copied:
         return ReferenceInertials(stated, GEOMETRY.other_unit)
     guess = np.zeros((len(arm.bodies), 10))
     links = [body for body in arm.bodies if body.parent >= 0]

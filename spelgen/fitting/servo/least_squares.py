@@ -23,9 +23,6 @@ from spelgen.errors import Diagnostic
 from spelgen.fitting.servo.tuning import TUNING
 from spelgen.fitting.servo.windows import ServoWindows, body_load
 
-# [1] Largest logarithm of a linear servo's frequency and damping: logs of a joint at rest bound neither of them.
-LARGEST = 10.0
-
 
 def set_initial_guess(model: ArmModel, windows: ServoWindows) -> list[Diagnostic]:
     """Set kp, kd, armature, friction and offset of the model by linear regression of the command error u - q.
@@ -169,13 +166,13 @@ def fit_linear_servos(windows: ServoWindows) -> LinearServos:
             x: (4,) log frequency, log damping ratio, delay and offset of the joint's servo. column: slice of the joint.
             """
             u = commands(x[2])[..., column] + x[3]
-            frequency, damping = np.exp(x[:2].clip(-LARGEST, LARGEST))[:, None]
+            frequency, damping = np.exp(x[:2].clip(-TUNING.max_logarithm, TUNING.max_logarithm))[:, None]
             predicted = linear_response(q[:, 0, column], qd[:, 0, column], u, dt, frequency, damping)
             result: np.ndarray = (predicted - measured[..., column])[:, windows.burn_in :].ravel()
             return result
 
         fits.append(least_squares(residual, initial, bounds=bounds, x_scale="jac", max_nfev=30).x)
     columns = np.array(fits).T
-    columns[:2] = np.exp(columns[:2].clip(-LARGEST, LARGEST))
+    columns[:2] = np.exp(columns[:2].clip(-TUNING.max_logarithm, TUNING.max_logarithm))
     frequency, damping, delay, offset = columns.tolist()
     return LinearServos(frequency, damping, delay, offset, float(late))

@@ -128,6 +128,9 @@ class ServoTuning:
     # the joints by less than this factor. The nominal kp itself is no reference: effort limits of URDFs, from which it
     # is computed, are placeholders in many files.
     kp_range: float = 20.0
+    # [1] Bound of the magnitude of the logarithms of a linear servo's frequency [rad/s] and damping ratio: logs of a
+    # joint at rest bound neither of them.
+    max_logarithm: float = 10.0
     # [1] A limit of the torque is not used if this quantile of the magnitude of the servo's torque exceeds it.
     limit_quantile: float = 0.95
     # [1] Number f = 0.05 in the lower bounds of three initial values, whose logarithms are fitted. With the powers of
